@@ -15,10 +15,10 @@ import numpy as np
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import origin_at
-from modelserver.estimation.filter.layout import ErrorState
+from modelserver.estimation.filter.error_layout import ErrorState
+from modelserver.estimation.filter.eskf import body_velocity_jacobian
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.measurements import REGISTRY, Compared, register
-from modelserver.estimation.filter.nav import jacobian_of_body_velocity
+from modelserver.estimation.filter.measurements import REGISTRY, Innovation, register
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import ImuSample, SensorHeader
 from modelserver.server.vehicle import load_vehicle
@@ -56,9 +56,9 @@ class Radar:
         """Return residual, Jacobian and noise covariance."""
         scale, base = 1.0 + scene.extra("radar_scale"), scene.rig.base
         forward = scene.nav.body_velocity(base)[0]
-        H = scale * jacobian_of_body_velocity(scene.nav, base, scene.layout.size)[:1]
+        H = scale * body_velocity_jacobian(scene.nav, base, scene.layout.size)[:1]
         H[0, scene.layout.index("radar_scale")] = forward
-        return Compared(np.array([sample.speed - scale * forward]), H, np.array([[sample.sigma**2]]))
+        return Innovation(np.array([sample.speed - scale * forward]), H, np.array([[sample.sigma**2]]))
 
 
 # --- a simulated drive --------------------------------------------------------------------------------------

@@ -178,7 +178,7 @@ class ModeLocalizer:
         else:
             before = self.estimate(utime - SPEED_SPAN_US)
             active = FilterLocalizer.start(config.setup, last.origin, mode).start_from(last, before)
-            if active.odom.started:
+            if active.odom.is_started:
                 X_odom = last.odom @ active.odom.pose(utime).inverse()
             else:
                 # its Odom will start with the vehicle's tilt and yaw 0

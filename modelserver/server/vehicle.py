@@ -77,12 +77,12 @@ class Vehicle:
         start_report = ""
         setup = self.make_localizer_setup()
         if setup is not None:
-            from modelserver.estimation.filter.persistence import opened
+            from modelserver.estimation.filter.persistence import prepare_warm_start
             from modelserver.estimation.modes import ModeLocalizer
 
             origin = get_configured_origin(config) or origin
             mode = config.localization.initial_mode
-            restored, start_report = opened(restored, config.vehicle, setup.setup, mode)
+            restored, start_report = prepare_warm_start(restored, config.vehicle, setup.setup, mode)
             localizer = ModeLocalizer.start(setup, mode, origin, restored)
         settings = CoreSettings(
             base_frame=config.base_frame,

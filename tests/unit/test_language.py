@@ -19,7 +19,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 EXEMPT = (
-    "modelserver/estimation/filter/",
     "modelserver/estimation/raw/",
     "tests/unit/estimation/",
     "tests/unit/test_language.py",

@@ -1,66 +1,60 @@
 """Heading check of a warm start: the restored heading against the first meters driven and the fixes there.
 
-Wheels that stood know that the vehicle did not turn by itself, not that nobody lifted it. A state with a wrong heading
-that it is sure of takes fixes for such that wander, and does not find out by itself.
+Stationary wheels show that the vehicle did not turn by itself, not that nobody lifted it. A state with a wrong heading
+and a small uncertainty would explain the fixes by their time-correlated error, and never find out.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
+from typing import Final
 
-from modelserver.estimation.filter import fixes
-from modelserver.estimation.filter.alignment import Passed, Turn
-from modelserver.estimation.filter.items import NOTHING, Fused
-from modelserver.estimation.filter.persistence import KEPT
+from modelserver.estimation.filter.fusion import report_event
+from modelserver.estimation.filter.heading_alignment import PathFix, Rotation
+from modelserver.estimation.filter.persistence import WARM_START
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState, Proving
+from modelserver.estimation.filter.state import Aligned, HeadingCheck
 from modelserver.messages import Decision, Verdict
 
-LEAST_WAY = 3.0
-"""Metres from end to end that tell a direction, and as many again for each metre that the antenna is off the middle."""
+MIN_DISTANCE: Final = 3.0
+"""Meters from end to end that give a direction, and as many again per meter of the antenna from the middle."""
 
-LONGEST_GAP = 2.0
-"""Seconds between two fixes beyond which the stretch begins anew."""
+MAX_GAP: Final = 2.0
+"""Seconds between two fixes beyond which the segment restarts."""
 
-MOUNTS = 0.05
-"""Radians by which the way driven and heading may differ on a sound vehicle: side slip, and the frames' survey."""
+MOUNT_SIGMA: Final = 0.05
+"""Radians by which path and heading may differ on a sound vehicle: side slip, and the survey of the frames."""
 
 
-def proved(setup: Setup, state: FilterState, newest: Passed) -> Fused:
-    """Return the state with a fix more: its heading proved, put right, or still neither."""
-    stretch, nav = state.proving, state.nav
-    if stretch is None or nav is None:
-        return state, NOTHING
+def update(
+    setup: Setup, state: Aligned, newest: PathFix
+) -> tuple[HeadingCheck | None, Rotation | None, Decision | None]:
+    """Return the check after a fix: None once it is decided, with the rotation of N if the heading is wrong."""
+    check, nav = state.heading_check, state.nav
+    assert check is not None
     velocity = cmath.rect(nav.body_velocity(setup.rig.base)[0], nav.yaw)
-    place = newest.place - newest.arm
-    dt = (newest.utime - stretch.utime) * 1e-6
-    if not stretch.utime or dt > LONGEST_GAP:
-        return state._replace(proving=Proving(newest.utime, newest.utime, place, 0j, velocity)), NOTHING
-    way = stretch.way + 0.5 * dt * (stretch.velocity + velocity)
-    state = state._replace(proving=stretch._replace(utime=newest.utime, way=way, velocity=velocity))
-    arm, moved = abs(newest.arm), place - stretch.place
-    # wheels that spin, or fixes that jump, tell no direction
-    if abs(way) < LEAST_WAY * (1.0 + arm) or not 0.5 < abs(moved) / abs(way) < 2.0:
-        return state, NOTHING
-    seconds = (newest.utime - stretch.begin) * 1e-6
-    changed = newest.lingering * math.sqrt(2.0 * (1.0 - math.exp(-seconds / setup.settings.gps_correlation_time)))
-    sigma = math.hypot(1.5 * newest.white, changed, 0.2 * arm) / abs(way)
+    position = newest.position - newest.arm
+    dt = (newest.utime - check.utime) * 1e-6
+    if not check.utime or dt > MAX_GAP:
+        return HeadingCheck(newest.utime, newest.utime, position, 0j, velocity), None, None
+    travel = check.travel + 0.5 * dt * (check.velocity + velocity)
+    check = check._replace(utime=newest.utime, travel=travel, velocity=velocity)
+    arm, moved = abs(newest.arm), position - check.position
+    # wheels that spin, or fixes that jump, give no direction
+    if abs(travel) < MIN_DISTANCE * (1.0 + arm) or not 0.5 < abs(moved) / abs(travel) < 2.0:
+        return check, None, None
+    seconds = (newest.utime - check.begin) * 1e-6
+    changed = newest.correlated * math.sqrt(2.0 * (1.0 - math.exp(-seconds / setup.settings.gps_correlation_time)))
+    sigma = math.hypot(1.5 * newest.white, changed, 0.2 * arm) / abs(travel)
     if sigma > setup.settings.align_sigma:
-        return state, NOTHING
-    turn = cmath.phase(moved / way)
-    doubt = math.hypot(sigma, MOUNTS, math.sqrt(max(nav.covariance[8, 8], 0.0)))
-    state = state._replace(proving=None)
-    if abs(turn) <= 4.0 * doubt:
-        return state, (
-            _word(state, Verdict.USED, f"the resumed heading is right: {abs(way):.1f} m driven agree with it"),
-        )
-    state = fixes.into_world(setup, state, nav, Turn(turn, sigma), newest)
-    state = state._replace(epoch=state.epoch + 1, allowance=0.0)
-    off = f"the kept heading was off by {abs(math.degrees(turn)):.0f} deg: the vehicle was turned while nobody watched"
-    return state, (_word(state, Verdict.RESET, f"cold start of the pose after all, {off}"),)
-
-
-def _word(state: FilterState, verdict: Verdict, text: str) -> Decision:
-    assert state.nav is not None
-    return Decision(state.nav.utime, "filter", 0, KEPT, verdict, text)
+        return check, None, None
+    angle = cmath.phase(moved / travel)
+    if abs(angle) <= 4.0 * math.hypot(sigma, MOUNT_SIGMA, math.sqrt(max(nav.covariance[8, 8], 0.0))):
+        text = f"the restored heading is right: {abs(travel):.1f} m driven agree with it"
+        return None, None, report_event(state, WARM_START, Verdict.USED, text)
+    degrees = abs(math.degrees(angle))
+    text = (
+        f"cold start of the pose: the restored heading was off by {degrees:.0f} deg, the vehicle was turned meanwhile"
+    )
+    return None, Rotation(angle, sigma), report_event(state, WARM_START, Verdict.RESET, text)

@@ -1,23 +1,26 @@
-"""The filter as a localizer: accepts samples in any order of arrival and answers with the pose."""
+"""The filter as a localizer: samples in any order of arrival in, the pose at any instant out.
+
+Read top-down: `FilterLocalizer.process` -> `ClockMonitor.update` -> `Timeline.insert`, `fuse`, `settle` -> `step`.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from modelserver.earth.geodesy import Geodesy
-from modelserver.estimation.filter import clocks, engine, inertial, motion, persistence, start, world
-from modelserver.estimation.filter.clocks import Clocks
-from modelserver.estimation.filter.items import INERTIAL, Item, items
+from modelserver.estimation.filter import imu_monitor, leveling, output, persistence, propagation
+from modelserver.estimation.filter.clock_monitor import IMU_RANK, ClockMonitor, StampVerdict
+from modelserver.estimation.filter.fusion import IMU, Item, reject, split_sample
 from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState, Said
+from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Unaligned
+from modelserver.estimation.filter.step import start
 from modelserver.estimation.filter.timeline import Timeline
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.messages import (
     STALE_SENSORS,
-    Decision,
     Estimate,
     ImuSample,
     Invalid,
@@ -27,29 +30,26 @@ from modelserver.messages import (
     Origin,
     PersistedState,
     PersistOrigin,
-    Phase,
     RestoredState,
     Sample,
     SensorFinding,
     SwitchMode,
-    Verdict,
     WheelsSample,
 )
 
-ODOM_LEAST_US = 15_000
-"""Microseconds between two steps of Odom, at least: between them it goes on by its twist."""
+ODOM_STEP_US: Final = 15_000
+"""Microseconds between two steps of Odom, at least: between them it is extrapolated by its twist."""
 
-ODOM_KEPT_US = 2_000_000
-ODOM_STEP_US = 20_000
-"""How far back poses in Odom are kept, and how close together, microseconds."""
+ODOM_HORIZON_US: Final = 2_000_000
+ODOM_SPACING_US: Final = 20_000
+"""How far back poses in Odom are stored, and how close together, microseconds."""
 
-
-STEERING_STALE = 1.0
-"""Seconds without a usable steering angle after which that is reported; wheels do without it at once."""
+STEERING_TIMEOUT: Final = 1.0
+"""Seconds without a usable steering angle after which that is reported; the wheels are used without it at once."""
 
 
 class Deferred(NamedTuple):
-    """An estimate that is worked out when it is looked at: most of those held for questions never are."""
+    """An estimate that is computed when it is read: most of those in the history never are."""
 
     setup: Setup
     state: FilterState
@@ -59,25 +59,30 @@ class Deferred(NamedTuple):
 
     def resolve(self) -> Estimate:
         """Return the estimate."""
-        return world.estimate(self.setup, self.state, self.odom, self.utime, self.newest)
+        return output.estimate(self.setup, self.state, self.odom, self.utime, self.newest)
 
 
 @dataclass(frozen=True, slots=True)
 class FilterLocalizer:
-    """The filter: an immutable value. Make the first with `start`.
+    """The filter: an immutable value. Create the first with `start`.
 
-    `timeline` holds what was measured within the horizon. `head` is the state that answers come from: the newest, or
-    while one is being worked through anew for a late measurement, the one before it carried forward. `odoms` are the
-    last two seconds of Odom.
+    Attributes
+    ----------
+    timeline: the measurements within the horizon.
+    head: the state that estimates come from: the newest, or while a delayed measurement is being worked in, the one
+        before it propagated by the IMU.
+    clocks: the stamps of all sources.
+    odom, odoms: Odom now, and in the last two seconds.
+    is_origin_reported: whether the origin was configured or reported.
     """
 
     setup: Setup
     timeline: Timeline
     head: FilterState
-    clocks: Clocks = field(default_factory=Clocks)
+    clocks: ClockMonitor = field(default_factory=ClockMonitor)
     odom: Odometry = field(default_factory=Odometry)
     odoms: tuple[Odometry, ...] = field(default=(), repr=False)
-    latched: bool = False
+    is_origin_reported: bool = False
 
     @classmethod
     def start(
@@ -85,211 +90,206 @@ class FilterLocalizer:
         setup: Setup,
         origin: Origin | None = None,
         mode: Mode = Mode.FULL,
-        recalled: RestoredState | None = None,
+        restored: RestoredState | None = None,
     ) -> FilterLocalizer:
-        """Return a localizer that has seen nothing yet.
+        """Return a localizer before its first sample.
 
-        `origin` is the configured or persisted one; None captures it from the first good fixes. `recalled` is what an
-        earlier run kept, where it may be used. Raises GeodesyError for an origin that is no place.
+        `origin` is the configured or persisted one; None captures it from the first good fixes. `restored` is the state
+        of an earlier run, for a warm start. Raises GeodesyError for an invalid origin.
         """
-        first = engine.first(setup, mode, None if origin is None else Geodesy(origin), recalled)
-        return cls(setup, Timeline(first), first, latched=origin is not None)
+        first = start(mode, None if origin is None else Geodesy(origin), restored)
+        return cls(setup, Timeline(first), first, is_origin_reported=origin is not None)
+
+    def start_from(self, last: Estimate, before: Estimate) -> FilterLocalizer:
+        """Return the localizer at another one's estimate `last`; `before` is an earlier one, for the velocity.
+
+        Only before the first sample. If the other had no valid pose in the world, this one starts from nothing.
+        """
+        assert isinstance(self.head, Leveling)
+        state = leveling.start_from(self.setup, self.head, last, before)
+        if state is None:
+            return self
+        odom = self.odom.advance(state.nav, self.setup.rig.base, is_stationary=False)
+        return replace(self, timeline=Timeline(state), head=state, odom=odom, odoms=(odom,))
 
     @property
     def utime(self) -> int:
-        """The instant of the newest sample taken, 0 before the first that the state could be carried to."""
-        nav = self.head.nav
-        if nav is None:
+        """The instant of the newest sample processed, 0 before leveling."""
+        head = self.head
+        if isinstance(head, Leveling):
             return 0
-        # what waits for inertial samples counts as taken
-        return max(nav.utime, self.clocks.newest) if motion.inertial(self.setup, self.mode) else nav.utime
+        # a measurement that waits for IMU samples counts as processed
+        return max(head.nav.utime, self.clocks.newest) if self.setup.uses_imu(self.mode) else head.nav.utime
 
     @property
     def mode(self) -> Mode:
         """Which sources are used."""
-        return self.head.mode
+        return self.head.common.mode
 
     def process(self, sample: Sample | SwitchMode) -> tuple[FilterLocalizer, tuple[LocalizerEvent, ...]]:
-        """Return what is concluded with one sample more, and what there is to say about it.
+        """Return the localizer after a sample, and the events.
 
-        Notes are `OriginLatched` and a `Decision` for each measurement: at once where its stamp is refused (late,
-        order, future, duplicate), else when the horizon has passed and nothing can change it any more.
+        Events are `PersistOrigin`, and a `Decision` for each measurement: at once for a rejected stamp, otherwise when
+        the horizon has passed and no delayed measurement can change it any more.
         """
         setup, header = self.setup, sample.header
-        found = items(setup, sample)
-        if not found:
+        items = split_sample(setup, sample)
+        if not items:
             return self, ()
         settings = setup.settings
-        name, rank = (type(sample).__name__, header.source), _rank(sample)
-        known, verdict = self.clocks.take(name, rank, found[0].utime, header.seq, settings)
-        if verdict is clocks.Verdict.STEPPED_BACK:
-            self = self._begun_anew(found[0].utime)
-        elif verdict is not clocks.Verdict.GOOD:
-            return replace(self, clocks=known), (_refused(found[0], verdict.value),)
-        oldest = known.newest - round(settings.horizon * 1e6)
-        timeline = self.timeline
-        begun = timeline.base.nav
-        # nor can anything be put before what another localizer handed over
-        earliest = oldest if begun is None else max(oldest, begun.utime)
-        notes: list[LocalizerEvent] = []
-        for item in found:
-            if item.utime < earliest:
-                notes.append(_refused(item, "too_old"))
-                continue
-            longer = timeline.with_item(item)
-            if isinstance(longer, str):
-                notes.append(_refused(item, longer))
-                continue
-            timeline, out = longer
-            if out is not None:
-                notes.append(_refused(out, "duplicate"))
+        name, rank = (type(sample).__name__, header.source), _get_rank(sample)
+        clocks, verdict = self.clocks.update(name, rank, items[0].utime, header.seq, settings)
+        if verdict is StampVerdict.STEPPED_BACK:
+            self = self._restart(items[0].utime)
+        elif verdict is not StampVerdict.GOOD:
+            return replace(self, clocks=clocks), (reject(items[0], verdict.value),)
+        oldest = clocks.newest - round(settings.horizon * 1e6)
+        timeline, events = self._insert(items, oldest)
         if timeline is self.timeline:
-            return replace(self, clocks=known), tuple(notes)
-        again = self.timeline.fused - timeline.fused
-        if again > 0 and rank < clocks.INERTIAL_RANK:
-            afforded = known.with_replay(name, again)
+            return replace(self, clocks=clocks), tuple(events)
+        again = self.timeline.num_fused - timeline.num_fused
+        if again > 0 and rank < IMU_RANK:
+            afforded = clocks.spend_replays(name, again)
             if afforded is None:
-                return replace(self, clocks=known), (_refused(found[0], "overload"),)
-            known = afforded
-        # an order is obeyed at once, and what was measured waits only for inertial samples that will be used
-        waits = motion.inertial(setup, self.mode) and not isinstance(sample, SwitchMode)
-        limit = known.complete_to() if waits else known.newest
-        timeline = timeline.worked(setup, settings.replay_budget, limit)
-        head = timeline.newest if timeline.settled(limit) else self._carried(sample, found[0])
-        timeline, decisions = timeline.settled_before(oldest)
-        notes += decisions
-        odom, odoms = self.odom, self.odoms
-        if head.nav is not None and head.nav.utime >= odom.utime + ODOM_LEAST_US:
-            odom = odom.advanced(head.nav, setup.rig.base, head.standing)
-            if not odoms or odom.utime - odoms[-1].utime >= ODOM_STEP_US:
-                odoms = _kept(odoms, odom)
-        elif head.nav is None:
-            odom = odom.stopped(odom.utime)
-        latched = self.latched
-        if not latched and head.geodesy is not None:
-            latched = True
-            notes.append(PersistOrigin(head.geodesy.origin))
-        return (
-            FilterLocalizer(setup, timeline, head, known, odom, odoms, latched),
-            tuple(notes),
-        )
+                return replace(self, clocks=clocks), (reject(items[0], "overload"),)
+            clocks = afforded
+        # a command takes effect at once; a measurement waits only for IMU samples that will be used
+        waits = setup.uses_imu(self.mode) and not isinstance(sample, SwitchMode)
+        limit = clocks.get_complete_utime() if waits else clocks.newest
+        timeline = timeline.fuse(setup, settings.replay_budget, limit)
+        head = timeline.newest if timeline.is_fused(limit) else self._propagate_head(sample, items[0])
+        timeline, decisions = timeline.settle(oldest)
+        events += decisions
+        odom, odoms = self._advance_odom(head)
+        is_origin_reported, geodesy = self.is_origin_reported, head.common.geodesy
+        if not is_origin_reported and geodesy is not None:
+            is_origin_reported = True
+            events.append(PersistOrigin(geodesy.origin))
+        return FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported), tuple(events)
 
-    def _carried(self, sample: Sample | SwitchMode, item: Item) -> FilterState:
-        """Return the head carried on by an inertial sample alone, while the timeline is not settled."""
+    def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, list[LocalizerEvent]]:
+        """Return the timeline with the items that are neither too old nor duplicates, and the decisions on the rest."""
+        timeline, base = self.timeline, self.timeline.base
+        # nor before the state that another localizer handed over
+        earliest = oldest if isinstance(base, Leveling) else max(oldest, base.nav.utime)
+        events: list[LocalizerEvent] = []
+        for item in items:
+            if item.utime < earliest:
+                events.append(reject(item, "too_old"))
+                continue
+            inserted = timeline.insert(item)
+            if isinstance(inserted, str):
+                events.append(reject(item, inserted))
+                continue
+            timeline, replaced = inserted
+            if replaced is not None:
+                events.append(reject(replaced, "duplicate"))
+        return timeline, events
+
+    def _propagate_head(self, sample: Sample | SwitchMode, item: Item) -> FilterState:
+        """Return the head propagated by an IMU sample alone, while a delayed measurement is being worked in."""
         head = self.head
-        if item.kind == INERTIAL and isinstance(sample, ImuSample) and head.nav is not None:
-            read = inertial.read(self.setup, sample)
-            if not isinstance(read, str) and item.utime > head.nav.utime and head.mode is not Mode.NO_IMU:
-                rate, force = read
-                said = head.said or Said(item.utime, rate, force, item.utime)
-                return motion.felt(self.setup, head, item.utime, rate, force, head.stillness, said)
+        if item.kind == IMU and isinstance(sample, ImuSample) and not isinstance(head, Leveling):
+            values = imu_monitor.read_imu(sample, self.setup.mount)
+            if not isinstance(values, str) and item.utime > head.nav.utime and head.common.mode is not Mode.NO_IMU:
+                return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, head.imu)
         return head
 
-    def _begun_anew(self, utime: int) -> FilterLocalizer:
+    def _advance_odom(self, head: FilterState) -> tuple[Odometry, tuple[Odometry, ...]]:
+        odom, odoms = self.odom, self.odoms
+        if isinstance(head, Leveling):
+            return odom.stop(odom.utime), odoms
+        if head.nav.utime < odom.utime + ODOM_STEP_US:
+            return odom, odoms
+        odom = odom.advance(head.nav, self.setup.rig.base, head.constraints.is_stationary)
+        if not odoms or odom.utime - odoms[-1].utime >= ODOM_SPACING_US:
+            first = 1 if odoms and odom.utime - odoms[0].utime > ODOM_HORIZON_US else 0
+            odoms = (*odoms[first:], odom)
+        return odom, odoms
+
+    def _restart(self, utime: int) -> FilterLocalizer:
         """Return the localizer after its clock was set back to `utime`: only Odom, the origin and the biases stay."""
         old = self.head
-        biases = old.biases
-        if old.nav is not None:
+        common = old.common.restart()._replace(is_clock_stepped=True)
+        if not isinstance(old, Leveling):
             P = old.nav.covariance
-            biases = (old.nav.gyro_bias, float(max(P[9, 9], P[10, 10], P[11, 11])) ** 0.5)
-        fresh = FilterState(
-            mode=old.mode,
-            geodesy=old.geodesy,
-            capture=old.capture,
-            epoch=old.epoch + 1,
-            biases=biases,
-            stepped=True,
-        )
+            sigma = float(max(P[9, 9], P[10, 10], P[11, 11])) ** 0.5
+            common = common._replace(gyro_biases=GyroBiases(old.nav.gyro_bias, sigma))
+        fresh = Leveling(common)
         return replace(
-            self, timeline=Timeline(fresh), head=fresh, odom=self.odom.stopped(utime), odoms=(), clocks=Clocks()
+            self, timeline=Timeline(fresh), head=fresh, odom=self.odom.stop(utime), odoms=(), clocks=ClockMonitor()
         )
-
-    def start_from(self, last: Estimate, before: Estimate) -> FilterLocalizer:
-        """Return the localizer knowing what another one knew at `last`, and a moment `before` for the speed.
-
-        Only of one that has seen nothing yet. Where the other had no valid pose in the world this one starts alone.
-        """
-        state = start.start_from(self.setup, self.head, last, before)
-        if state is None:
-            return self
-        assert state.nav is not None
-        odom = self.odom.advanced(state.nav, self.setup.rig.base, standing=False)
-        return replace(self, timeline=Timeline(state), head=state, odom=odom, odoms=(odom,))
 
     def estimate(self, utime: int) -> Estimate:
-        """Return the rolling frame's pose at `utime`: predicted past the newest sample, else of the state then."""
+        """Return the rolling frame's pose at `utime`: predicted beyond the newest sample, else of the state then."""
         return self.defer_estimate(utime).resolve()
 
     def defer_estimate(self, utime: int) -> Deferred:
-        """Return `estimate(utime)`, to be worked out later; it holds no more of the past than it needs."""
+        """Return `estimate(utime)`, computed when it is read; it refers to no more of the past than it needs."""
         state, odom = self.head, self.odom
-        if state.nav is not None and utime < state.nav.utime:
-            state = self.timeline.state_at(utime)
-            odom = _at(self.odoms, utime, odom)
+        if not isinstance(state, Leveling) and utime < state.nav.utime:
+            state = self.timeline.get_state_at(utime)
+            odom = _get_odom_at(self.odoms, utime, odom)
         return Deferred(self.setup, state, odom, utime, self.utime)
 
     def navigation(self, utime: int) -> NavigationState | None:
-        """Return the whole state as of the newest sample; None before levelling."""
-        return world.navigation(self.setup, motion.caught_up(self.setup, self.head))
+        """Return the whole state as of the newest sample; None before leveling."""
+        head = self.head
+        if not isinstance(head, Leveling):
+            head = propagation.propagate_covariance(self.setup, head)
+        return output.get_navigation_state(self.setup, head)
 
     def get_state_to_persist(self) -> PersistedState | None:
-        """Return what the next run should know; None where it is no better than what was kept before."""
-        nav = self.head.nav
-        return None if nav is None else persistence.kept(self.setup, self.head, self.estimate(nav.utime).invalid)
+        """Return the state for the next run; None where it is no better than what was persisted before."""
+        head = self.head
+        if isinstance(head, Leveling):
+            return None
+        return persistence.get_persisted_state(self.setup, head, self.estimate(head.nav.utime).invalid)
 
     def find_stale_sensors(self, utime: int) -> Invalid:
-        """Return what of SILENCE speaks against an estimate at `utime`, which is not before the newest sample."""
-        return world.invalid(self.setup, self.head, utime) & STALE_SENSORS
+        """Return the bits of STALE_SENSORS of an estimate at `utime`, which is not before the newest sample."""
+        return output.find_invalid(self.setup, self.head, utime) & STALE_SENSORS
 
     def summary(self, utime: int) -> LocalizerSummary:
-        """Return mode and phase, whether the vehicle stands, and when a fix was last used."""
+        """Return mode and phase, whether the vehicle is stationary, when a fix was last used, and the findings."""
         head = self.head
-        return LocalizerSummary(head.mode, head.phase, head.standing, head.fix_utime, self._findings())
+        used_utime = head.gnss.used_utime if isinstance(head, Aligned) else 0
+        return LocalizerSummary(self.mode, head.phase, head.is_stationary, used_utime, self._find_unusable())
 
-    def _findings(self) -> tuple[SensorFinding, ...]:
+    def _find_unusable(self) -> tuple[SensorFinding, ...]:
         """Return the configured sensors that cannot be used now: by their configuration, or by what they measure."""
         setup, head = self.setup, self.head
-        found = setup.findings[head.mode]
-        if head.phase is Phase.LEVELING and head.tilt:
+        findings = setup.findings[self.mode]
+        if isinstance(head, Leveling) and head.tilt:
             if math.isinf(head.tilt):
-                text = "its specific force at rest is no gravity: are its units m/s2, are its axes in order?"
+                text = "its specific force at rest is not gravity: check its units (m/s2) and its axes"
             else:
                 off = math.degrees(head.tilt)
                 text = f"gravity is {off:.0f} deg off the geometry's up: a wrong mount, or a vehicle on its side"
-            fix = "modelserver calibrate imu LOG -c FILE says which mount fits"
-            found += (SensorFinding("imu", "gravity", "sensors.imu.frame", text, fix),)
-        signal, nav = setup.rig.steering, head.nav
-        if signal is not None and nav is not None and head.mode is not Mode.NO_WHEELS:
-            age = (nav.utime - head.steering.utime) * 1e-6
-            if age > max(signal.max_age, STEERING_STALE):
+            fix = "modelserver calibrate imu LOG -c FILE finds the mount that fits"
+            findings += (SensorFinding("imu", "gravity", "sensors.imu.frame", text, fix),)
+        signal = setup.rig.steering
+        if signal is not None and not isinstance(head, Leveling) and self.mode is not Mode.NO_WHEELS:
+            age = (head.nav.utime - head.common.wheels.steering.utime) * 1e-6
+            if age > max(signal.max_age, STEERING_TIMEOUT):
                 text = "no fresh steering angle: the steered wheels are used by the speed of their contact points alone"
                 fix = "start the driver of the vehicle controller, and see that it measures steering_angle"
-                found += (SensorFinding("wheels", "steering", "sensors.wheels.steering", text, fix),)
-        if head.undirected:
+                findings += (SensorFinding("wheels", "steering", "sensors.wheels.steering", text, fix),)
+        if isinstance(head, Unaligned) and head.alignment.is_direction_unknown:
             text = (
-                "the course is known, and not whether the vehicle drives forward or backward along it: heading waits "
-                "until it brakes, turns or stops, or wheels measure it"
+                "the course is known, but not whether the vehicle drives forward or backward: the heading waits until "
+                "it brakes, turns or stops, or wheels measure it"
             )
-            found += (SensorFinding("gps", "direction", "sensors.gps", text),)
-        return found
+            findings += (SensorFinding("gps", "direction", "sensors.gps", text),)
+        return findings
 
 
-def _rank(sample: Sample | SwitchMode) -> int:
-    return clocks.INERTIAL_RANK if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
+def _get_rank(sample: Sample | SwitchMode) -> int:
+    return IMU_RANK if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
 
 
-def _refused(item: Item, reason: str) -> Decision:
-    return Decision(item.utime, item.source, item.seq, item.kind, Verdict.REJECTED, reason)
-
-
-def _kept(odoms: tuple[Odometry, ...], newest: Odometry) -> tuple[Odometry, ...]:
-    if odoms and newest.utime - odoms[0].utime > ODOM_KEPT_US:
-        return (*odoms[1:], newest)
-    return (*odoms, newest)
-
-
-def _at(odoms: tuple[Odometry, ...], utime: int, newest: Odometry) -> Odometry:
-    """Return the pose in Odom kept nearest before an instant, else the oldest."""
+def _get_odom_at(odoms: tuple[Odometry, ...], utime: int, newest: Odometry) -> Odometry:
+    """Return the newest stored pose in Odom not newer than an instant, else the oldest."""
     for odom in reversed(odoms):
         if odom.utime <= utime:
             return odom

@@ -1,31 +1,31 @@
-"""Dead reckoning in the odom frame (REP-105): the integrated twist, which never jumps.
+"""Dead reckoning in the odom frame (REP-105): the integrated twist of the filter, which never jumps.
 
-Fixes correct the filter; Odom only goes on by how the vehicle moves now. A measurement that comes late changes the
-filter's past, not what Odom has said. Tilt is drawn towards the filter's, slowly.
+Fixes correct the filter; Odom only integrates the present velocity. A delayed measurement changes the filter's past,
+not what Odom has published. Its tilt follows the filter's with time constant TILT_TIME.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from modelserver.estimation.filter.nav import ZERO, Nav
+from modelserver.estimation.filter.eskf import ZERO, NavState
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
 
-LEVEL_TIME = 1.0
-"""Time constant, seconds, with which Odom's tilt follows the filter's."""
+TILT_TIME: Final = 1.0
+"""Time constant, seconds, with which the tilt of Odom follows the filter's."""
 
-LONGEST = 0.5
-"""Seconds for which a twist is carried on where nothing tells a new one."""
+MAX_EXTRAPOLATION: Final = 0.5
+"""Seconds for which a twist is integrated without a new one."""
 
 
 class Odometry(NamedTuple):
-    """The rolling frame in Odom at `utime`: position (m), attitude; its twist then, along the body's axes.
+    """The rolling frame in Odom at `utime`: position (m), attitude, and its twist along the body axes.
 
-    `drift` is by how much the position may be off since Odom began, metres, `yaw_drift` yaw, rad: errors of rates and
-    speeds last, so they add up in proportion to time. `started` is whether the first attitude was taken.
+    Errors of rates and speeds last, so they add up in proportion to time: `drift` is the sigma of the position since
+    Odom began, m, `yaw_drift` that of yaw, rad. `is_started` is whether the first attitude was set.
     """
 
     utime: int = 0
@@ -35,39 +35,39 @@ class Odometry(NamedTuple):
     rate: Vector3 = ZERO
     drift: float = 0.0
     yaw_drift: float = 0.0
-    started: bool = False
+    is_started: bool = False
 
-    def advanced(self, nav: Nav, base: Vector3, standing: bool) -> Odometry:
-        """Return Odom at a newer state of the filter."""
-        velocity, rate = (ZERO, ZERO) if standing else (nav.body_velocity(base), nav.turn_rate)
-        if not self.started:
-            tilt = _levelled(so3.IDENTITY, nav.up, 1.0)
+    def advance(self, nav: NavState, base: Vector3, is_stationary: bool) -> Odometry:
+        """Return Odom at a newer state; `base` leads from the IMU to the rolling frame's origin, body axes, m."""
+        velocity, rate = (ZERO, ZERO) if is_stationary else (nav.body_velocity(base), nav.angular_rate)
+        if not self.is_started:
+            tilt = _follow_tilt(so3.IDENTITY, nav.up, 1.0)
             return Odometry(nav.utime, self.position, tilt, velocity, rate, self.drift, self.yaw_drift, True)
         dt = (nav.utime - self.utime) * 1e-6
         if dt <= 0.0:
             return self
-        short = min(dt, LONGEST)
-        position, attitude = _integrated(self, velocity, rate, short)
-        attitude = _levelled(attitude, nav.up, short / (LEVEL_TIME + short))
+        step = min(dt, MAX_EXTRAPOLATION)
+        position, attitude = _integrate(self, velocity, rate, step)
+        attitude = _follow_tilt(attitude, nav.up, step / (TILT_TIME + step))
         P = nav.covariance
         speed_sigma = math.sqrt(P[3, 3] + P[4, 4])
         rate_sigma = math.sqrt(P[11, 11])
-        yaw_drift = self.yaw_drift + (0.0 if standing else rate_sigma * dt)
-        drift = self.drift + (0.0 if standing else (speed_sigma + self.yaw_drift * math.hypot(*velocity)) * dt)
+        yaw_drift = self.yaw_drift + (0.0 if is_stationary else rate_sigma * dt)
+        drift = self.drift + (0.0 if is_stationary else (speed_sigma + self.yaw_drift * math.hypot(*velocity)) * dt)
         return Odometry(nav.utime, position, attitude, velocity, rate, min(drift, 1e6), min(yaw_drift, 1e3), True)
 
-    def stopped(self, utime: int) -> Odometry:
-        """Return Odom where it is, from `utime` on, while nothing tells a motion."""
+    def stop(self, utime: int) -> Odometry:
+        """Return Odom at its pose from `utime` on, while the motion is unknown."""
         return self._replace(utime=utime, velocity=ZERO, rate=ZERO)
 
     def pose(self, utime: int) -> Pose:
-        """Return the pose at an instant near, carried on by the twist, at most for half a second either way."""
-        dt = max(-LONGEST, min((utime - self.utime) * 1e-6, LONGEST))
-        position, attitude = _integrated(self, self.velocity, self.rate, dt)
+        """Return the pose at an instant nearby, extrapolated by the twist within MAX_EXTRAPOLATION."""
+        dt = max(-MAX_EXTRAPOLATION, min((utime - self.utime) * 1e-6, MAX_EXTRAPOLATION))
+        position, attitude = _integrate(self, self.velocity, self.rate, dt)
         return Pose(position, attitude)
 
     def covariance(self) -> tuple[float, ...]:
-        """Return the 36 numbers of the pose in Odom."""
+        """Return the 36 numbers of the covariance of the pose in Odom."""
         p, y, t = self.drift**2 + 1e-6, self.yaw_drift**2 + 1e-8, 4e-4
         numbers = [0.0] * 36
         numbers[0] = numbers[7] = numbers[14] = p
@@ -76,7 +76,7 @@ class Odometry(NamedTuple):
         return tuple(numbers)
 
 
-def _integrated(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> tuple[Vector3, Quaternion]:
+def _integrate(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> tuple[Vector3, Quaternion]:
     (ax, ay, az), (bx, by, bz) = odom.rate, rate
     h = 0.5 * dt
     turn = ((ax + bx) * h, (ay + by) * h, (az + bz) * h)
@@ -88,8 +88,8 @@ def _integrated(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> 
     return (px + x, py + y, pz + z), attitude
 
 
-def _levelled(attitude: Quaternion, up: Vector3, share: float) -> Quaternion:
-    """Return an attitude turned by a share of the way to where its up along the body is `up`; yaw stays."""
+def _follow_tilt(attitude: Quaternion, up: Vector3, share: float) -> Quaternion:
+    """Return an attitude rotated by a share of the angle to where its up along the body is `up`; yaw stays."""
     x, y, _ = so3.rotate(attitude, up)
-    # the body's true up stands at (x, y) in Odom: turn it to (0, 0)
+    # the body's true up is at (x, y) in Odom: rotate it to (0, 0)
     return so3.normalize(so3.multiply(so3.small_angle_exponential((y * share, -x * share, 0.0)), attitude))

@@ -5,125 +5,130 @@ from __future__ import annotations
 import hashlib
 import math
 from functools import lru_cache
+from typing import Final
 
 from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.errors import quote
-from modelserver.estimation.filter import motion
-from modelserver.estimation.filter.nav import Nav
+from modelserver.estimation.filter import propagation
+from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState
-from modelserver.messages import Mode, PersistedPose, PersistedState, Phase, RestoredState, WheelsSample
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling
+from modelserver.estimation.filter.wheel_monitor import RECEIVED
+from modelserver.messages import Mode, PersistedPose, PersistedState, RestoredState, WheelsSample
 
-KEPT = "warm_start"
-"""The kind of the ledger's words on what was kept."""
+WARM_START: Final = "warm_start"
+"""Kind of the ledger's decisions on a warm start."""
 
 
 @lru_cache(maxsize=8)
-def named(setup: Setup) -> str:
-    """Return a word that stands for all that a kept state rests on: equal where it may be gone on from."""
+def get_setup_hash(setup: Setup) -> str:
+    """Return a hash of all that a stored state depends on: equal where it may be used."""
     rig = setup.rig
     words = repr((rig.geometry_key(), rig.kinematics, rig.steering, setup.layout.names))
     return hashlib.sha256(words.encode()).hexdigest()[:16]
 
 
-def kept(setup: Setup, state: FilterState, invalid: int) -> PersistedState | None:
-    """Return what is worth keeping of a state; None where there is nothing better than what was kept before.
+def get_persisted_state(setup: Setup, state: FilterState, invalid: int) -> PersistedState | None:
+    """Return what to store of a state; None if what was stored before is better.
 
-    `invalid` are the reasons of the pose now: one that is not valid is not kept, its biases are.
+    `invalid` are the reasons of the present pose: an invalid pose is not stored, its biases are.
     """
-    nav = state.nav
-    if nav is None or state.warm_start is not None:
+    if isinstance(state, Leveling) or state.common.warm_start is not None:
         return None
-    state = motion.caught_up(setup, state)
+    state = propagation.propagate_covariance(setup, state)
     nav = state.nav
-    assert nav is not None
     numbers = tuple(nav.covariance.ravel().tolist())
     if not all(map(math.isfinite, (*numbers, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras))):
         return None
+    pose = None
+    if isinstance(state, Aligned) and state.is_stationary and not invalid:
+        pose = _get_persisted_pose(state, nav)
     return PersistedState(
         "",
         0,
         0,
         "",
-        named(setup),
+        get_setup_hash(setup),
         nav.utime,
         setup.layout.names,
         nav.gyro_bias,
         nav.accelerometer_bias,
         tuple(map(float, nav.extras)),
         numbers,
-        None if invalid or not state.standing else _kept_pose(state, nav),
+        pose,
     )
 
 
-def _kept_pose(state: FilterState, nav: Nav) -> PersistedPose | None:
-    site = state.site
-    if site is None or state.phase is not Phase.ALIGNED:
-        return None
-    place = (*nav.position, *nav.attitude, *state.shown, *state.doubt, state.allowance, state.restless)
-    if not all(map(math.isfinite, place)):
+def _get_persisted_pose(state: Aligned, nav: NavState) -> PersistedPose | None:
+    gnss, common = state.gnss, state.common
+    offset = gnss.offset
+    numbers = (*offset.value, *offset.variance, gnss.outlier_allowance, gnss.noise_inflation)
+    if not all(map(math.isfinite, (*nav.position, *nav.attitude, *numbers))):
         return None
     source, seq = "", 0
-    told: tuple[tuple[str, float], ...] = ()
-    seen = state.last.get((state.wheels_source, "seen"))
-    if seen is not None and isinstance(seen.sample, WheelsSample):
-        source, seq = state.wheels_source, seen.sample.header.seq
-        told = ways(seen.sample)
+    travel: tuple[tuple[str, float], ...] = ()
+    received = common.previous.get((common.wheels.source, RECEIVED))
+    if received is not None and isinstance(received.sample, WheelsSample):
+        source, seq = common.wheels.source, received.sample.header.seq
+        travel = get_travel(received.sample)
     return PersistedPose(
-        *geodetic_from_ecef(site.ecef),
+        *geodetic_from_ecef(state.site.ecef),
         nav.position,
         nav.attitude,
-        state.shown,
-        state.doubt,
-        state.allowance,
-        state.restless,
-        state.fix_utime,
-        state.confirmed,
-        state.epoch,
+        offset.value,
+        offset.variance,
+        gnss.outlier_allowance,
+        gnss.noise_inflation,
+        gnss.used_utime,
+        gnss.num_confirmed,
+        common.epoch,
         source,
         seq,
-        told,
+        travel,
     )
 
 
-def ways(sample: WheelsSample) -> tuple[tuple[str, float], ...]:
-    """Return the way that each wheel of a sample tells, metres."""
+def get_travel(sample: WheelsSample) -> tuple[tuple[str, float], ...]:
+    """Return the travel of each wheel that measures it, by name, m."""
     return tuple((wheel.name, wheel.travel) for wheel in sample.wheels if math.isfinite(wheel.travel))
 
 
-def judged(recalled: RestoredState, vehicle: str, setup: Setup) -> RestoredState:
-    """Return what was recalled, without what is kept of another vehicle, other mounts, or too long ago; it says why."""
-    kept = recalled.state
-    if kept is None:
-        return recalled
-    why = ""
-    if kept.vehicle != vehicle:
-        why = f"it is of vehicle {quote(kept.vehicle)}, not of {quote(vehicle)}"
-    elif kept.setup != named(setup):
-        why = "mounts, wheels or measurements of the vehicle have changed since"
-    elif kept.names != setup.layout.names or len(kept.covariance) != setup.layout.size**2:
-        why = "its error states are others"
-    elif recalled.age > recalled.max_age:
-        why = "it is older than warm_start.max_age_s"
-    if not why:
-        return recalled
-    return recalled._replace(state=None, reason=f"what was kept {ago(recalled.age)} is not used: {why}")
+def check_restored(restored: RestoredState, vehicle: str, setup: Setup) -> RestoredState:
+    """Return what was restored, without a state of another vehicle, of other mounts, or too old; with the reason."""
+    state = restored.state
+    if state is None:
+        return restored
+    reason = ""
+    if state.vehicle != vehicle:
+        reason = f"it is of vehicle {quote(state.vehicle)}, not of {quote(vehicle)}"
+    elif state.setup != get_setup_hash(setup):
+        reason = "mounts, wheels or measurements of the vehicle have changed since"
+    elif state.names != setup.layout.names or len(state.covariance) != setup.layout.size**2:
+        reason = "its error states are others"
+    elif restored.age > restored.max_age:
+        reason = "it is older than warm_start.max_age_s"
+    if not reason:
+        return restored
+    text = f"the state stored {format_age(restored.age)} is not used: {reason}"
+    return restored._replace(state=None, reason=text)
 
 
-def opened(recalled: RestoredState | None, vehicle: str, setup: Setup, mode: Mode) -> tuple[RestoredState | None, str]:
-    """Return what a start goes on from, None where it is cold; and what is said about it, empty where nobody asked."""
-    if recalled is None:
+def prepare_warm_start(
+    restored: RestoredState | None, vehicle: str, setup: Setup, mode: Mode
+) -> tuple[RestoredState | None, str]:
+    """Return the state to start from, None for a cold start; and the message, empty if no state was asked for."""
+    if restored is None:
         return None, ""
     if mode is Mode.RAW:
-        recalled = recalled._replace(state=None, reason="raw mode goes on from nothing but the origin")
-    recalled = judged(recalled, vehicle, setup)
-    if recalled.state is None:
-        return None, f"cold start: {recalled.reason}"
-    return recalled, f"warm start: what was kept {ago(recalled.age)} waits for the sensors"
+        restored = restored._replace(state=None, reason="raw mode restores only the origin")
+    restored = check_restored(restored, vehicle, setup)
+    if restored.state is None:
+        return None, f"cold start: {restored.reason}"
+    return restored, f"warm start: the state stored {format_age(restored.age)} waits for the sensors"
 
 
-def ago(seconds: float) -> str:
-    """Return an age in words that people read at a glance."""
+def format_age(seconds: float) -> str:
+    """Return an age in words, e.g. `5 min ago`."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
             return f"{seconds / size:.0f} {unit} ago"

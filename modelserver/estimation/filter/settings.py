@@ -41,7 +41,7 @@ class FilterSettings(FixSettings):
     gap_acceleration: float = 1.0
     """Sigma of the acceleration that nobody measured during a gap, m/s2: ordinary driving and braking."""
     wheel_rate_sigma: float = 0.05
-    """Sigma of the turn rate by the wheels where no gyro tells, rad/s: one side slips 2 % at 2 m/s, 1 m apart."""
+    """Sigma of the turn rate by the wheels without a gyro, rad/s: one side slips 2 % at 2 m/s, 1 m apart."""
     frozen_time: float = 1.0
     """A unit that repeats one value for so long is frozen, seconds: noise alone changes the last digit of every
     sample."""
@@ -51,9 +51,9 @@ class FilterSettings(FixSettings):
     leveling_time: float = 2.0
     """How long a standing vehicle's specific force and rates are averaged for tilt and biases, seconds (report 5.1)."""
     leveling_timeout: float = 5.0
-    """After how long a vehicle that does not stand is levelled on the move, seconds."""
+    """After how long a vehicle that is not stationary is leveled on the move, seconds."""
     leveling_acceleration: float = 1.0
-    """Sigma of the mean acceleration while levelling on the move, m/s2: a tenth of g is a tilt of 0.1 rad."""
+    """Sigma of the mean acceleration while leveling on the move, m/s2: a tenth of g is a tilt of 0.1 rad."""
     tilt_mount_limit: float = 0.6
     """Largest angle between the felt vertical and the geometry's up, at rest, rad: no vehicle starts on a slope of 35
     degrees, but a wrong mount is off by 90."""
@@ -61,7 +61,7 @@ class FilterSettings(FixSettings):
     # --- wheels and how the vehicle moves over ground ---
 
     wheel_sigma: float = 0.02
-    """Sigma of a wheel's speed where the sample does not tell, m/s: a pulse of 1 cm twice in a second."""
+    """Sigma of a wheel's speed if the sample has none, m/s: a pulse of 1 cm twice in a second."""
     wheel_period: float = 0.4
     """Shortest time over which the wheels' way is compared, seconds: an encoder's errors of place, a pulse or an update
     missed, fall out over a longer way, and the inertial unit bridges the time."""
@@ -89,7 +89,7 @@ class FilterSettings(FixSettings):
     side_slip: float = 0.006
     """Side slip angle that a sideways acceleration of 1 m/s2 brings, rad: cornering stiffness of an ordinary tyre."""
     roll_point_sigma: float = 0.05
-    """How far the point that moves straight ahead wanders along the vehicle, metres: load, and ground under a skid."""
+    """How far the point that moves straight ahead moves along the vehicle, meters: load, and ground under a skid."""
     up_sigma: float = 0.05
     """Sigma of the speed along the vehicle's up, m/s: springs and bumps."""
     up_share: float = 0.01
@@ -109,7 +109,7 @@ class FilterSettings(FixSettings):
     stationary_sigma: float = 0.01
     """Sigma of the speed of a standing vehicle, m/s: it rocks."""
     recapture_time: float = 3.0
-    """How long the vehicle must have stood before the gyros' biases are captured anew, seconds (report 5.1)."""
+    """How long the vehicle must have stood before the gyro biases are calibrated again, seconds (report 5.1)."""
 
     # --- fixes ---
 
@@ -122,20 +122,20 @@ class FilterSettings(FixSettings):
     """Sigma of how late a fix's place is, seconds, beyond what is configured: receivers compute for 20 to 150 ms and
     stamp as they please (P. Groves 2013, 10.3). It is estimated: at 20 m/s 80 ms are worse than all else."""
     gps_sigma_floor: float = 0.02
-    """A fix is never taken to be surer than this, metres: RTK, 2 cm (OEM4 data sheet)."""
+    """Least sigma of a fix, meters: RTK, 2 cm (OEM4 data sheet)."""
     gps_inflation_time: float = 2.0
     """Time constant, seconds, with which the wandering of fixes is learnt from what they do beside odometry."""
     gps_inflation_limit: float = 100.0
-    """By how much faster than the settings say, in variance, fixes are let wander before they are refused."""
+    """Largest inflation of the process noise of the time-correlated error, in variance, before fixes are rejected."""
     position_slew_rate: float = 2.0
-    """How fast the pose goes with what lingers in the fixes, m/s, at most: the pose in the world is where the receiver
-    would see it, as way points surveyed with it are, but it does not jump there."""
+    """How fast the pose follows the time-correlated error of the fixes, m/s, at most: the pose in the world is where
+    the receiver would report it, because way points are surveyed with it, but it does not jump there."""
     velocity_sigma: float = 0.1
-    """Sigma of the receiver's velocity where it tells none, m/s: three times the 0.03 m/s rms of the OEM4 sheet."""
+    """Sigma of the receiver's velocity if it reports none, m/s: three times the 0.03 m/s rms of the OEM4 sheet."""
     course_speed: float = 1.0
     """Least speed at which course and speed are taken for a velocity, m/s (report 5.1)."""
     course_sigma: float = 0.05
-    """Sigma of a course where the receiver tells none, rad: 0.1 m/s sideways at 2 m/s."""
+    """Sigma of a course if the receiver reports none, rad: 0.1 m/s sideways at 2 m/s."""
     gate_risk: float = 1e-4
     """Probability that a good measurement is refused by its chi-square gate."""
 
@@ -156,9 +156,9 @@ class FilterSettings(FixSettings):
     orientation_time: float = 5.0
     """How long errors of the unit's own orientation last, seconds: its own filter's time constant."""
     aiding_sigma: float = 0.5
-    """Sigma of another source's position or range where it tells none, metres."""
+    """Sigma of another source's position or range if it reports none, meters."""
     aiding_rotation_sigma: float = 0.1
-    """Sigma of another source's orientation where it tells none, rad."""
+    """Sigma of another source's orientation if it reports none, rad."""
 
     # --- heading ---
 
@@ -167,31 +167,31 @@ class FilterSettings(FixSettings):
     align_window: float = 60.0
     """Longest stretch of fixes that heading is found from, seconds."""
     align_speed: float = 1.0
-    """Least speed at which the receiver's velocity tells heading, m/s."""
+    """Least speed at which the receiver's velocity gives the heading, m/s."""
     reverse_speed: float = 6.0
-    """Speed from which on the vehicle is known to drive forward, m/s, where neither wheels nor accelerations tell: a
+    """Speed from which on the vehicle is known to drive forward, m/s, if neither wheels nor accelerations show it: a
     road vehicle's reverse gear is as short as its first and ends at about 20 km/h. For a vehicle that drives as fast
     either way set it to `maximum_speed`."""
 
     # --- losing and finding fixes ---
 
     recovery_fixes: int = 10
-    """How many refused fixes, agreeing with the way driven, before position is taken up anew from them."""
+    """How many refused fixes, that agree with the path driven, before the position is reset to them."""
     recovery_time: float = 20.0
     """How long they must have agreed, seconds: a reflection seldom lasts through 20 s of driving."""
     recovery_distance: float = 5.0
-    """How far the vehicle must have moved meanwhile, metres: at rest a wrong fix agrees as well as a right one."""
+    """How far the vehicle must have moved meanwhile, meters: at rest a wrong fix agrees as well as a right one."""
     rejection_timeout: float = 30.0
     """After how long of nothing but refused fixes the pose is not valid, seconds, however sure odometry is."""
     jump_epoch: float = 1.0
-    """A single correction that moves the pose by more, metres, begins a new epoch: a discontinuity for its users."""
+    """A single correction that moves the pose by more, meters, starts a new epoch: a discontinuity for its users."""
 
     # --- time ---
 
     horizon: float = 1.0
     """How late a measurement may come and still be fused at its instant, seconds."""
     replay_budget: int = 128
-    """Most measurements and inertial samples worked through anew for one that came late; more wait for the next."""
+    """Most measurements and inertial samples fused again for a delayed one; more wait for the next sample."""
 
     # --- validity ---
 
@@ -202,9 +202,9 @@ class FilterSettings(FixSettings):
     risk_per_hour: float = 1e-5
     """Probability in an hour that the true position, or heading, is outside its bound."""
     horizontal_limit: float = 20.0
-    """Horizontal bound past which a pose is not valid, metres."""
+    """Horizontal protection level beyond which a pose is not valid, meters."""
     heading_limit: float = 0.6
-    """Heading bound past which a pose is not valid, radians."""
+    """Heading protection level beyond which a pose is not valid, radians."""
     maximum_tilt: float = 1.05
     """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
     maximum_speed: float = 60.0

@@ -1,196 +1,251 @@
-"""State of the filter at an instant: what is restored when an out-of-sequence measurement arrives."""
+"""State of the filter at an instant: its phases as types. It is restored when an out-of-sequence measurement arrives.
+
+    Leveling  -- vertical and gyro biases found -->  Unaligned  -- heading found -->  Aligned
+
+A vehicle without an IMU is taken to be level. A warm start goes from Unaligned to Aligned by the persisted pose. After
+divergence, or a gap in the IMU that loses the vertical, the filter restarts with `Leveling(common.restart())`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias, TypeVar
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame
-from modelserver.estimation.filter.alignment import Passed
-from modelserver.estimation.filter.nav import Nav
-from modelserver.estimation.filter.stationary import Stillness
-from modelserver.estimation.filter.strapdown import Earth
+from modelserver.estimation.filter.eskf import ZERO, Earth, NavState
+from modelserver.estimation.filter.gnss_monitor import GnssMonitor
+from modelserver.estimation.filter.heading_alignment import HeadingAlignment
+from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 from modelserver.estimation.origin import OriginCapture
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode
 from modelserver.transforms.so3 import Vector3
 
-LINE = 3e-4
-"""How near, as a share, two changes must be to lie on one line: stamps of whole microseconds, 100 times a second."""
 
-MADE_UP = 3
-"""Samples in a row along one line, in all six numbers, that cannot be chance."""
-
-
-class Last(NamedTuple):
-    """The last measurement of a kind from a source that was compared: its instant, and its sample."""
+class PreviousSample(NamedTuple):
+    """The previous sample of a source and kind that was compared, and its instant."""
 
     utime: int
     sample: Sample | SwitchMode
 
 
-class Said(NamedTuple):
-    """What an inertial unit said last, at `utime`: is it alive?
+class PendingDecision(NamedTuple):
+    """A decision that takes effect at `utime`, when no delayed sample can change it any more.
 
-    `since` is from when on it says nothing else. `slope` is the change a second of its six numbers, and `even` how many
-    samples in a row have gone on along exactly that line.
+    `origin` is to be set; `resets_position`: the position is to be reset to the rejected fixes.
     """
-
-    utime: int
-    rate: Vector3
-    force: Vector3
-    since: int
-    slope: tuple[float, ...] = ()
-    even: int = 0
-
-    def followed(self, utime: int, rate: Vector3, force: Vector3) -> Said:
-        """Return what it said with one sample more."""
-        dt = (utime - self.utime) * 1e-6
-        if dt <= 0.0:
-            return self
-        if rate == self.rate and force == self.force:
-            return self._replace(utime=utime, slope=(), even=self.even + 1 if not self.slope else 1)
-        (a, b, c), (d, e, f) = self.rate, self.force
-        (g, h, i), (j, k, m) = rate, force
-        slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
-        on_line = bool(self.slope) and all(
-            abs(x - y) <= LINE * (0.3 + abs(x) + abs(y)) for x, y in zip(slope, self.slope, strict=True)
-        )
-        return Said(utime, rate, force, utime, slope, self.even + 1 if on_line else 0)
-
-    @property
-    def made_up(self) -> bool:
-        """Whether the numbers go along a line, or stay, as no noise lets them: someone filled a gap with them."""
-        return self.even >= MADE_UP
-
-
-class Pending(NamedTuple):
-    """A decision that takes effect at `utime`, when no sample that comes late can change it any more."""
 
     utime: int
     origin: Origin | None = None
-    take_up: bool = False
+    resets_position: bool = False
 
 
-class Steering(NamedTuple):
-    """The steering angle (rad) that the vehicle controller measured last, at `utime`; nan where it measures none."""
+class GyroBiases(NamedTuple):
+    """Gyro biases found while stationary, rad/s, and their sigma: a restarted filter continues with them."""
 
-    utime: int = 0
-    angle: float = math.nan
+    biases: Vector3
+    sigma: float
 
 
-class Resuming(NamedTuple):
-    """What an earlier run kept, while it waits for evidence.
+class WarmStart(NamedTuple):
+    """The state that an earlier run persisted, while it waits for evidence.
 
-    `since` is when it began to wait, 0 before levelling, `looked` the last look at the evidence. `fixes` counts those
-    in a row that agree with the kept pose, below 0 those that do not; `seen` is the last one's instant.
+    Attributes
+    ----------
+    restored: the persisted state.
+    since: when it began to wait, 0 before leveling.
+    checked_utime: the last look at the evidence.
+    num_fixes: fixes in a row that agree with the persisted pose; below 0 those that do not.
+    fix_utime: of the last of them.
     """
 
-    recalled: RestoredState
+    restored: RestoredState
     since: int = 0
-    looked: int = 0
-    fixes: int = 0
-    seen: int = 0
+    checked_utime: int = 0
+    num_fixes: int = 0
+    fix_utime: int = 0
 
 
-WHEELS_LAST = 1_000_000
-"""Microseconds for which what wheels said tells how fast the vehicle goes."""
+class HeadingCheck(NamedTuple):
+    """A segment of fixes that a restored heading is compared with, from `begin` to `utime` (0: none yet).
 
-
-class Proving(NamedTuple):
-    """A stretch of fixes that a resumed heading is held against, from `begin` to `utime` (0: none yet).
-
-    `place` is where the rolling frame was by the first fix, `way` what was driven since along the heading, metres, and
-    `velocity` what it is now, m/s; all complex, east + i north.
+    `position` is the rolling frame at the first fix, `travel` the distance travelled since along the heading, m, and
+    `velocity` the present velocity, m/s; all complex, east + i north.
     """
 
     utime: int = 0
     begin: int = 0
-    place: complex = 0j
-    way: complex = 0j
+    position: complex = 0j
+    travel: complex = 0j
     velocity: complex = 0j
 
 
-class FilterState(NamedTuple):
-    """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
+class Common(NamedTuple):
+    """What every phase has, and what changes less often than with each IMU sample.
 
-    `nav` is None while levelling. `site` is the tangent plane that N is east, north, up of once `phase` is ALIGNED.
-    `imu_utime` is the last inertial sample used, `heard` the first of levelling, `began` the first of its mean;
-    `said` what the unit said, and `guessed` whether that was made up; `wheels_utime` the last wheels used, and
-    `wheels_source` who told them. `passed` are fixes beside the way, for heading;
-    `unit` the way at speed 1 so far (s). `refused` are the fixes refused in a row, `refused_since` the first of
-    them; `confirmed` counts the fixes that were used, and `fix_utime` is the last that was used or confirmed.
-    `moved` is until when fixes say that the vehicle moves. `restless` is by how much faster than the settings say
-    what lingers in fixes wanders. `shown` is how far the pose goes with what lingers in fixes, metres along N,
-    `doubt` the variance that this adds, and `anchored` when another source last told the place along each axis.
-    `allowance` is what one outlier just within its gate may have moved the position by, metres, and
-    `conflict_utime` when a fix from beyond its gate was last used. `biases` are the gyros' with their sigma, kept
-    where the rest begins anew. `tilt` is how far gravity is off the geometry's up at start-up, where that is too
-    far; infinite where what is felt is no gravity. `warm_start` is what an earlier run stored, until it is used or not;
-    `proving` what a resumed heading is held against, until it is right or not. `steering` is the vehicle controller's
-    steering angle. Before heading is known, `gained` (m/s) and `swept` (m) are the first and the second integral of the
-    inertial unit's horizontal acceleration along N, and `undirected` is whether heading lacks only the direction of
-    travel: forward or backward.
+    Attributes
+    ----------
+    mode: which sources are used.
+    geodesy, capture: of the origin; None until it is set, and the fixes collected for it.
+    epoch: of the pose: it increases with each discontinuity.
+    gyro_biases: for a restart of the filter.
+    is_clock_stepped: whether the clock was set back and the heading has not been found since.
+    pending: decisions that wait, in order.
+    wheels: the wheels used last.
+    previous: the previous sample by source and kind.
+    moving_until: until when fixes show that the vehicle moves.
+    warm_start: the persisted state of an earlier run, until it is used or rejected.
     """
 
-    nav: Nav | None = None
-    stillness: Stillness = Stillness()
-    said: Said | None = None
-    imu_utime: int = 0
-    phase: Phase = Phase.LEVELING
     mode: Mode = Mode.FULL
-    earth: Earth = Earth()
-    site: LocalFrame | None = None
     geodesy: Geodesy | None = None
     capture: OriginCapture = OriginCapture()
-    pending: tuple[Pending, ...] = ()
-    standing: bool = False
-    began: int = 0
-    heard: int = 0
-    guessed: bool = False
-    wheels_utime: int = 0
-    wheels_rate: float = 0.0
-    wheels_source: str = ""
-    last: Mapping[tuple[str, str], Last] = MappingProxyType({})
-    rolled_utime: int = 0
-    rested_utime: int = 0
-    passed: tuple[Passed, ...] = ()
-    unit: complex = 0j
-    refused: tuple[Passed, ...] = ()
-    refused_since: int = 0
-    refused_count: int = 0
-    fix_utime: int = 0
-    confirmed: int = 0
-    moved: int = 0
-    fixed: Passed | None = None
-    restless: float = 1.0
-    shown: Vector3 = (0.0, 0.0, 0.0)
-    doubt: Vector3 = (0.0, 0.0, 0.0)
-    anchored: tuple[int, int, int] = (0, 0, 0)
-    allowance: float = 0.0
-    conflict_utime: int = 0
     epoch: int = 0
+    gyro_biases: GyroBiases | None = None
+    is_clock_stepped: bool = False
+    pending: tuple[PendingDecision, ...] = ()
+    wheels: WheelMonitor = WheelMonitor()
+    previous: Mapping[tuple[str, str], PreviousSample] = MappingProxyType({})
+    moving_until: int = 0
+    warm_start: WarmStart | None = None
+
+    def restart(self) -> Common:
+        """Return what a restarted filter continues with: origin, mode and good gyro biases, in a new epoch."""
+        return Common(self.mode, self.geodesy, self.capture, self.epoch + 1, self.gyro_biases)
+
+    def measures_wheel_speed(self, utime: int) -> bool:
+        """Return whether the wheels measure the speed of the vehicle at an instant."""
+        return self.mode is not Mode.NO_WHEELS and self.wheels.measures_speed(utime)
+
+
+class MotionConstraints(NamedTuple):
+    """Whether the vehicle is stationary, and when the constraints were last used (utime)."""
+
+    is_stationary: bool = False
+    zupt_utime: int = 0
+    non_holonomic_utime: int = 0
+
+
+class Leveling(NamedTuple):
+    """Coarse alignment: the mean of the IMU gives the vertical, and while stationary the gyro biases.
+
+    Attributes
+    ----------
+    first_utime: the first IMU sample of leveling; 0: none yet.
+    mean_since: the first sample of the present mean.
+    is_stationary: whether the mean is of a stationary vehicle.
+    force_sum, rate_sum, num_samples: of the mean.
+    tilt: angle between gravity and the geometry's up, rad, if it is beyond its limit; infinite if the force is not
+        gravity; else 0.
+    """
+
+    common: Common = Common()
+    imu: ImuMonitor = ImuMonitor()
+    stationary: StationaryDetector = StationaryDetector()
+    first_utime: int = 0
+    mean_since: int = 0
+    is_stationary: bool = False
+    force_sum: Vector3 = ZERO
+    rate_sum: Vector3 = ZERO
+    num_samples: int = 0
     tilt: float = 0.0
-    level_force: Vector3 = (0.0, 0.0, 0.0)
-    level_rate: Vector3 = (0.0, 0.0, 0.0)
-    level_count: int = 0
-    biases: tuple[Vector3, float] | None = None
-    stepped: bool = False
-    warm_start: Resuming | None = None
-    proving: Proving | None = None
-    steering: Steering = Steering()
-    gained: complex = 0j
-    swept: complex = 0j
-    undirected: bool = False
 
-    def on_wheels(self, utime: int) -> bool:
-        """Return whether wheels tell how fast the vehicle goes at an instant."""
-        return self.mode is not Mode.NO_WHEELS and self.wheels_utime > 0 and utime - self.wheels_utime < WHEELS_LAST
+    @property
+    def phase(self) -> Phase:
+        """LEVELING."""
+        return Phase.LEVELING
 
-    def felt(self, nav: Nav, stillness: Stillness, said: Said, imu_utime: int) -> FilterState:
-        """Return the state after an inertial sample.
 
-        What `_replace` does, at a quarter of its cost: this is done for every one. The four stand first for it.
-        """
-        return FilterState._make((nav, stillness, said, imu_utime, *self[4:]))
+class Unaligned(NamedTuple):
+    """Level, at an unknown heading: N is where the filter started, rotated about up by an unknown angle.
+
+    The four that change with each IMU sample are first. `site` is the tangent plane at the first fix, `leveled_since`
+    the first sample of leveling.
+    """
+
+    nav: NavState
+    imu: ImuMonitor
+    stationary: StationaryDetector
+    alignment: HeadingAlignment
+    constraints: MotionConstraints
+    common: Common
+    earth: Earth = Earth()
+    site: LocalFrame | None = None
+    leveled_since: int = 0
+
+    @property
+    def phase(self) -> Phase:
+        """UNALIGNED."""
+        return Phase.UNALIGNED
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the vehicle is stationary."""
+        return self.constraints.is_stationary
+
+    def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Unaligned:
+        """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
+        alignment = self.alignment.update(self.nav, nav) if nav.utime > self.nav.utime else self.alignment
+        return Unaligned(nav, imu, stationary, alignment, *self[4:])
+
+    def with_nav(self, nav: NavState) -> Unaligned:
+        """Return the state propagated to a later instant."""
+        alignment = self.alignment.update(self.nav, nav) if nav.utime > self.nav.utime else self.alignment
+        return self._replace(nav=nav, alignment=alignment)
+
+
+class Aligned(NamedTuple):
+    """The vehicle in the world: N is east, north, up of the tangent plane `site`.
+
+    `heading_check` is what a restored heading is compared with, until it is confirmed or wrong.
+    """
+
+    nav: NavState
+    imu: ImuMonitor
+    stationary: StationaryDetector
+    constraints: MotionConstraints
+    common: Common
+    earth: Earth
+    site: LocalFrame
+    gnss: GnssMonitor = GnssMonitor()
+    heading_check: HeadingCheck | None = None
+
+    @property
+    def phase(self) -> Phase:
+        """ALIGNED."""
+        return Phase.ALIGNED
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the vehicle is stationary."""
+        return self.constraints.is_stationary
+
+    def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Aligned:
+        """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
+        return Aligned(nav, imu, stationary, *self[3:])
+
+    def with_nav(self, nav: NavState) -> Aligned:
+        """Return the state propagated to a later instant."""
+        return self._replace(nav=nav)
+
+
+Navigating: TypeAlias = Unaligned | Aligned
+FilterState: TypeAlias = Leveling | Unaligned | Aligned
+
+N = TypeVar("N", Unaligned, Aligned, Unaligned | Aligned)
+"""A navigating state, for functions that return the phase that they get; the last is for a phase that is not known."""
+S = TypeVar("S", Leveling, Unaligned, Aligned, Unaligned | Aligned, Leveling | Unaligned | Aligned)
+"""Any state, in the same way."""
+
+
+def is_speed_known(state: Navigating) -> bool:
+    """Return whether the state knows the speed, and its sign along the vehicle's own axis."""
+    nav = state.nav
+    if state.common.measures_wheel_speed(nav.utime):
+        return True
+    P = nav.covariance
+    sigma = math.sqrt(max(P[3, 3], P[4, 4]))
+    return sigma < max(0.3 * math.hypot(nav.velocity[0], nav.velocity[1]), 0.15)

@@ -1,26 +1,27 @@
-"""Measurement buffer: a delayed (out-of-sequence) measurement is inserted, and what follows is fused again.
+"""Timeline: delayed (out-of-sequence) measurements.
 
-Delayed measurements: each is inserted at its instant and what follows is fused again, a bounded amount at a time.
-Whatever the order of arrival, the state in the end is that of the one order: instant, source, sequence.
+Each item is inserted at its instant, and what follows is fused again from the state before it, a bounded number of
+items at a time. Whatever the order of arrival, the final state is that of one order: instant, source, sequence number.
+Items older than the horizon are settled: their decisions are final, and the state before the rest is the base.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
-from modelserver.estimation.filter import engine
-from modelserver.estimation.filter.items import Item
+from modelserver.estimation.filter.fusion import Item
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
+from modelserver.estimation.filter.step import step
 from modelserver.messages import Decision
 
-MOST = 8192
-"""Items within a horizon: more come from a flood, and are refused."""
+MAX_ITEMS: Final = 8192
+"""Items within a horizon: more come from a flood, and are rejected."""
 
 
 class Entry(NamedTuple):
-    """An item, the state after it (None: not worked through yet), and what became of it."""
+    """An item, the state after it (None: not fused yet), and the decisions on it."""
 
     item: Item
     state: FilterState | None
@@ -30,92 +31,92 @@ class Entry(NamedTuple):
 Key: TypeAlias = tuple[int, str, int, int]
 
 
-def _key(entry: Entry) -> Key:
+def _get_key(entry: Entry) -> Key:
     return entry.item.key
 
 
-def _order(item: Item) -> tuple[int, str]:
-    """Return what decides between two items of one source and instant; samples are values, and say all in words."""
+def _get_order(item: Item) -> tuple[int, str]:
+    """Return what orders two items of one source and instant; samples are values, so their repr is complete."""
     return item.seq, repr(item.sample)
 
 
 class Timeline(NamedTuple):
-    """`base` is the state before all `entries`; the first `fused` of them are worked through."""
+    """`base` is the state before all `entries`; the first `num_fused` of them are fused."""
 
     base: FilterState
     entries: tuple[Entry, ...] = ()
-    fused: int = 0
+    num_fused: int = 0
 
     @property
     def newest(self) -> FilterState:
-        """The state after all that is worked through."""
-        state = self.entries[self.fused - 1].state if self.fused else self.base
+        """The state after all that is fused."""
+        state = self.entries[self.num_fused - 1].state if self.num_fused else self.base
         assert state is not None
         return state
 
-    def settled(self, limit: int) -> bool:
-        """Return whether everything up to the instant `limit` is worked through."""
-        return self.fused == len(self.entries) or self.entries[self.fused].item.utime > limit
+    def is_fused(self, limit: int) -> bool:
+        """Return whether everything up to the instant `limit` is fused."""
+        return self.num_fused == len(self.entries) or self.entries[self.num_fused].item.utime > limit
 
-    def with_item(self, item: Item) -> tuple[Timeline, Item | None] | str:
-        """Return the timeline with one item more in its place, or in one word why not.
+    def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
+        """Return the timeline with an item more, and the item that it replaces; or in one word why not.
 
-        With it comes the item that had to make room: of two that one source says of one instant the lower number
-        counts, whichever came first.
+        Of two items of one source and instant the lower sequence number counts, whichever arrived first.
         """
         entries = self.entries
         key = item.key
         if not entries or key > entries[-1].item.key:
             at = len(entries)
-        elif len(entries) >= MOST:
+        elif len(entries) >= MAX_ITEMS:
             return "overload"
         else:
-            at = bisect_left(entries, key, key=_key)
-        out = None
-        twin = self._twin(item, at)
-        if twin is not None:
-            out = entries[twin].item
-            if _order(out) <= _order(item):
+            at = bisect_left(entries, key, key=_get_key)
+        replaced = None
+        duplicate = self._find_duplicate(item, at)
+        if duplicate is not None:
+            replaced = entries[duplicate].item
+            if _get_order(replaced) <= _get_order(item):
                 return "duplicate"
-            entries = entries[:twin] + entries[twin + 1 :]
-        return Timeline(self.base, entries[:at] + (Entry(item, None, ()),) + entries[at:], min(self.fused, at)), out  # noqa: RUF005 - a third faster here
+            entries = entries[:duplicate] + entries[duplicate + 1 :]
+        entries = entries[:at] + (Entry(item, None, ()),) + entries[at:]  # noqa: RUF005 - a third faster here
+        return Timeline(self.base, entries, min(self.num_fused, at)), replaced
 
-    def _twin(self, item: Item, at: int) -> int | None:
-        """Return where the same source says the same of the same instant; `at` is where the item's place would be.
+    def _find_duplicate(self, item: Item, at: int) -> int | None:
+        """Return the index of the same measurement of the same source and instant; `at` is the item's own index.
 
-        A source measures a thing once at an instant, whatever its numbering; all of that instant stand side by side.
+        A source measures a thing once at an instant, whatever its numbering; all of that instant are side by side.
         """
         for around in (range(at - 1, -1, -1), range(at, len(self.entries))):
             for n in around:
                 other = self.entries[n].item
                 if other.utime != item.utime or other.source != item.source:
                     break
-                # a range of the same source name is no inertial sample
+                # different types of samples may have the same source name
                 if other.part == item.part and type(other.sample) is type(item.sample):
                     return n
         return None
 
-    def worked(self, setup: Setup, budget: int, limit: int) -> Timeline:
-        """Return the timeline with up to `budget` items more worked through, none later than the instant `limit`."""
-        entries, at = self.entries, self.fused
-        if self.settled(limit):
+    def fuse(self, setup: Setup, budget: int, limit: int) -> Timeline:
+        """Return the timeline with up to `budget` items more fused, none later than the instant `limit`."""
+        entries, at = self.entries, self.num_fused
+        if self.is_fused(limit):
             return self
         state = self.newest
-        fresh = []
+        fused = []
         for entry in entries[at : at + budget]:
             if entry.item.utime > limit:
                 break
-            state, decisions = engine.fused(setup, state, entry.item)
-            fresh.append(Entry(entry.item, state, decisions))
-        until = at + len(fresh)
-        return Timeline(self.base, entries[:at] + tuple(fresh) + entries[until:], until)
+            state, decisions = step(setup, state, entry.item)
+            fused.append(Entry(entry.item, state, decisions))
+        until = at + len(fused)
+        return Timeline(self.base, entries[:at] + tuple(fused) + entries[until:], until)
 
-    def settled_before(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:
-        """Return the timeline without what is older than `utime` and worked through, and what became of that."""
+    def settle(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:
+        """Return the timeline without the fused items older than `utime`, and the decisions on them."""
         entries = self.entries
         cut = 0
-        # one or two are past at a time
-        while cut < self.fused and entries[cut].item.utime < utime:
+        # one or two at a time
+        while cut < self.num_fused and entries[cut].item.utime < utime:
             cut += 1
         if not cut:
             return self, ()
@@ -124,11 +125,11 @@ class Timeline(NamedTuple):
             decisions += entry.decisions
         state = entries[cut - 1].state
         assert state is not None
-        return Timeline(state, entries[cut:], self.fused - cut), decisions
+        return Timeline(state, entries[cut:], self.num_fused - cut), decisions
 
-    def state_at(self, utime: int) -> FilterState:
-        """Return the newest state worked through that is not newer than an instant; the base before all."""
-        for entry in reversed(self.entries[: self.fused]):
+    def get_state_at(self, utime: int) -> FilterState:
+        """Return the newest fused state not newer than an instant; the base before all."""
+        for entry in reversed(self.entries[: self.num_fused]):
             if entry.item.utime <= utime and entry.state is not None:
                 found: FilterState = entry.state
                 return found

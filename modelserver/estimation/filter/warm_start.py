@@ -1,189 +1,294 @@
-"""Warm start: restore persisted biases at leveling, and the pose where the vehicle cannot have moved.
+"""Warm start: restore persisted biases at leveling, and the pose if the vehicle cannot have moved.
 
-Nobody watched the vehicle between the two runs. Biases change slowly whatever was done with it, so they are taken
-up with what they may have wandered. The pose is not: heading cannot be seen at rest. It is used only where the
-vehicle stood when it was kept and stands now, the time between is short, the wheels' counters went on and did not
-move, gravity stands as it stood, and fixes agree where there are any. Until all of this is told there is no pose,
-and where any of it is missing the start is as cold as without a kept pose. What was resumed is held against the first
-metres driven: see `proving`.
+Nobody observed the vehicle between the two runs. Biases change slowly whatever happens, so they are restored with the
+variance of their drift (`age_biases`). The pose is not: a heading cannot be observed while stationary. It is used only
+if the vehicle was stationary when it was stored and is now, the time between is short, the wheels' counters continue
+and have not moved, gravity points the same way, and fixes agree if there are any. Until all of this is known there is
+no pose, and if any of it is missing the start is as cold as without a stored pose. A restored heading is then checked
+against the first meters driven (`heading_check`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame
-from modelserver.estimation.filter import kalman, motion
-from modelserver.estimation.filter.bias_inflation import aged, with_biases
-from modelserver.estimation.filter.handling import without_gps
-from modelserver.estimation.filter.items import NOTHING, Fused
-from modelserver.estimation.filter.layout import STRAPDOWN
-from modelserver.estimation.filter.measurements.gps import WANDER
-from modelserver.estimation.filter.nav import ZERO, Nav, jacobian_of_point
-from modelserver.estimation.filter.persistence import KEPT, ago, ways
-from modelserver.estimation.filter.setup import ROCKING, Setup
-from modelserver.estimation.filter.state import FilterState, Proving
-from modelserver.estimation.filter.strapdown import Earth
-from modelserver.messages import Decision, Mode, PersistedPose, PersistedState, Phase, Verdict, WheelsSample
+from modelserver.estimation.filter import eskf
+from modelserver.estimation.filter.error_layout import STRAPDOWN
+from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, Earth, NavState, level_attitude
+from modelserver.estimation.filter.fusion import NOTHING, Fused, report_event, uses_gnss
+from modelserver.estimation.filter.gnss_monitor import GnssMonitor, OutputOffset
+from modelserver.estimation.filter.leveling import get_tilt_by_bias
+from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR
+from modelserver.estimation.filter.measurements.measurement import point_jacobian
+from modelserver.estimation.filter.persistence import WARM_START, format_age, get_travel
+from modelserver.estimation.filter.setup import STATIONARY_ANGLE_WALK, Setup
+from modelserver.estimation.filter.state import (
+    Aligned,
+    FilterState,
+    HeadingCheck,
+    Leveling,
+    Navigating,
+    Unaligned,
+    WarmStart,
+)
+from modelserver.estimation.filter.wheel_monitor import RECEIVED
+from modelserver.messages import Decision, Mode, PersistedPose, PersistedState, Verdict, WheelsSample
 from modelserver.transforms import so3
+from modelserver.transforms.so3 import Array
 
-FIXES = 3
-"""Fixes in a row that must agree with the kept pose, or disagree: one of them may be a stray."""
+NUM_FIXES: Final = 3
+"""Fixes in a row that must agree with the persisted pose, or disagree: one of them may be an outlier."""
 
-NO_FIX_FOR = 3.0
-"""Seconds of standing without a fix after which a kept pose is used without asking any."""
+FIX_TIMEOUT: Final = 3.0
+"""Seconds stationary without a fix after which a persisted pose is used without one."""
 
-SAME_WAY = 0.02
-"""Metres by which a wheel's counter may differ and still have stood: two pulses of a coarse encoder."""
+TRAVEL_TOLERANCE: Final = 0.02
+"""Meters by which a stationary wheel's counter may differ: two pulses of a coarse encoder."""
 
-LEAST_TRACK = 0.2
-"""Metres between the wheels on the left and those on the right, below which they do not tell a turn."""
+MIN_TRACK: Final = 0.2
+"""Meters between the left and the right wheels, below which they do not show a turn."""
 
-SAME_TILT = 0.03
-"""Radians by which gravity may lean otherwise: 1.7 deg, passengers and load on the springs."""
+TILT_TOLERANCE: Final = 0.03
+"""Radians by which gravity may differ: 1.7 deg, passengers and load on the springs."""
 
-WAITS = 30.0
-"""Seconds after which evidence that has not come is not waited for any more."""
+EVIDENCE_TIMEOUT: Final = 30.0
+"""Seconds to wait for evidence."""
 
-LOOKED_US = 200_000
+CHECK_PERIOD_US: Final = 200_000
 """Microseconds between two looks at the evidence."""
 
+BIAS_GATE: Final = 5.0
+"""Sigmas by which the persisted gyro biases may differ from the mean rate of a stationary IMU."""
 
-# --- going on -----------------------------------------------------------------------------------------------
+SWITCHED_SHARE: Final = 0.25
+"""Share of its initial sigma by which a bias may change when its unit is switched off and on."""
 
 
-def gone_on(setup: Setup, state: FilterState, utime: int) -> Fused:
-    """Return the state with what was kept taken up as far as it may be, and a word for each step."""
-    waiting, nav = state.warm_start, state.nav
-    if waiting is None or nav is None or utime < waiting.looked + LOOKED_US:
+def advance(setup: Setup, state: FilterState, utime: int) -> Fused:
+    """Return the state with the warm start continued as far as the evidence allows, and a decision for each step."""
+    waiting = state.common.warm_start
+    if waiting is None or isinstance(state, Leveling) or utime < waiting.checked_utime + CHECK_PERIOD_US:
         return state, NOTHING
-    kept = waiting.recalled.state
-    assert kept is not None
-    age = max(waiting.recalled.age, (nav.utime - kept.sensor_utime) * 1e-6)
+    persisted = waiting.restored.state
+    assert persisted is not None
+    age = max(waiting.restored.age, (state.nav.utime - persisted.sensor_utime) * 1e-6)
     if not waiting.since:
-        return _begun(setup, state, nav, kept, age)
-    state = state._replace(warm_start=waiting._replace(looked=utime))
-    if state.phase is Phase.ALIGNED:
-        return _pose_left(state, age, "something else told the heading first")
-    why = _hopeless(setup, state, kept, 0.0)
-    if why:
-        return _pose_left(state, age, why)
-    pose = kept.pose
+        return _restore_biases(setup, state, waiting, persisted, age)
+    waiting = waiting._replace(checked_utime=utime)
+    state = _with_warm_start(state, waiting)
+    if isinstance(state, Aligned):
+        return _drop_pose(state, age, "another source measured the heading first")
+    reason = _find_obstacle(setup, state, persisted, 0.0)
+    if reason:
+        return _drop_pose(state, age, reason)
+    pose = persisted.pose
     assert pose is not None
-    moved = _moved(setup, state, pose, utime)
-    if moved is None:
-        return _waited(
-            state, utime, age, f"wheels ({pose.wheels_source}) and inertial unit do not stand still together"
-        )
-    if moved:
-        return _pose_left(state, age, moved)
-    resumed = _resumed(setup, state, nav, kept, pose, age)
-    if resumed is None:
-        return _pose_left(state, age, "its place is out of reach of the origin")
-    return _by_fixes(setup, state, resumed, age, utime)
+    motion = _find_motion(setup, state, pose, utime)
+    if motion is None:
+        text = f"wheels ({pose.wheels_source}) and inertial unit are not stationary together"
+        return _wait(state, waiting, utime, age, text)
+    if motion:
+        return _drop_pose(state, age, motion)
+    restored = _restore_pose(setup, state, persisted, pose, age)
+    if restored is None:
+        return _drop_pose(state, age, "its position is out of range of the origin")
+    return _check_fixes(setup, state, restored, age, utime)
 
 
-def _begun(setup: Setup, state: FilterState, nav: Nav, kept: PersistedState, age: float) -> Fused:
-    """Return the state that was just levelled, with the biases that were kept."""
-    waiting = state.warm_start
-    assert waiting is not None
-    if nav.utime < kept.sensor_utime:
-        why = "the sensors' clock stands before what was kept"
-        return _without(state, f"cold start: what was kept {ago(age)} is not used: {why}")
-    values, P = aged(setup, kept, age, waiting.recalled.max_pose_age)
-    begun = with_biases(setup, state, nav, values, P)
-    if begun is None:
-        why = "its gyro biases are not those of the standing unit: another one, or one that changed its temperature"
-        return _without(state, f"cold start: what was kept {ago(age)} is not used: {why}")
-    state = state._replace(nav=begun)
-    unwatched = max(waiting.recalled.age, ((state.began or nav.utime) - kept.sensor_utime) * 1e-6)
-    why = _hopeless(setup, state, kept, unwatched)
-    if why:
-        return _pose_left(state, age, why)
-    state = state._replace(warm_start=waiting._replace(since=nav.utime, looked=nav.utime))
-    return state, (_word(state, f"warm start: biases kept {ago(age)}; the pose of then waits for evidence"),)
+# --- biases -------------------------------------------------------------------------------------------------
 
 
-# --- the evidence -------------------------------------------------------------------------------------------
+def _restore_biases(
+    setup: Setup, state: Navigating, waiting: WarmStart, persisted: PersistedState, age: float
+) -> Fused:
+    """Return a state that was just leveled, with the persisted biases."""
+    nav = state.nav
+    if nav.utime < persisted.sensor_utime:
+        reason = "the sensors' clock is before the stored time"
+        return _drop(state, f"cold start: the state stored {format_age(age)} is not used: {reason}")
+    values, P = age_biases(setup, persisted, age, waiting.restored.max_pose_age)
+    with_biases = apply_biases(setup, state, values, P)
+    if with_biases is None:
+        reason = "its gyro biases are not those of the stationary IMU: another unit, or another temperature"
+        return _drop(state, f"cold start: the state stored {format_age(age)} is not used: {reason}")
+    state = state._replace(nav=with_biases)
+    leveled_since = state.leveled_since if isinstance(state, Unaligned) else 0
+    unobserved = max(waiting.restored.age, ((leveled_since or nav.utime) - persisted.sensor_utime) * 1e-6)
+    reason = _find_obstacle(setup, state, persisted, unobserved)
+    if reason:
+        return _drop_pose(state, age, reason)
+    state = _with_warm_start(state, waiting._replace(since=nav.utime, checked_utime=nav.utime))
+    return state, (_report(state, f"warm start: biases stored {format_age(age)}; the stored pose waits for evidence"),)
 
 
-def _hopeless(setup: Setup, state: FilterState, kept: PersistedState, unwatched: float) -> str:
-    """Return why the kept pose cannot be used, whatever comes; empty where it may be.
+def age_biases(
+    setup: Setup, persisted: PersistedState, age: float, max_pose_age: float
+) -> tuple[tuple[float, ...], Array]:
+    """Return biases and additional states (6 + m) as expected after `age` seconds, and the covariance (n, n).
 
-    `unwatched` is for how long, seconds, nobody felt the vehicle.
+    A random walk of density q^2 that has reached its initial sigma is taken for a Gauss-Markov process with that sigma:
+    its time constant is 2 sigma^2 / q^2, so an old enough value is worth no more than none. After more than
+    `max_pose_age` seconds units may have been switched off and on.
     """
-    pose, waiting = kept.pose, state.warm_start
+    settings, n = setup.settings, setup.layout.size
+    keep, add = np.ones(n), np.zeros(n)
+    switched = SWITCHED_SHARE**2 if age > max_pose_age else 0.0
+
+    def add_walk(at: slice, sigma: float, walk: float) -> None:
+        share = math.exp(-age * walk * walk / (2.0 * sigma * sigma)) if walk > 0.0 else 1.0
+        keep[at] = share
+        add[at] = sigma * sigma * (1.0 - share * share + switched)
+
+    add_walk(slice(9, 12), settings.gyro_bias_sigma, settings.gyro_bias_walk)
+    add_walk(slice(12, 15), settings.accelerometer_bias_sigma, settings.accelerometer_bias_walk)
+    switched, at = 0.0, STRAPDOWN
+    for extra in setup.layout.extras:
+        where = slice(at, at + len(extra.names))
+        if math.isfinite(extra.time_constant):
+            keep[where] = math.exp(-age / extra.time_constant)
+            add[where] = extra.sigma**2 * (1.0 - keep[at] ** 2)
+        else:
+            add_walk(where, extra.sigma, extra.walk)
+        at = where.stop
+    P = np.array(persisted.covariance).reshape(n, n) * np.outer(keep, keep)
+    P.reshape(-1)[:: n + 1] += add
+    values = np.array((*persisted.gyro_bias, *persisted.accelerometer_bias, *persisted.extras)) * keep[9:]
+    return tuple(values.tolist()), 0.5 * (P + P.T)
+
+
+def apply_biases(setup: Setup, state: Navigating, values: tuple[float, ...], P: Array) -> NavState | None:
+    """Return the leveled state with persisted biases; None if the gyros of a stationary IMU contradict them.
+
+    Up was found without an accelerometer bias: it is computed again with the persisted one, and correlated with it. The
+    mean rate of a stationary IMU and the persisted gyro biases are combined.
+    """
+    nav = state.nav
+    n, after = setup.layout.size, nav.covariance.copy()
+    rates, mean = np.array(values[:3]), np.array(nav.gyro_bias)
+    Pg, Pn = P[9:12, 9:12], nav.covariance[9:12, 9:12]
+    is_stationary_level = state.is_stationary and bool(nav.covariance[6:9, 12:15].any())
+    uses_imu = setup.uses_imu(state.common.mode)
+    attitude = nav.attitude
+    if is_stationary_level:
+        S = Pg + Pn
+        if (np.abs(mean - rates) > BIAS_GATE * np.sqrt(np.diagonal(S))).any():
+            return None
+        gain = np.linalg.solve(S, Pg).T
+        rates, Pg = rates + gain @ (mean - rates), Pg - gain @ Pg
+    if uses_imu:
+        after[9:12, :], after[:, 9:12] = 0.0, 0.0
+        after[9:12, 9:12] = 0.5 * (Pg + Pg.T)
+        after[12:15, :], after[:, 12:15] = 0.0, 0.0
+        Pa = after[12:15, 12:15] = P[12:15, 12:15]
+    if is_stationary_level:
+        g = STANDARD_GRAVITY
+        x, y, z = nav.up
+        attitude = level_attitude((x * g - values[3], y * g - values[4], z * g - values[5]))
+        M = get_tilt_by_bias(attitude)
+        after[6:9, :], after[:, 6:9] = 0.0, 0.0
+        after[6:9, 6:9] = M @ Pa @ M.T + np.diag((1e-6, 1e-6, 0.0))
+        after[6:9, 12:15] = M @ Pa
+        after[12:15, 6:9] = after[6:9, 12:15].T
+    extras = list(nav.extras)
+    for at in range(STRAPDOWN, n):
+        # a Gauss-Markov state decays within a minute
+        if not setup.layout.decay_rates[at - STRAPDOWN]:
+            extras[at - STRAPDOWN] = values[at - 9]
+            after[at, :], after[:, at] = 0.0, 0.0
+            after[at, at] = P[at, at]
+    nav = nav._replace(extras=tuple(extras), covariance=after)
+    if not uses_imu:
+        return nav
+    a, b, c = rates.tolist()
+    return nav._replace(
+        attitude=attitude,
+        position=so3.rotate(attitude, setup.rig.imu),
+        gyro_bias=(a, b, c),
+        accelerometer_bias=(values[3], values[4], values[5]),
+    )
+
+
+# --- evidence -----------------------------------------------------------------------------------------------
+
+
+def _find_obstacle(setup: Setup, state: Navigating, persisted: PersistedState, unobserved: float) -> str:
+    """Return why the persisted pose cannot be used whatever comes, empty if it may be.
+
+    `unobserved` is for how long, seconds, nobody observed the vehicle.
+    """
+    pose, waiting, mode = persisted.pose, state.common.warm_start, state.common.mode
     assert waiting is not None
     if pose is None:
-        return "the vehicle did not stand with a valid pose then"
-    longest = waiting.recalled.max_pose_age
-    if not motion.inertial(setup, state.mode) or state.mode in (Mode.NO_WHEELS, Mode.DEAD_RECKONING):
-        return f"mode {state.mode.name.lower()} cannot tell that it is still right"
-    if unwatched > longest:
-        return f"nobody watched the vehicle for {unwatched:.0f} s, longer than warm_start.max_pose_age_s"
-    wheels = setup.wheels
-    sides = [wheels.contacts[name][1] for name, _ in pose.wheels if name in wheels.contacts] if wheels else []
-    if not sides or max(sides) - min(sides) < LEAST_TRACK:
-        return "no wheels on both sides tell ways, so nothing tells whether it was turned meanwhile"
-    if max(abs(way) for _, way in pose.wheels) <= 2.0 * SAME_WAY:
-        # such a counter cannot be told from one that was started anew
-        return "the wheels' counters had told no way yet"
+        return "the vehicle was not stationary with a valid pose then"
+    if not setup.uses_imu(mode) or mode in (Mode.NO_WHEELS, Mode.DEAD_RECKONING):
+        return f"mode {mode.name.lower()} cannot verify it"
+    if unobserved > waiting.restored.max_pose_age:
+        return f"the vehicle was unobserved for {unobserved:.0f} s, longer than warm_start.max_pose_age_s"
+    if _get_track(setup, pose) < MIN_TRACK:
+        return "no wheels on both sides measure travel, so a turn meanwhile would not show"
+    if max(abs(travel) for _, travel in pose.wheels) <= 2.0 * TRAVEL_TOLERANCE:
+        # a counter near 0 looks the same as one that was restarted
+        return "the wheels' counters had measured no travel yet"
     return ""
 
 
-def _moved(setup: Setup, state: FilterState, pose: PersistedPose, utime: int) -> str | None:
-    """Return how the vehicle was moved since, empty where it was not; None while nothing says that it stands."""
-    seen = state.last.get((pose.wheels_source, "seen"))
-    if seen is None:
+def _get_track(setup: Setup, pose: PersistedPose) -> float:
+    """Return the distance between the leftmost and the rightmost wheel of a persisted pose, m; 0 without wheels."""
+    contacts = setup.wheels.contacts if setup.wheels is not None else {}
+    sides = [contacts[name][1] for name, _ in pose.wheels if name in contacts]
+    return max(sides) - min(sides) if sides else 0.0
+
+
+def _find_motion(setup: Setup, state: Navigating, pose: PersistedPose, utime: int) -> str | None:
+    """Return how the vehicle has moved since, empty if it has not; None while nothing shows that it is stationary."""
+    received = state.common.previous.get((pose.wheels_source, RECEIVED))
+    if received is None:
         return None
-    sample = seen.sample
+    sample = received.sample
     assert isinstance(sample, WheelsSample)
     if sample.header.seq <= pose.wheels_seq:
-        return "the wheels' driver was started anew, so nothing tells whether they rolled meanwhile"
-    now = dict(ways(sample))
+        return "the wheels' driver was restarted, so travel meanwhile would not show"
+    now = dict(get_travel(sample))
     if any(name not in now for name, _ in pose.wheels):
-        return "the wheels do not tell the ways that they told then"
-    rolled = max(abs(now[name] - way) for name, way in pose.wheels)
-    if rolled > SAME_WAY:
+        return "the wheels do not measure the travel that they measured then"
+    rolled = max(abs(now[name] - travel) for name, travel in pose.wheels)
+    if rolled > TRAVEL_TOLERANCE:
         return f"the wheels have rolled {rolled:.2f} m since"
-    if not (state.standing and state.stillness.vouched(utime)):
+    if not (state.is_stationary and state.stationary.is_confirmed_by_wheels(utime)):
         return None
-    nav = state.nav
-    assert nav is not None
-    lean = so3.rotate(so3.conjugate(pose.attitude), (0.0, 0.0, 1.0))
-    tilt = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(lean, nav.up, strict=True)))))
-    if tilt > SAME_TILT:
-        return f"it leans otherwise than then, by {math.degrees(tilt):.1f} deg"
+    up = so3.rotate(so3.conjugate(pose.attitude), (0.0, 0.0, 1.0))
+    tilt = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(up, state.nav.up, strict=True)))))
+    if tilt > TILT_TOLERANCE:
+        return f"its tilt has changed by {math.degrees(tilt):.1f} deg"
     return ""
 
 
-def _resumed(
-    setup: Setup, state: FilterState, nav: Nav, kept: PersistedState, pose: PersistedPose, age: float
-) -> FilterState | None:
-    """Return the state in the world as it was kept, less sure by what nobody saw; None out of the origin's reach."""
-    waiting = state.warm_start
-    assert waiting is not None
-    values, P = aged(setup, kept, age, waiting.recalled.max_pose_age)
-    wheels = setup.wheels
-    assert wheels is not None
-    sides = [wheels.contacts[name][1] for name, _ in pose.wheels if name in wheels.contacts]
+def _restore_pose(
+    setup: Setup, state: Unaligned, persisted: PersistedState, pose: PersistedPose, age: float
+) -> Aligned | None:
+    """Return the state at the persisted pose, inflated by what nobody observed; None out of the origin's range."""
+    common, nav = state.common, state.nav
+    assert common.warm_start is not None
+    values, P = age_biases(setup, persisted, age, common.warm_start.restored.max_pose_age)
     P[3:6, :], P[:, 3:6] = 0.0, 0.0
     diagonal = P.reshape(-1)[:: len(P) + 1]
-    diagonal[0:3] += SAME_WAY**2
+    diagonal[0:3] += TRAVEL_TOLERANCE**2
     diagonal[3:6] = setup.settings.stationary_sigma**2
-    diagonal[6:8] += (SAME_TILT / 3.0) ** 2
-    diagonal[8] += (0.5 * SAME_WAY / (max(sides) - min(sides))) ** 2 + ROCKING**2 * age
+    diagonal[6:8] += (TILT_TOLERANCE / 3.0) ** 2
+    diagonal[8] += (0.5 * TRAVEL_TOLERANCE / _get_track(setup, pose)) ** 2 + STATIONARY_ANGLE_WALK**2 * age
     site = LocalFrame.at(pose.latitude_deg, pose.longitude_deg, pose.height)
-    if state.geodesy is not None:
+    if common.geodesy is not None:
         try:
-            state.geodesy.utm_from_ecef(site.to_ecef(pose.position))
+            common.geodesy.utm_from_ecef(site.to_ecef(pose.position))
         except GeodesyError:
             return None
-    since = round(age * 1e6) + kept.sensor_utime - pose.fix_utime
-    return state._replace(
-        nav=nav._replace(
+    since = round(age * 1e6) + persisted.sensor_utime - pose.fix_utime
+    return Aligned(
+        nav._replace(
             position=pose.position,
             velocity=ZERO,
             attitude=so3.normalize(pose.attitude),
@@ -194,78 +299,79 @@ def _resumed(
             lag=0.0,
             impulse=ZERO,
         ),
-        phase=Phase.ALIGNED,
-        site=site,
-        earth=Earth.at(pose.latitude_deg, pose.height),
-        passed=(),
-        fixed=None,
-        fix_utime=nav.utime - since if pose.fix_utime else 0,
-        confirmed=pose.confirmed,
-        shown=pose.correlated_error,
-        doubt=pose.correlated_error_variance,
-        allowance=pose.allowance,
-        restless=pose.gnss_noise_inflation,
-        epoch=pose.pose_epoch + 1,
-        warm_start=None,
-        proving=Proving(),
+        state.imu,
+        state.stationary,
+        state.constraints,
+        common._replace(epoch=pose.pose_epoch + 1, warm_start=None),
+        Earth.at(pose.latitude_deg, pose.height),
+        site,
+        GnssMonitor(
+            used_utime=nav.utime - since if pose.fix_utime else 0,
+            num_confirmed=pose.confirmed,
+            noise_inflation=pose.gnss_noise_inflation,
+            offset=OutputOffset(pose.correlated_error, pose.correlated_error_variance),
+            outlier_allowance=pose.allowance,
+        ),
+        HeadingCheck(),
     )
 
 
-def _by_fixes(setup: Setup, state: FilterState, resumed: FilterState, age: float, utime: int) -> Fused:
-    """Return the resumed state once fixes agree with it, or where there are none; else the state that waits."""
-    waiting, fix = state.warm_start, state.fixed
+def _check_fixes(setup: Setup, state: Unaligned, restored: Aligned, age: float, utime: int) -> Fused:
+    """Return the restored state once fixes agree with it, or if there are none; else the state that waits."""
+    waiting, fix = state.common.warm_start, state.alignment.last_fix
     assert waiting is not None
-    stood = "the wheels and the inertial unit stood"
-    if not setup.rig.gps_frame or without_gps(state.mode):
-        return resumed, (_word(resumed, f"warm start: the pose kept {ago(age)}: {stood}"),)
+    text = f"warm start: the pose stored {format_age(age)}: the wheels and the IMU were stationary"
+    if not setup.rig.gps_frame or not uses_gnss(state.common.mode):
+        return restored, (_report(restored, text),)
     if fix is None:
-        if (utime - waiting.since) * 1e-6 < NO_FIX_FOR:
+        if (utime - waiting.since) * 1e-6 < FIX_TIMEOUT:
             return state, NOTHING
-        return resumed, (_word(resumed, f"warm start: the pose kept {ago(age)}: {stood}; there is no fix to ask"),)
-    if fix.utime <= waiting.seen:
-        return _waited(state, utime, age, "no more fixes came")
-    nav, layout, site, tangent = resumed.nav, setup.layout, resumed.site, state.site
-    assert nav is not None
+        return restored, (_report(restored, f"{text}; there is no fix to compare with"),)
+    if fix.utime <= waiting.fix_utime:
+        return _wait(state, waiting, utime, age, "no more fixes came")
+    nav, layout, site = restored.nav, setup.layout, state.site
     assert site is not None
-    assert tangent is not None
     lever = setup.rig.lever_arm(setup.rig.gps_frame)
-    east, north, _ = site.from_ecef(tangent.to_ecef((fix.place.real, fix.place.imag, fix.up)))
+    east, north, _ = restored.site.from_ecef(site.to_ecef((fix.position.real, fix.position.imag, fix.up)))
     x, y, _ = nav.point(lever)
-    at = layout.extra(WANDER[0])
-    residual = np.array((east - x - fix.lingering * nav.extras[at], north - y - fix.lingering * nav.extras[at + 1]))
-    H = jacobian_of_point(nav, lever, layout.size)[:2]
-    H[0, STRAPDOWN + at] = H[1, STRAPDOWN + at + 1] = fix.lingering
-    S = kalman.innovation(nav.covariance, H, np.eye(2) * fix.white**2)
-    agrees = kalman.statistic(residual, S) <= kalman.gate_limit(2, setup.settings.gate_risk)
-    count = max(waiting.fixes, 0) + 1 if agrees else min(waiting.fixes, 0) - 1
-    if count >= FIXES:
-        resumed = resumed._replace(fix_utime=nav.utime)
-        return resumed, (_word(resumed, f"warm start: the pose kept {ago(age)}: {stood}, and {FIXES} fixes agree"),)
-    state = state._replace(warm_start=waiting._replace(fixes=count, seen=fix.utime))
-    if count <= -FIXES:
-        return _pose_left(state, age, f"fixes are {math.hypot(*residual.tolist()):.1f} m from it")
-    return state, NOTHING
+    at = layout.extra_index(CORRELATED_ERROR[0])
+    residual = np.array((east - x - fix.correlated * nav.extras[at], north - y - fix.correlated * nav.extras[at + 1]))
+    H = point_jacobian(nav, lever, layout.size)[:2]
+    H[0, STRAPDOWN + at] = H[1, STRAPDOWN + at + 1] = fix.correlated
+    S = eskf.innovation_covariance(nav.covariance, H, np.eye(2) * fix.white**2)
+    gate = eskf.chi_square_gate(2, setup.settings.gate_risk)
+    agrees = eskf.normalized_innovation_squared(residual, S) <= gate
+    count = max(waiting.num_fixes, 0) + 1 if agrees else min(waiting.num_fixes, 0) - 1
+    if count >= NUM_FIXES:
+        restored = restored._replace(gnss=restored.gnss._replace(used_utime=nav.utime))
+        return restored, (_report(restored, f"{text}, and {NUM_FIXES} fixes agree"),)
+    if count <= -NUM_FIXES:
+        return _drop_pose(state, age, f"fixes are {math.hypot(*residual.tolist()):.1f} m from it")
+    return _with_warm_start(state, waiting._replace(num_fixes=count, fix_utime=fix.utime)), NOTHING
 
 
-# --- words --------------------------------------------------------------------------------------------------
+# --- steps --------------------------------------------------------------------------------------------------
 
 
-def _waited(state: FilterState, utime: int, age: float, why: str) -> Fused:
-    waiting = state.warm_start
-    assert waiting is not None
-    return _pose_left(state, age, why) if (utime - waiting.since) * 1e-6 > WAITS else (state, NOTHING)
+def _wait(state: Navigating, waiting: WarmStart, utime: int, age: float, reason: str) -> Fused:
+    """Return the state that waits for evidence, without the persisted pose after EVIDENCE_TIMEOUT."""
+    is_late = (utime - waiting.since) * 1e-6 > EVIDENCE_TIMEOUT
+    return _drop_pose(state, age, reason) if is_late else (state, NOTHING)
 
 
-def _pose_left(state: FilterState, age: float, why: str) -> Fused:
-    """Return the state that goes on with biases alone."""
-    return _without(state, f"warm start of the biases kept {ago(age)}, cold start of the pose: {why}")
+def _drop_pose(state: Navigating, age: float, reason: str) -> Fused:
+    """Return the state that continues with the biases alone."""
+    return _drop(state, f"warm start of the biases stored {format_age(age)}, cold start of the pose: {reason}")
 
 
-def _without(state: FilterState, text: str) -> Fused:
-    state = state._replace(warm_start=None)
-    return state, (_word(state, text)._replace(verdict=Verdict.MONITORED),)
+def _drop(state: Navigating, text: str) -> Fused:
+    """Return the state without the warm start."""
+    return _with_warm_start(state, None), (_report(state, text)._replace(verdict=Verdict.MONITORED),)
 
 
-def _word(state: FilterState, text: str) -> Decision:
-    assert state.nav is not None
-    return Decision(state.nav.utime, "filter", 0, KEPT, Verdict.RESET, text)
+def _with_warm_start(state: Navigating, waiting: WarmStart | None) -> Navigating:
+    return state._replace(common=state.common._replace(warm_start=waiting))
+
+
+def _report(state: Navigating, text: str) -> Decision:
+    return report_event(state, WARM_START, Verdict.RESET, text)

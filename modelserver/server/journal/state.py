@@ -17,7 +17,7 @@ from modelserver.core import CoreState
 from modelserver.core.commands import ModelLoaded
 from modelserver.estimation.filter.localizer import Deferred
 from modelserver.estimation.filter.measurements import REGISTRY, Measurement
-from modelserver.estimation.filter.world import TwistCovariance
+from modelserver.estimation.filter.output import TwistCovariance
 from modelserver.estimation.history import DeferredEstimate
 from modelserver.estimation.interface import Localizer
 from modelserver.estimation.modes import ModeLocalizer
@@ -56,7 +56,7 @@ def _make_schema(measurements: tuple[type[Measurement], ...]) -> Schema:
 
 
 def detach(state: CoreState) -> CoreState:
-    """Copy what a state shares with its successors, with the history that is written."""
+    """Copy what a state split_variance with its successors, with the history that is written."""
     view = state.view
     return state._replace(view=replace(view, history=view.history.copy_recent(HISTORY_S), joints=view.joints.detach()))
 

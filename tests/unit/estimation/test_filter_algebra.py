@@ -13,8 +13,8 @@ from scipy import stats
 from support_cart import rig, some_nav
 
 from modelserver.estimation.filter import bounds, kalman, updates
-from modelserver.estimation.filter.layout import STRAPDOWN, ErrorState, Layout
-from modelserver.estimation.filter.measurements import Compared
+from modelserver.estimation.filter.error_layout import STRAPDOWN, ErrorState, Layout
+from modelserver.estimation.filter.measurements import Innovation
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filterpy_import import import_kalman_filter
@@ -77,7 +77,7 @@ def test_given_any_numbers_when_corrected_then_it_is_what_the_formulas_say(seed,
     K = P @ H.T @ np.linalg.inv(S)
     assert error == pytest.approx(K @ r)
     assert after == pytest.approx((np.eye(n) - K @ H) @ P, abs=1e-9)
-    # by information, which shares nothing with the gain
+    # by information, which split_variance nothing with the gain
     assert np.linalg.inv(after) == pytest.approx(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H, rel=1e-6, abs=1e-6)
     assert (after == after.T).all()
     assert np.linalg.eigvalsh(after)[0] > 0.0
@@ -161,7 +161,7 @@ def put(residual: list[float], sigma: list[float], **more: object):
     H = np.zeros((len(residual), SETUP.layout.size))
     for row in range(len(residual)):
         H[row, row] = 1.0
-    compared = Compared(np.array(residual), H, np.diag(np.square(sigma)), **more)
+    compared = Innovation(np.array(residual), H, np.diag(np.square(sigma)), **more)
     return nav, *updates.used(nav, compared, SETTINGS, 5, "gps", 7, "kind")
 
 

@@ -13,18 +13,24 @@ from support_cart import IMU as IMU_FRAME
 
 from modelserver.estimation.filter import alignment, clocks, engine, inertial, placing, start
 from modelserver.estimation.filter import latency as lateness
-from modelserver.estimation.filter.alignment import Passed, Turn
-from modelserver.estimation.filter.clocks import Clocks, Verdict
-from modelserver.estimation.filter.latency import Lateness
-from modelserver.estimation.filter.measurements.gps import LATENCY, WANDER
-from modelserver.estimation.filter.measurements.wheels import WheelSpeed, _mean, rolling, standing_wheels, turn_rate
-from modelserver.estimation.filter.nav import ZERO
+from modelserver.estimation.filter.heading_alignment import Passed, Turn
+from modelserver.estimation.filter.clock_monitor import Clocks, Verdict
+from modelserver.estimation.filter.latency_estimator import Lateness
+from modelserver.estimation.filter.measurements.gnss import LATENCY, CORRELATED_ERROR
+from modelserver.estimation.filter.measurements.wheels import (
+    WheelSpeed,
+    _mean,
+    rolling,
+    are_wheels_stationary,
+    turn_rate,
+)
+from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
-from modelserver.estimation.filter.stationary import Stillness
-from modelserver.estimation.filter.strapdown import STANDARD_GRAVITY, level_attitude
+from modelserver.estimation.filter.stationary_detector import Stillness
+from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, level_attitude
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     Decision,
@@ -483,7 +489,7 @@ def test_given_a_fix_then_the_antenna_is_put_there_and_its_lingering_error_and_l
     v = np.array((vx, vy, 0.0))
     doubt = np.array((*(0.1**2 * np.diagonal(nav.covariance)[3:5]), 0.0))
     assert after.point(lever) == pytest.approx(np.array((31.0, -38.0, 5.0)) + 0.2 * v)
-    P, at = after.covariance, SETUP.layout.index(WANDER[0])
+    P, at = after.covariance, SETUP.layout.index(CORRELATED_ERROR[0])
     assert np.linalg.eigvalsh(P)[0] > -1e-9
     assert (P == P.T).all()
     # the antenna's own error is the fix's alone, whatever attitude is off by
@@ -495,7 +501,7 @@ def test_given_a_fix_then_the_antenna_is_put_there_and_its_lingering_error_and_l
     )
     assert P[:3, late_at] == pytest.approx(v * 0.1**2)
     assert (P[0, at], P[1, at + 1], P[2, at + 2]) == pytest.approx((-0.5, -0.5, -0.8))
-    assert [after.extras[SETUP.layout.extra(name)] for name in WANDER] == [0.0, 0.0, 0.0]
+    assert [after.extras[SETUP.layout.extra(name)] for name in CORRELATED_ERROR] == [0.0, 0.0, 0.0]
 
 
 def test_given_a_speed_then_the_velocity_along_the_body_is_drawn_to_it():
@@ -561,10 +567,10 @@ def test_given_travel_then_it_tells_the_mean_speed_and_without_it_the_speed_coun
 
 def test_given_wheels_that_stand_or_roll_or_say_nothing_then_so_it_is():
     contacts = wheel_speed("differential", "RL", "RR").contacts
-    assert standing_wheels(said(0.0, WheelSample("RL", speed=0.01)), None, contacts, SETTINGS) is True
+    assert are_wheels_stationary(said(0.0, WheelSample("RL", speed=0.01)), None, contacts, SETTINGS) is True
     moving = said(0.0, WheelSample("RL", speed=0.0), WheelSample("RR", speed=0.5))
-    assert standing_wheels(moving, None, contacts, SETTINGS) is False
-    assert standing_wheels(said(0.0, WheelSample("RL")), None, contacts, SETTINGS) is None
+    assert are_wheels_stationary(moving, None, contacts, SETTINGS) is False
+    assert are_wheels_stationary(said(0.0, WheelSample("RL")), None, contacts, SETTINGS) is None
 
 
 def test_given_a_vehicle_that_skids_with_a_wheel_missing_then_the_turn_still_falls_out():

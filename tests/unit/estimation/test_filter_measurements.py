@@ -22,9 +22,15 @@ from support_cart import (
 )
 
 from modelserver.earth.geodesy import geodetic_from_ecef
-from modelserver.estimation.filter.measurements import REGISTRY, Compared, Measurement, Scene, constraints
-from modelserver.estimation.filter.measurements.gps import stated_velocity
-from modelserver.estimation.filter.nav import Nav, cross
+from modelserver.estimation.filter.measurements import (
+    REGISTRY,
+    Innovation,
+    Measurement,
+    MeasurementContext,
+    constraints,
+)
+from modelserver.estimation.filter.measurements.gnss import read_velocity
+from modelserver.estimation.filter.eskf import Nav, cross
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.magnetometer import magnetic_field
@@ -188,17 +194,17 @@ CASES = {
 }
 
 
-def prepared(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, Scene, Sample]:
+def prepared(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, MeasurementContext, Sample]:
     setup = Setup(case.rig, SETTINGS)
     nav = some_nav(setup, seed, extras=extras)
     sample = case.sample(nav, case.rig)  # type: ignore[operator]
     (measurement,) = (each for each in setup.measurements[type(sample)] if each.kind == case.kind)
-    return measurement, Scene(nav, setup.layout, SETTINGS, case.rig, SITE, GEODESY), sample
+    return measurement, MeasurementContext(nav, setup.layout, SETTINGS, case.rig, SITE, GEODESY), sample
 
 
-def compared(measurement: Measurement, scene: Scene, sample: Sample) -> Compared:
+def compared(measurement: Measurement, scene: MeasurementContext, sample: Sample) -> Innovation:
     found = measurement.compare(scene, sample)
-    assert isinstance(found, Compared), found
+    assert isinstance(found, Innovation), found
     return found
 
 
@@ -255,7 +261,7 @@ def test_given_wheels_by_their_travel_when_the_motion_is_steady_then_residual_an
         speed.header, tuple(WheelSample(w.name, travel=7.0 + DT * w.speed, steering=w.steering) for w in speed.wheels)
     )
 
-    def steady(nav: Nav) -> Scene:
+    def steady(nav: Nav) -> MeasurementContext:
         rolled, turned = nav.body_velocity(scene.rig.base), nav.turn_rate
         nav = nav._replace(
             rolled=(rolled[0] * DT, rolled[1] * DT, rolled[2] * DT),
@@ -278,9 +284,9 @@ def test_given_wheels_by_their_travel_when_the_motion_is_steady_then_residual_an
 def test_given_a_constraint_when_the_state_is_off_a_little_then_the_residual_goes_as_its_jacobian_says(seed):
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, seed)
-    scene = Scene(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)
+    scene = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)
     rolling = Setup(rig(wheels=()), SETTINGS)
-    bare = Scene(some_nav(rolling, seed), rolling.layout, SETTINGS, rolling.rig)
+    bare = MeasurementContext(some_nav(rolling, seed), rolling.layout, SETTINGS, rolling.rig)
     for each, know in (
         (scene, lambda s: constraints.non_holonomic(s, 0.1)),
         (bare, lambda s: constraints.non_holonomic(s, 0.1)),
@@ -299,7 +305,7 @@ def test_given_a_vehicle_that_does_what_it_must_when_compared_then_nothing_is_le
     forward = so3.rotate(nav.attitude, (3.0, 0.0, 0.0))
     arm = so3.rotate(nav.attitude, cross(nav.turn_rate, PAIR.base))
     rolling = nav._replace(velocity=(forward[0] - arm[0], forward[1] - arm[1], forward[2] - arm[2]))
-    scene = Scene(rolling, setup.layout, SETTINGS, PAIR)
+    scene = MeasurementContext(rolling, setup.layout, SETTINGS, PAIR)
     assert constraints.non_holonomic(scene, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
     standing = scene._replace(nav=nav._replace(velocity=(0.0, 0.0, 0.0)))
     assert constraints.zero_velocity(standing, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
@@ -311,10 +317,10 @@ def test_given_a_vehicle_that_does_what_it_must_when_compared_then_nothing_is_le
 # --- what is refused, and what is taken instead -------------------------------------------------------------
 
 
-def refusal(kind: str, sample: Sample, **scene: object) -> str | Compared:
+def refusal(kind: str, sample: Sample, **scene: object) -> str | Innovation:
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, 1)
-    given = Scene(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)._replace(**scene)
+    given = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)._replace(**scene)
     (measurement,) = (each for each in setup.measurements[type(sample)] if each.kind == kind)
     return measurement.compare(given, sample)
 
@@ -378,13 +384,13 @@ def test_given_a_magnetic_heading_in_vertical_gyro_mode_then_it_is_compared_and_
 
 
 def test_given_a_velocity_without_covariance_or_a_slow_course_then_the_settings_speak():
-    told = stated_velocity(GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, velocity=(1.0, 2.0, 3.0)), SETTINGS)
+    told = read_velocity(GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, velocity=(1.0, 2.0, 3.0)), SETTINGS)
     assert told is not None
     assert told[1] == pytest.approx(np.eye(3) * SETTINGS.velocity_sigma**2)
     slow = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=0.9 * SETTINGS.course_speed, course=1.0)
-    assert stated_velocity(slow, SETTINGS) is None
+    assert read_velocity(slow, SETTINGS) is None
     fast = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=10.0, course=0.5, speed_sigma=0.2, course_sigma=0.1)
-    velocity, R = stated_velocity(fast, SETTINGS) or ((), np.zeros(0))
+    velocity, R = read_velocity(fast, SETTINGS) or ((), np.zeros(0))
     along, across = np.array((math.cos(0.5), math.sin(0.5))), np.array((-math.sin(0.5), math.cos(0.5)))
     assert velocity == pytest.approx((*(10.0 * along), 0.0))
     assert along @ R @ along == pytest.approx(0.2**2)

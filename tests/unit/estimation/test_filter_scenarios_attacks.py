@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.nav import ATTITUDE
+from modelserver.estimation.filter.eskf import ATTITUDE
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import GpsSample, ImuSample, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import DrivePhase as Stretch

@@ -9,11 +9,11 @@ import pytest
 from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, model, rig, some_nav
 
 from modelserver.estimation.filter import motion, strapdown
-from modelserver.estimation.filter.layout import STRAPDOWN
-from modelserver.estimation.filter.nav import ZERO, Nav, cross
+from modelserver.estimation.filter.error_layout import STRAPDOWN
+from modelserver.estimation.filter.eskf import ZERO, Nav, cross
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
-from modelserver.estimation.filter.strapdown import Earth, Noise
+from modelserver.estimation.filter.eskf import Earth, Noise
 from modelserver.messages import ImuSample
 from modelserver.simulation import ImuModel, Simulation, Terrain, Timing, Trajectory, Wave, figure_eight
 from modelserver.simulation.scenario import START_UTIME

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter.engine import fused
-from modelserver.estimation.filter.items import items
+from modelserver.estimation.filter.step import fused
+from modelserver.estimation.filter.fusion import items
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.measurements import Compared, Scene
-from modelserver.estimation.filter.measurements.wheels import WheelSpeed, standing_wheels, turn_rate
-from modelserver.estimation.filter.nav import Nav
+from modelserver.estimation.filter.measurements import Innovation, MeasurementContext
+from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, turn_rate
+from modelserver.estimation.filter.eskf import Nav
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState, Steering
@@ -78,9 +78,9 @@ def sample(speeds: dict[str, float], utime: int = START_UTIME, **more: object) -
     return WheelsSample(SensorHeader(utime, "wheels"), wheels)
 
 
-def compared(setup: Setup, nav: Nav, measured: WheelsSample, steering: float = math.nan) -> Compared | str:
+def compared(setup: Setup, nav: Nav, measured: WheelsSample, steering: float = math.nan) -> Innovation | str:
     assert setup.wheels is not None
-    return setup.wheels.compare(Scene(nav, setup.layout, SETTINGS, setup.rig, steering=steering), measured)
+    return setup.wheels.compare(MeasurementContext(nav, setup.layout, SETTINGS, setup.rig, steering=steering), measured)
 
 
 def by_differences(setup: Setup, nav: Nav, measured: WheelsSample, steering: float = math.nan) -> np.ndarray:
@@ -91,8 +91,8 @@ def by_differences(setup: Setup, nav: Nav, measured: WheelsSample, steering: flo
         ahead, behind = (
             compared(setup, nav.injected(sign * error, nav.covariance), measured, steering) for sign in (1, -1)
         )
-        assert isinstance(ahead, Compared)
-        assert isinstance(behind, Compared)
+        assert isinstance(ahead, Innovation)
+        assert isinstance(behind, Innovation)
         columns.append((behind.residual - ahead.residual) / 2e-6)
     return np.array(columns).T
 
@@ -107,13 +107,13 @@ def test_given_no_angle_and_a_known_course_then_it_measures_the_speed_of_the_con
     nav = moving(setup, speed, turn * abs(speed), CERTAIN)
     measured = sample(contact_speeds(nav, setup.rig))
     found = compared(setup, nav, measured)
-    assert isinstance(found, Compared)
+    assert isinstance(found, Innovation)
     assert np.abs(found.residual).max() < 1e-6
     assert by_differences(setup, nav, measured) == pytest.approx(found.jacobian, abs=1e-4)
     assert np.linalg.eigvalsh(found.noise)[0] > 0.0
     # the sign is the encoder's: rolling the other way is not what the state says
     other = compared(setup, nav, sample({name: -v for name, v in contact_speeds(nav, setup.rig).items()}))
-    assert isinstance(other, Compared)
+    assert isinstance(other, Innovation)
     assert np.abs(other.residual).min() > 1.5 * abs(speed)
 
 
@@ -124,7 +124,7 @@ def test_given_any_speed_through_zero_then_residual_and_jacobian_stay_finite_and
     for speed in (-0.02, -1e-3, -1e-5, 0.0, 1e-5, 1e-3, 0.02):
         nav = moving(setup, speed, 0.0, variance)
         found = compared(setup, nav, sample({"FL": speed, "FR": speed}))
-        assert isinstance(found, Compared)
+        assert isinstance(found, Innovation)
         assert np.isfinite(found.residual).all()
         assert np.isfinite(found.noise).all()
         assert np.abs(found.residual).max() < 0.02
@@ -137,8 +137,8 @@ def test_given_an_unknown_course_then_the_noise_covers_the_whole_range_of_the_st
     nav = moving(setup, 2.0, 0.0, UNCERTAIN)
     found = compared(setup, nav, sample({"FL": 2.0, "FR": 2.0}))
     certain = compared(setup, moving(setup, 2.0, 0.0, CERTAIN), sample({"FL": 2.0, "FR": 2.0}))
-    assert isinstance(found, Compared)
-    assert isinstance(certain, Compared)
+    assert isinstance(found, Innovation)
+    assert isinstance(certain, Innovation)
     # at 30 degrees of lock a wheel rolls 2 m/s while the vehicle moves 1.73 m/s ahead: within two sigmas
     assert 2.0 * math.sqrt(found.noise[0, 0]) > 0.27
     assert math.sqrt(certain.noise[0, 0]) < 0.05
@@ -150,14 +150,14 @@ def test_given_an_encoder_without_a_direction_then_the_sign_is_that_of_the_state
     nav = moving(setup, speed, 0.3, 0.01)
     sizes = {name: abs(v) for name, v in contact_speeds(nav, setup.rig).items()}
     found = compared(setup, nav, sample(sizes, direction=Direction.UNSIGNED))
-    assert isinstance(found, Compared)
+    assert isinstance(found, Innovation)
     assert np.abs(found.residual).max() < 0.02
     # a state that does not know it learns nothing of the direction from them
     nav = moving(setup, speed, 0.3, 1.0)
     assert compared(setup, nav, sample(sizes, direction=Direction.UNSIGNED)) == "direction"
     # that they do not turn is worth knowing either way
     still = compared(setup, moving(setup, 0.0, 0.0, 1.0), sample({"FL": 0.01, "FR": 0.0}, direction=Direction.UNSIGNED))
-    assert isinstance(still, Compared)
+    assert isinstance(still, Innovation)
 
 
 def test_given_a_skid_steered_vehicle_then_a_wheel_by_an_unknown_angle_is_dropped_with_the_word():
@@ -167,10 +167,10 @@ def test_given_a_skid_steered_vehicle_then_a_wheel_by_an_unknown_angle_is_droppe
 
 def test_given_wheels_that_steer_then_they_tell_whether_the_vehicle_is_stationary():
     contacts = dict.fromkeys(FRONT, (1.2, 0.0, 0.0))
-    assert standing_wheels(sample({"FL": 0.0, "FR": 0.01}), None, contacts, SETTINGS) is True
-    assert standing_wheels(sample({"FL": 0.0, "FR": 0.3}), None, contacts, SETTINGS) is False
+    assert are_wheels_stationary(sample({"FL": 0.0, "FR": 0.01}), None, contacts, SETTINGS) is True
+    assert are_wheels_stationary(sample({"FL": 0.0, "FR": 0.3}), None, contacts, SETTINGS) is False
     sizes = sample({"FL": 0.3, "FR": 0.3}, direction=Direction.UNSIGNED)
-    assert standing_wheels(sizes, None, contacts, SETTINGS) is False
+    assert are_wheels_stationary(sizes, None, contacts, SETTINGS) is False
 
 
 @pytest.mark.parametrize("speed", [2.0, -1.0])
@@ -210,12 +210,12 @@ def test_given_the_controllers_angle_then_the_wheels_measure_along_it_and_the_an
     measured = sample(contact_speeds(nav, setup.rig))
     angle = math.atan(1.2 * curvature)
     found = compared(setup, nav, measured, angle)
-    assert isinstance(found, Compared)
+    assert isinstance(found, Innovation)
     assert np.abs(found.residual).max() < 0.02
     assert by_differences(setup, nav, measured, angle) == pytest.approx(found.jacobian, abs=1e-5)
     # a wheel that is steered against its course slides: the residual says so, and the noise allows for the sigma
     askew = compared(setup, nav, measured, angle + 0.3)
-    assert isinstance(askew, Compared)
+    assert isinstance(askew, Innovation)
     assert np.abs(askew.residual).min() > 0.05
     assert askew.noise[0, 0] > found.noise[0, 0]
 
@@ -236,7 +236,7 @@ def test_given_angles_that_are_stale_none_or_out_of_range_then_they_are_not_used
 
 
 def test_given_an_angle_when_it_ages_then_the_wheels_go_back_to_the_speed_of_their_contact_points():
-    from modelserver.estimation.filter.handling import steering_angle
+    from modelserver.estimation.filter.fusion import steering_angle
 
     setup = Setup(cart(signal=SIGNAL), SETTINGS)
     nav = moving(setup, 2.0, 0.0, CERTAIN)

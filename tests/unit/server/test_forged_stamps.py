@@ -11,7 +11,7 @@ from support_drive import CHANNELS, SimulatedDrive
 from support_faults import INERTIAL
 
 from modelserver.estimation.filter import engine
-from modelserver.estimation.filter.clocks import REPLAY_BURST, REPLAY_RATE
+from modelserver.estimation.filter.clock_monitor import REPLAY_BURST, REPLAY_RATE
 
 pytestmark = pytest.mark.slow
 

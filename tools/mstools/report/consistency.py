@@ -14,7 +14,7 @@ from itertools import groupby
 
 import numpy as np
 
-from modelserver.estimation.filter.kalman import gate_limit
+from modelserver.estimation.filter.eskf import chi_square_gate
 from modelserver.messages import Decision, Verdict
 
 
@@ -50,7 +50,7 @@ def compute_consistency(decisions: Iterable[Decision]) -> list[Consistency]:
 
 def _summarize(kind: str, found: list[Decision]) -> Consistency:
     rejected = sum(each.verdict is Verdict.REJECTED for each in found)
-    beyond = sum(each.statistic > gate_limit(each.dof, 0.05) for each in found)
+    beyond = sum(each.statistic > chi_square_gate(each.dof, 0.05) for each in found)
     mean = sum(each.statistic for each in found) / sum(each.dof for each in found)
     return Consistency(kind, len(found), rejected, mean, beyond / len(found))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError
 from modelserver.estimation import fix_quality as gate
-from modelserver.estimation.filter.measurements.gps import WANDER, shares
+from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, split_variance
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.interface import Localizer
 from modelserver.messages import (
@@ -391,9 +391,9 @@ class ReplayCollector:
                     place = geodesy.to_relative_utm(utm)
             before = _latest(snapshots, times, t) if decision is not None and decision.dof == 2 else None
             if decision is not None and before is not None and math.isfinite(before.speed):
-                east = shares(fix.east_variance, sample.fix_type, settings)[1]
-                north = shares(fix.north_variance, sample.fix_type, settings)[1]
-                a, b = (before.values.get(name, 0.0) for name in WANDER[:2])
+                east = split_variance(fix.east_variance, sample.fix_type, settings)[1]
+                north = split_variance(fix.north_variance, sample.fix_type, settings)[1]
+                a, b = (before.values.get(name, 0.0) for name in CORRELATED_ERROR[:2])
                 residual = (decision.residual[0] + east * a, decision.residual[1] + north * b)
                 velocity = _velocity(before)
             found.append(FixRecord(t, place, verdict, reason, residual, velocity))

@@ -30,13 +30,14 @@ from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import Geodesy, GeodesyError
 from modelserver.errors import RecordingError
 from modelserver.estimation import fix_quality as gate
-from modelserver.estimation.filter import fixes, kalman, motion
+from modelserver.estimation.filter import eskf, gnss_monitor, propagation
+from modelserver.estimation.filter.fusion import create_context
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.measurements.base import Scene
-from modelserver.estimation.filter.measurements.gps import GpsPosition
+from modelserver.estimation.filter.measurements.gnss import GpsPosition
+from modelserver.estimation.filter.state import Aligned
 from modelserver.estimation.interface import Localizer
 from modelserver.estimation.modes import ModeLocalizer
-from modelserver.messages import Decision, GpsSample, Phase
+from modelserver.messages import Decision, GpsSample
 from modelserver.server.offline import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
@@ -230,19 +231,17 @@ def _log_density(localizer: Localizer | None, sample: GpsSample) -> float:
     setup, utime = localizer.active.setup, sample.header.utime
     state = localizer.active.defer_estimate(utime).state
     measurement = next((each for each in setup.measurements.get(GpsSample, ()) if isinstance(each, GpsPosition)), None)
-    if state.phase is not Phase.ALIGNED or measurement is None:
+    if not isinstance(state, Aligned) or measurement is None:
         return UNKNOWN_LOG_DENSITY
-    state = motion.caught_up(setup, motion.at(setup, state, utime))
-    nav = state.nav
-    assert nav is not None
-    seconds = (utime - state.fixed.utime) * 1e-6 if state.fixed is not None else 0.0
-    nav = fixes.widened(setup, nav, state.restless, seconds)
-    scene = Scene(nav, setup.layout, setup.settings, setup.rig, state.site, state.geodesy, state.standing)
-    compared = measurement.compare(scene, sample)
-    if isinstance(compared, str):
+    state = propagation.advance(setup, state, utime)
+    gnss = state.gnss
+    seconds = (utime - gnss.last_fix.utime) * 1e-6 if gnss.last_fix is not None else 0.0
+    nav = gnss_monitor.inflate_correlated_error(state.nav, gnss.noise_inflation, seconds, setup.layout, setup.settings)
+    innovation = measurement.evaluate(create_context(setup, state._replace(nav=nav)), sample)
+    if isinstance(innovation, str):
         return UNKNOWN_LOG_DENSITY
-    S = kalman.innovation(nav.covariance, compared.jacobian, compared.noise)
-    return mixture_log_density(compared.residual, S)
+    S = eskf.innovation_covariance(nav.covariance, innovation.jacobian, innovation.noise)
+    return mixture_log_density(innovation.residual, S)
 
 
 def mixture_log_density(residual: Array, S: Array) -> float:
@@ -256,7 +255,9 @@ def _normal_log_density(residual: Array, S: Array) -> float:
     sign, size = np.linalg.slogdet(S)
     if sign <= 0.0:
         return -math.inf
-    return -0.5 * (kalman.statistic(residual, S) + float(size) + len(residual) * math.log(2.0 * math.pi))
+    return -0.5 * (
+        eskf.normalized_innovation_squared(residual, S) + float(size) + len(residual) * math.log(2.0 * math.pi)
+    )
 
 
 def _gap_ends(known: UsableFixes, rows: Iterable[tuple[GpsSample, float, float]]) -> tuple[float, ...]:

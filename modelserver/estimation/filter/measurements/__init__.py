@@ -3,7 +3,23 @@
 `REGISTRY` has them by name; `register` adds one, also from outside the library.
 """
 
-from modelserver.estimation.filter.measurements import aiding, gps, orientation, wheels
-from modelserver.estimation.filter.measurements.base import REGISTRY, Compared, Measurement, Scene, register
+from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.measurements import aiding, gnss, imu_orientation, wheels
+from modelserver.estimation.filter.measurements.measurement import (
+    REGISTRY,
+    Measurement,
+    MeasurementContext,
+    register,
+)
 
-__all__ = ["REGISTRY", "Compared", "Measurement", "Scene", "aiding", "gps", "orientation", "register", "wheels"]
+__all__ = [
+    "REGISTRY",
+    "Innovation",
+    "Measurement",
+    "MeasurementContext",
+    "aiding",
+    "gnss",
+    "imu_orientation",
+    "register",
+    "wheels",
+]

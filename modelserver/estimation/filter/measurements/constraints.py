@@ -1,66 +1,72 @@
 """Constraints: non-holonomic constraint (NHC), zero-velocity update (ZUPT), zero angular rate update (ZARU).
 
-Each takes the seconds since it was last applied: what errs for longer than that must not count as new each time.
+Measurements without a sensor: a rolling vehicle does not slide sideways or leave the ground, a stationary one does not
+move or turn. Each takes the seconds since its last update: an error that lasts longer must not count as a new one each
+time, so its variance is multiplied by slip_time / dt.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter.measurements.base import Compared, Scene
+from modelserver.estimation.filter.error_layout import GYRO_BIAS, VELOCITY
+from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.measurements.measurement import MeasurementContext, body_velocity_jacobian
 from modelserver.estimation.filter.measurements.wheels import YAW
-from modelserver.estimation.filter.nav import GYRO_BIAS, VELOCITY, jacobian_of_body_velocity
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
 
-NON_HOLONOMIC, ZERO_VELOCITY, ZERO_RATE = "non_holonomic", "zero_velocity", "zero_rate"
+NON_HOLONOMIC: Final = "non_holonomic"
+ZERO_VELOCITY: Final = "zero_velocity"
+ZERO_RATE: Final = "zero_rate"
 
 
-def non_holonomic(scene: Scene, dt: float) -> Compared:
-    """Compare the rolling frame's sideways and upward speed with 0; the noise grows with what makes vehicles slip.
+def non_holonomic(context: MeasurementContext, dt: float) -> Innovation:
+    """Compare the sideways and upward speed of the rolling frame with 0.
 
     Sideways along the wheels: v_y - yaw v_x, with the angle between the wheels and the geometry's x axis. The noise is
-    side slip (angle proportional to sideways acceleration) and the wandering of the point that moves straight ahead.
+    that of the side slip angle, proportional to the lateral acceleration, and of the point that moves straight ahead.
     """
-    nav, layout, settings = scene.nav, scene.layout, scene.settings
-    base = scene.rig.base
+    nav, layout, settings = context.nav, context.layout, context.settings
+    base = context.rig.base
     vx, vy, vz = nav.body_velocity(base)
-    wz = nav.turn_rate[2]
-    yaw = scene.extra(YAW)
-    body = jacobian_of_body_velocity(nav, base, layout.size)
+    wz = nav.angular_rate[2]
+    yaw = context.extra(YAW)
+    body = body_velocity_jacobian(nav, base, layout.size)
     H = np.array((body[1] - yaw * body[0], body[2]))
     if YAW in layout:
         H[0, layout.index(YAW)] = -vx
     slip = settings.side_slip * vx * wz * vx
-    wander = settings.roll_point_sigma * wz
-    lasting = max(settings.slip_time / dt, 1.0)
-    side = (settings.side_sigma**2 + slip * slip + wander * wander) * lasting
-    up = (settings.up_sigma**2 + (settings.up_share * vx) ** 2) * lasting
-    return Compared(np.array((yaw * vx - vy, -vz)), H, np.diag((side, up)), eased=math.inf)
+    offset = settings.roll_point_sigma * wz
+    correlated = max(settings.slip_time / dt, 1.0)
+    side = (settings.side_sigma**2 + slip * slip + offset * offset) * correlated
+    up = (settings.up_sigma**2 + (settings.up_share * vx) ** 2) * correlated
+    return Innovation(np.array((yaw * vx - vy, -vz)), H, np.diag((side, up)), inflation_limit=math.inf)
 
 
-def zero_velocity(scene: Scene, dt: float) -> Compared:
+def zero_velocity(context: MeasurementContext, dt: float) -> Innovation:
     """Compare the velocity with 0."""
-    nav = scene.nav
-    H = scene.jacobian(3)
+    nav = context.nav
+    H = context.zero_jacobian(3)
     H[:, VELOCITY] = np.eye(3)
-    lasting = max(scene.settings.slip_time / dt, 1.0)
-    return Compared(-np.array(nav.velocity), H, np.eye(3) * (scene.settings.stationary_sigma**2 * lasting))
+    correlated = max(context.settings.slip_time / dt, 1.0)
+    return Innovation(-np.array(nav.velocity), H, np.eye(3) * (context.settings.stationary_sigma**2 * correlated))
 
 
-def zero_rate(scene: Scene, mean_rate: Vector3, earth: Vector3, dt: float) -> Compared:
-    """Compare the turn rate with 0: the mean of what the gyros felt for `dt` seconds is their bias and the earth's."""
-    nav = scene.nav
-    H = scene.jacobian(3)
+def zero_rate(context: MeasurementContext, mean_rate: Vector3, earth_rate: Vector3, dt: float) -> Innovation:
+    """Compare the angular rate with 0: the mean of the gyros over `dt` seconds is their bias and the earth rate."""
+    nav = context.nav
+    H = context.zero_jacobian(3)
     H[:, GYRO_BIAS] = np.eye(3)
-    variance = scene.settings.gyro_noise**2 / max(dt, 1e-3)
-    felt = np.subtract(mean_rate, so3.rotate(so3.conjugate(nav.attitude), earth))
-    return Compared(felt - nav.gyro_bias, H, np.eye(3) * variance)
+    variance = context.settings.gyro_noise**2 / max(dt, 1e-3)
+    measured = np.subtract(mean_rate, so3.rotate(so3.conjugate(nav.attitude), earth_rate))
+    return Innovation(measured - nav.gyro_bias, H, np.eye(3) * variance)
 
 
-def tilt_of(up: Vector3) -> float:
-    """Return the angle between a direction of the body and its up, radians."""
+def compute_tilt(up: Vector3) -> float:
+    """Return the angle between a direction of the body and its up, rad."""
     x, y, z = up
     return math.atan2(math.hypot(x, y), z)

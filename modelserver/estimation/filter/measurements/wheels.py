@@ -1,7 +1,7 @@
 """Wheel speeds: each wheel measures the speed of its contact point along the direction in which it rolls.
 
-Measurement. With v the velocity of the rolling frame, w the turn rate and c the contact point (body axes; x and y span
-the ground plane), the contact point moves with u = v + w x c. A wheel at the steering angle a measures
+Measurement. With v the velocity of the rolling frame, w the angular rate and c the contact point (body axes; x and y
+span the ground plane), the contact point moves with u = v + w x c. A wheel at the steering angle a measures
 
     z = (1 + s) d(a) . u + noise,   d(a) = (cos(a + m), sin(a + m)),
 
@@ -25,7 +25,7 @@ Slip acts as for every wheel: a share of speed, larger under acceleration. Of a 
 in every turn, the mean of all wheels is one measurement; a wheel that steers has no place there.
 
 Limits: one steering angle for the time between two samples; a wheel beyond 3 steering_sigma needs a measured angle.
-Read top-down: `rolling` -> `WheelSpeed.compare` -> `_steer` -> `standing_wheels`, `turn_rate`.
+Read top-down: `read_wheels` -> `WheelSpeed.evaluate` -> `_steer` -> `are_wheels_stationary`, `estimate_turn_rate`.
 """
 
 from __future__ import annotations
@@ -38,22 +38,27 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from modelserver.estimation.filter.layout import ErrorState
-from modelserver.estimation.filter.measurements.base import INSTANT, Compared, Scene, register
-from modelserver.estimation.filter.nav import jacobian_of_body_velocity
+from modelserver.estimation.filter.error_layout import ErrorState
+from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.measurements.measurement import (
+    IMU_AVERAGING,
+    MeasurementContext,
+    body_velocity_jacobian,
+    register,
+)
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.sensor_rig import SensorRig, SteeringSignal
 from modelserver.messages import Direction, WheelsSample
 from modelserver.transforms.so3 import Array, Vector3, cross
 
 SCALE, YAW = "wheel_scale", "wheel_yaw"
-"""How much too far all wheels tell, and by how much the way they roll is turned to the left of the geometry's x."""
+"""States: the common scale error of the wheels, and the angle by which they roll to the left of the geometry's x."""
 
-EASED = 4.0
-"""Up to so many times its limit a slip is used with wider noise: twice what the gate lets through."""
+SLIP_INFLATION_LIMIT = 4.0
+"""A NIS up to this many times the gate is used with inflated noise: a slip of twice the gate."""
 
-LONGEST = 1.0
-"""Seconds between two samples over which travel still tells a speed."""
+MAX_TRAVEL_TIME = 1.0
+"""Seconds between two samples, at most, for a speed from their travel."""
 
 SIGN_KNOWN = 3.0
 """Sigmas by which a predicted speed must differ from 0 to give an unsigned measurement its sign."""
@@ -65,44 +70,46 @@ NO_ANGLES: Mapping[str, float] = MappingProxyType({})
 
 
 def wheel_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
-    """Return the error states of wheels."""
+    """Return the error states of the wheels."""
     return (
         ErrorState((SCALE,), settings.wheel_scale_sigma, settings.wheel_scale_walk),
         ErrorState((YAW,), settings.wheel_yaw_sigma, settings.wheel_yaw_walk),
     )
 
 
-class Rolling(NamedTuple):
+class WheelMotion(NamedTuple):
     """One wheel between two samples: mean speed (m/s) and its variance, steering angle (rad), contact point (body, m).
 
-    `mean`: of the whole time between, from travel; else of the instant. `steering` is nan where nobody measures it,
-    `steering_sigma` its standard deviation where the vehicle controller does. `unsigned`: `speed` is a magnitude.
+    `is_mean`: over the time between, from travel; else of the instant. `steering` is nan where nobody measures it,
+    `steering_sigma` its standard deviation where the vehicle controller does. `is_unsigned`: `speed` is a magnitude.
     """
 
     speed: float
     variance: float
     steering: float
     contact: Vector3
-    mean: bool
+    is_mean: bool
     steering_sigma: float = 0.0
-    unsigned: bool = False
+    is_unsigned: bool = False
 
 
-def rolling(
+def read_wheels(
     sample: WheelsSample,
-    before: WheelsSample | None,
+    previous: WheelsSample | None,
     contacts: Mapping[str, Vector3],
     settings: FilterSettings,
     angles: Mapping[str, float] = NO_ANGLES,
     angle_sigma: float = 0.0,
-) -> list[Rolling]:
-    """Return what each known wheel of a sample measures: from its travel since `before`, else from its speed.
+) -> list[WheelMotion]:
+    """Return what each known wheel of a sample measures: from its travel since `previous`, else from its speed.
 
     `angles` are the steering angles (rad) that the vehicle controller measures, to `angle_sigma`, by the wheel's name:
     for wheels that steer and do not measure it themselves.
     """
-    dt = 0.0 if before is None else (sample.header.utime - before.header.utime) * 1e-6
-    earlier = {wheel.name: wheel for wheel in before.wheels} if before is not None and 0.0 < dt <= LONGEST else {}
+    dt = 0.0 if previous is None else (sample.header.utime - previous.header.utime) * 1e-6
+    earlier = (
+        {wheel.name: wheel for wheel in previous.wheels} if previous is not None and 0.0 < dt <= MAX_TRAVEL_TIME else {}
+    )
     found = []
     for wheel in sample.wheels:
         contact = contacts.get(wheel.name)
@@ -113,21 +120,21 @@ def rolling(
             steering, steering_sigma = angles[wheel.name], angle_sigma
         unsigned = wheel.direction is Direction.UNSIGNED
         last = earlier.get(wheel.name)
-        way = wheel.travel - last.travel if last is not None else math.nan
-        if math.isfinite(way):
+        travel = wheel.travel - last.travel if last is not None else math.nan
+        if math.isfinite(travel):
             sigma = wheel.travel_sigma if 0.0 < wheel.travel_sigma < 10.0 else settings.wheel_sigma * 0.5
-            speed, variance, mean = way / dt, 2.0 * (sigma / dt) ** 2, True
+            speed, variance, mean = travel / dt, 2.0 * (sigma / dt) ** 2, True
         elif math.isfinite(wheel.speed):
             sigma = wheel.speed_sigma if 0.0 < wheel.speed_sigma < 10.0 else settings.wheel_sigma
             speed, variance, mean = wheel.speed, sigma * sigma, False
         else:
             continue
         speed = abs(speed) if unsigned else speed
-        found.append(Rolling(speed, variance, steering, contact, mean, steering_sigma, unsigned))
+        found.append(WheelMotion(speed, variance, steering, contact, mean, steering_sigma, unsigned))
     return found
 
 
-class Steered(NamedTuple):
+class SteeredDirection(NamedTuple):
     """The direction of a wheel: its angle (rad), how much of the course's change it follows, and its variance (rad2).
 
     `follow` is the weight k of the module's theory, `course_gradient` d(course)/du (rad per m/s).
@@ -142,7 +149,7 @@ class Steered(NamedTuple):
 @register
 @dataclass(frozen=True, slots=True)
 class WheelSpeed:
-    """Speed of the wheels: measured = (1 + scale) d . (v + w x c), d the way a wheel rolls, c its contact point.
+    """Speed of the wheels: measured = (1 + scale) d . (v + w x c), d its rolling direction, c its contact point.
 
     Each wheel is one number; of a skid-steered vehicle, whose wheels slide in every turn, the mean of all is.
     """
@@ -157,22 +164,22 @@ class WheelSpeed:
     steering: SteeringSignal | None = None
 
     @classmethod
-    def of(cls, rig: SensorRig, settings: FilterSettings) -> Self | None:
-        """Return it where the vehicle file names wheels."""
+    def create(cls, rig: SensorRig, settings: FilterSettings) -> Self | None:
+        """Return it for a vehicle with configured wheels."""
         if not rig.wheel_frames:
             return None
         contacts = {name: rig.pose(frame).xyz for name, frame in rig.wheel_frames.items()}
         half = max(abs(contact[1]) for contact in contacts.values())
         return cls(contacts, rig.kinematics == "skid_steer", half, rig.imu, rig.steering)
 
-    def instant(self, sample: WheelsSample) -> int | None:
+    def get_utime(self, sample: WheelsSample) -> int | None:
         """Return the sample's stamp."""
         return sample.header.utime
 
-    def compare(self, scene: Scene, sample: WheelsSample) -> Compared | str:
-        """Compare the mean speeds since the sample before with the mean motion since then, or speeds of the instant."""
-        settings = scene.settings
-        wheels = self.rolling(sample, scene.before, settings, scene.steering)
+    def evaluate(self, context: MeasurementContext, sample: WheelsSample) -> Innovation | str:
+        """Compare the mean speeds since the previous sample with the mean motion, or the present speeds."""
+        settings = context.settings
+        wheels = self.read_wheels(sample, context.previous, settings, context.steering)
         if not wheels:
             known = [wheel for wheel in sample.wheels if wheel.name in self.contacts]
             if not known:
@@ -184,11 +191,11 @@ class WheelSpeed:
             return "range"
         if self.skid:
             wheels = [_mean(wheels)]
-        return self._compared(scene, wheels)
+        return self._evaluate(context, wheels)
 
-    def rolling(
-        self, sample: WheelsSample, before: WheelsSample | None, settings: FilterSettings, steering: float = math.nan
-    ) -> list[Rolling]:
+    def read_wheels(
+        self, sample: WheelsSample, previous: WheelsSample | None, settings: FilterSettings, steering: float = math.nan
+    ) -> list[WheelMotion]:
         """Return what each wheel measures that can be used; `steering` is the controller's steering angle, rad.
 
         On a skid-steered vehicle a wheel that steers by an unknown angle cannot be averaged with the others.
@@ -196,35 +203,35 @@ class WheelSpeed:
         angles, sigma = NO_ANGLES, 0.0
         if self.steering is not None and math.isfinite(steering):
             angles, sigma = self.steering.wheel_angles(steering, self.contacts), self.steering.sigma
-        found = rolling(sample, before, self.contacts, settings, angles, sigma)
+        found = read_wheels(sample, previous, self.contacts, settings, angles, sigma)
         return [each for each in found if math.isfinite(each.steering)] if self.skid else found
 
-    def by_travel(self, sample: WheelsSample, before: WheelsSample | None) -> bool:
-        """Return whether a wheel tells the way since a sample before."""
-        earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
+    def has_travel(self, sample: WheelsSample, previous: WheelsSample | None) -> bool:
+        """Return whether a wheel measures the travel since a previous sample."""
+        earlier = {wheel.name: wheel.travel for wheel in previous.wheels} if previous is not None else {}
         return any(math.isfinite(wheel.travel - earlier.get(wheel.name, math.nan)) for wheel in sample.wheels)
 
-    def _compared(self, scene: Scene, wheels: list[Rolling]) -> Compared | str:
-        nav, layout, settings = scene.nav, scene.layout, scene.settings
-        dt = scene.age
-        scale, yaw = 1.0 + scene.extra(SCALE), scene.extra(YAW)
-        base = scene.rig.base
+    def _evaluate(self, context: MeasurementContext, wheels: list[WheelMotion]) -> Innovation | str:
+        nav, layout, settings = context.nav, context.layout, context.settings
+        dt = context.age
+        scale, yaw = 1.0 + context.extra(SCALE), context.extra(YAW)
+        base = context.rig.base
         now = nav.body_velocity(base)
-        rate = nav.turn_rate
+        rate = nav.angular_rate
         residuals, rows, noises = [], [], []
-        body = jacobian_of_body_velocity(nav, base, layout.size)
+        body = body_velocity_jacobian(nav, base, layout.size)
         for wheel in wheels:
-            if wheel.mean:
-                motion = nav.rolled
-                swing = cross(nav.turned, wheel.contact)
+            if wheel.is_mean:
+                motion = nav.travel
+                lever = cross(nav.rotation, wheel.contact)
                 v = (
-                    (motion[0] + swing[0]) / dt,
-                    (motion[1] + swing[1]) / dt,
-                    (motion[2] + swing[2]) / dt,
+                    (motion[0] + lever[0]) / dt,
+                    (motion[1] + lever[1]) / dt,
+                    (motion[2] + lever[2]) / dt,
                 )
             else:
-                swing = cross(rate, wheel.contact)
-                v = (now[0] + swing[0], now[1] + swing[1], now[2] + swing[2])
+                lever = cross(rate, wheel.contact)
+                v = (now[0] + lever[0], now[1] + lever[1], now[2] + lever[2])
             steered = _steer(wheel, v, yaw, body, nav.covariance, settings)
             c, s = math.cos(steered.angle), math.sin(steered.angle)
             along, across = c * v[0] + s * v[1], c * v[1] - s * v[0]
@@ -235,24 +242,30 @@ class WheelSpeed:
             row[layout.index(SCALE)] = along
             row[layout.index(YAW)] = scale * (1.0 - steered.follow) * across
             variance = wheel.variance
-            if not wheel.mean:
-                # the rate of the instant has the gyro's noise, which a longer way averages
+            if not wheel.is_mean:
+                # the rate of the instant has the noise of one gyro sample
                 x, y, _ = wheel.contact
-                variance += ((c * y - s * x) * settings.gyro_noise) ** 2 / INSTANT
+                variance += ((c * y - s * x) * settings.gyro_noise) ** 2 / IMU_AVERAGING
             fast = max(math.hypot(v[0], v[1]), abs(wheel.speed))
             variance += (across * across + 0.75 * fast * fast * steered.variance) * steered.variance
             speed = wheel.speed
-            if wheel.unsigned:
+            if wheel.is_unsigned:
                 certain = along * along > SIGN_KNOWN**2 * float(row @ nav.covariance @ row)
                 if not certain and speed > settings.stationary_speed:
                     continue
                 speed = math.copysign(speed, along) if certain else 0.0
             residuals.append(speed - scale * along)
             rows.append(row)
-            noises.append(variance + self._slip(nav.force, along, rate[2], settings) * _lasting(dt, settings))
+            noises.append(variance + self._slip(nav.force, along, rate[2], settings) * _correlate(dt, settings))
         if not rows:
             return "direction"
-        return Compared(np.array(residuals), np.array(rows), np.diag(noises), separable=True, eased=EASED)
+        return Innovation(
+            np.array(residuals),
+            np.array(rows),
+            np.diag(noises),
+            is_separable=True,
+            inflation_limit=SLIP_INFLATION_LIMIT,
+        )
 
     def _slip(self, force: Vector3, speed: float, turn: float, settings: FilterSettings) -> float:
         """Return the variance of slip, (m/s)2: on firm ground, under acceleration, and of a skid-steered in turns."""
@@ -262,8 +275,8 @@ class WheelSpeed:
         return (share * speed) ** 2 + turning * turning
 
 
-def _lasting(dt: float, settings: FilterSettings) -> float:
-    """Return by how much a noise that lasts must be widened where samples `dt` seconds apart count as independent."""
+def _correlate(dt: float, settings: FilterSettings) -> float:
+    """Return the factor of a correlated noise's variance for updates `dt` seconds apart that count as independent."""
     return max(settings.slip_time / dt, 1.0) if 0.0 < dt < settings.slip_time else 1.0
 
 
@@ -276,14 +289,16 @@ def _row(rx: float, ry: float, contact: Vector3, body: Array) -> Array:
     return row
 
 
-def _steer(wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings) -> Steered:
-    """Return the direction of a wheel whose contact point moves with `u` (body axes, m/s); see the module's theory."""
+def _steer(
+    wheel: WheelMotion, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings
+) -> SteeredDirection:
+    """Return the direction of a wheel whose contact point moves with `u` (body axes, m/s): see the module's theory."""
     if math.isfinite(wheel.steering):
-        return Steered(wheel.steering + yaw, 0.0, wheel.steering_sigma**2, (0.0, 0.0))
+        return SteeredDirection(wheel.steering + yaw, 0.0, wheel.steering_sigma**2, (0.0, 0.0))
     prior = settings.steering_sigma**2
     square = u[0] * u[0] + u[1] * u[1]
     if square < 1e-12:
-        return Steered(yaw, 0.0, prior, (0.0, 0.0))
+        return SteeredDirection(yaw, 0.0, prior, (0.0, 0.0))
     # a wheel does not turn round: rolling backward it points away from the course
     ahead = math.copysign(1.0, u[0])
     course = math.atan2(ahead * u[1], ahead * u[0])
@@ -296,12 +311,12 @@ def _steer(wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Arra
     # no wheel steers farther than its stop: the angle follows the course no longer
     gradient = (-u[1] / square, u[0] / square) if abs(turned) <= most else (0.0, 0.0)
     angle = yaw + follow * min(max(turned, -most), most)
-    return Steered(angle, follow, follow * variance, gradient)
+    return SteeredDirection(angle, follow, follow * variance, gradient)
 
 
-def _mean(wheels: list[Rolling]) -> Rolling:
-    """Return the mean of the left and of the right wheels, so that the turn falls out, also with a wheel missing."""
-    sides: dict[bool, list[Rolling]] = {}
+def _mean(wheels: list[WheelMotion]) -> WheelMotion:
+    """Return the mean of the left and of the right wheels, so that the turn cancels, also with a wheel missing."""
+    sides: dict[bool, list[WheelMotion]] = {}
     for wheel in wheels:
         sides.setdefault(wheel.contact[1] > 0.0, []).append(wheel)
     speed = variance = y = z = 0.0
@@ -312,33 +327,33 @@ def _mean(wheels: list[Rolling]) -> Rolling:
             variance += part * part * wheel.variance
             y, z = y + part * wheel.contact[1], z + part * wheel.contact[2]
     # along x the mean contact point does not matter to the way it rolls, and in a skid nothing rolls about it
-    return Rolling(speed, variance, 0.0, (0.0, y, z), all(wheel.mean for wheel in wheels))
+    return WheelMotion(speed, variance, 0.0, (0.0, y, z), all(wheel.is_mean for wheel in wheels))
 
 
-def standing_wheels(
-    sample: WheelsSample, before: WheelsSample | None, contacts: Mapping[str, Vector3], settings: FilterSettings
+def are_wheels_stationary(
+    sample: WheelsSample, previous: WheelsSample | None, contacts: Mapping[str, Vector3], settings: FilterSettings
 ) -> bool | None:
     """Return whether the wheels are stationary; None where they do not measure it. Steering does not matter here."""
-    wheels = rolling(sample, before, contacts, settings)
+    wheels = read_wheels(sample, previous, contacts, settings)
     if not wheels:
         return None
     return all(abs(wheel.speed) <= settings.stationary_speed for wheel in wheels)
 
 
-def turn_rate(
+def estimate_turn_rate(
     sample: WheelsSample,
-    before: WheelsSample | None,
+    previous: WheelsSample | None,
     measurement: WheelSpeed,
     settings: FilterSettings,
     steering: float = math.nan,
 ) -> float:
-    """Return the turn rate that the wheels measure, rad/s; 0 where they do not. `steering`: as in `rolling`.
+    """Return the turn rate that the wheels measure, rad/s; 0 where they do not. `steering`: as in `read_wheels`.
 
     Each wheel rolls at d . (v + w x c): two unknowns, forward speed and turn rate, by least squares. The direction of a
     wheel whose angle is not measured follows from the two, so it is found by iteration from straight ahead. A
-    skid-steered vehicle's wheels slide: it turns by less than its sides' difference says, by an unknown share.
+    skid-steered vehicle's wheels slide: it turns by less than the difference of its sides, by an unknown share.
     """
-    wheels = [each for each in measurement.rolling(sample, before, settings, steering) if not each.unsigned]
+    wheels = [each for each in measurement.read_wheels(sample, previous, settings, steering) if not each.is_unsigned]
     if len(wheels) < 2:
         return 0.0
     speeds = np.array([wheel.speed for wheel in wheels])

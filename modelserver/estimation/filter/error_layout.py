@@ -6,17 +6,19 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from modelserver.transforms.so3 import Array
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
-"""Where the strapdown's states stand: errors along the navigation frame's axes, biases along the body's."""
+"""Indices of the strapdown states: errors along the axes of N, biases along the body axes."""
 
-STRAPDOWN = 15
+STRAPDOWN: Final = 15
+"""Number of the strapdown states; the additional states follow them."""
 
-_CORE_NAMES = (
+_STRAPDOWN_NAMES = (
     *("position_east", "position_north", "position_up"),
     *("velocity_east", "velocity_north", "velocity_up"),
     *("attitude_east", "attitude_north", "attitude_up"),
@@ -27,10 +29,14 @@ _CORE_NAMES = (
 
 @dataclass(frozen=True, slots=True)
 class ErrorState:
-    """A further state beside the strapdown's: what a measurement brings that has to be estimated with it.
+    """An additional state: a parameter that a measurement needs and that is estimated with the strapdown states.
 
-    `names` has one for each number. `sigma` is that of each at the start. A random walk drifts by `walk` in the square
-    root of a second; with a finite `time_constant` (seconds) it is a Gauss-Markov process of steady sigma `sigma`.
+    Attributes
+    ----------
+    names: one for each number.
+    sigma: initial standard deviation of each number.
+    walk: density of a random walk, unit per square root of a second.
+    time_constant: of a Gauss-Markov process with steady standard deviation `sigma`, seconds; infinite: a random walk.
     """
 
     names: tuple[str, ...]
@@ -39,14 +45,14 @@ class ErrorState:
     time_constant: float = math.inf
 
 
-class Layout:
-    """The error vector: the strapdown's 15 states, then the further ones in their order. Immutable."""
+class ErrorLayout:
+    """The error vector: the 15 strapdown states, then the additional ones in their order. Immutable."""
 
     def __init__(self, extras: Iterable[ErrorState] = ()):
-        """Take the further states. Raises ValueError where a name is given twice."""
+        """Lay out the additional states. Raises ValueError for a name that is declared twice."""
         self.extras = tuple(dict.fromkeys(extras))
         self.extra_names = tuple(name for extra in self.extras for name in extra.names)
-        self.names = _CORE_NAMES + self.extra_names
+        self.names = _STRAPDOWN_NAMES + self.extra_names
         self.size = len(self.names)
         twice = {name for name in self.names if self.names.count(name) > 1}
         if twice:
@@ -57,27 +63,27 @@ class Layout:
         return name in self._index
 
     def index(self, name: str) -> int:
-        """Return where a state stands. Raises KeyError for one that is not declared."""
+        """Return the index of a state. Raises KeyError for one that is not declared."""
         return self._index[name]
 
-    def extra(self, name: str) -> int:
-        """Return where a further state stands among the further ones. Raises KeyError."""
+    def extra_index(self, name: str) -> int:
+        """Return the index of an additional state among the additional ones. Raises KeyError."""
         return self._index[name] - STRAPDOWN
 
     @cached_property
     def extra_sigmas(self) -> tuple[float, ...]:
-        """Sigma of each further state at the start."""
+        """Initial standard deviation of each additional state."""
         return tuple(extra.sigma for extra in self.extras for _ in extra.names)
 
     @cached_property
-    def decays(self) -> Array:
-        """1 / time constant of each further state, 1/s; 0 for a random walk."""
+    def decay_rates(self) -> Array:
+        """1 / time constant of each additional state, 1/s; 0 for a random walk."""
         rates = [0.0 if math.isinf(e.time_constant) else 1.0 / e.time_constant for e in self.extras for _ in e.names]
         return np.array(rates)
 
     @cached_property
-    def drives(self) -> Array:
-        """Spectral density that drives each further state, its unit squared a second."""
+    def noise_densities(self) -> Array:
+        """Spectral density of the process noise of each additional state, its unit squared per second."""
         found = [
             e.walk**2 if math.isinf(e.time_constant) else 2.0 * e.sigma**2 / e.time_constant
             for e in self.extras

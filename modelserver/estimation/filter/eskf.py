@@ -1,0 +1,549 @@
+"""Error-state Kalman filter: state, propagation, update, reset.
+
+Nominal state (`NavState`), in a frame N that is fixed to the earth and level at its origin, with east, north and up
+once the filter is aligned: position p and velocity v of the IMU, attitude R of the body axes (rolling frame: x forward,
+y left, z up), gyro bias b_g, accelerometer bias b_a, and the additional states of `ErrorLayout`.
+
+Propagation, with specific force f, angular rate w and earth rate w_E (P. Groves, "Principles of GNSS, Inertial, and
+Multisensor Integrated Navigation Systems", 2013, 5.4 in a local tangent frame):
+
+    p' = v,   v' = R (f - b_a) + g(p) - 2 w_E x v,   R' = R [w - b_g - R' w_E]x                                  (1)
+
+g includes the centrifugal acceleration and follows the vertical of the place. Each IMU interval is integrated with the
+mean of the samples at its ends, R at its middle.
+
+Error state, R_true = exp([theta]x) R (J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, 7,
+global angular error):
+
+    dp' = dv,   dv' = -[R f]x theta - R db_a + noise,   theta' = -R db_g + noise                                 (2)
+
+The covariance P <- F P F' + Q (Groves 14.2) is propagated every COVARIANCE_STEP, not with each sample: errors change
+slowly, and it is most of the work. `lag` and `impulse` of the state hold what F needs over that time.
+
+Update, with residual y, Jacobian H, noise R (Groves 3.2, Joseph form; filterpy's KalmanFilter holds the error state):
+
+    S = H P H' + R,   gate: y' S^-1 y <= chi2(1 - risk, m),   K = P H' S^-1                                      (3)
+
+Reset: the error K y is injected into the nominal state and is 0 again; P is rotated by half of it (Sola 7.3).
+
+Limits: one IMU; rates below 1 rad per interval; within 200 km of N's origin.
+Read top-down: `NavState` -> `propagate` -> `propagate_covariance` -> `update` -> `NavState.inject`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.earth import gravity as earth_model
+from modelserver.estimation.filter.error_layout import ATTITUDE, STRAPDOWN, ErrorLayout
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filterpy_import import import_kalman_filter
+from modelserver.messages import Decision, Verdict
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
+
+KalmanFilter: Final = import_kalman_filter()
+
+ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
+
+STANDARD_GRAVITY: Final = 9.80665
+EARTH_RADIUS: Final = 6_371_000.0
+"""Meters, mean (IUGG): for the direction of the vertical away from N's origin."""
+
+COVARIANCE_STEP: Final = 0.05
+"""Seconds between two steps of the covariance, at least."""
+
+
+# --- state --------------------------------------------------------------------------------------------------
+
+
+class NavState(NamedTuple):
+    """Nominal state at `utime`, the covariance of its error, and the last IMU sample.
+
+    A NamedTuple, because a new one is made for every IMU sample.
+
+    Attributes
+    ----------
+    utime: microseconds.
+    position, velocity: of the IMU in N, m and m/s.
+    attitude: rotation from the body axes to N.
+    gyro_bias, accelerometer_bias: along the body axes, rad/s and m/s2.
+    extras: the additional states, in the order of the layout.
+    covariance: (n, n) of the error (position, velocity, attitude, biases, additional states). It holds for the instant
+        `utime - 1e6 lag`.
+    lag: seconds since the covariance was propagated.
+    impulse: integral of R f over the lag, m/s along N.
+    rate, force: last IMU sample, rad/s and m/s2 along the body axes, with its biases.
+    travel: integral of the rolling frame's velocity along the body axes since the last wheel sample, m.
+    rotation: integral of the angular rate since then, rad.
+    """
+
+    utime: int
+    position: Vector3
+    velocity: Vector3
+    attitude: Quaternion
+    gyro_bias: Vector3
+    accelerometer_bias: Vector3
+    extras: tuple[float, ...]
+    covariance: Array
+    lag: float = 0.0
+    impulse: Vector3 = ZERO
+    rate: Vector3 = ZERO
+    force: Vector3 = ZERO
+    travel: Vector3 = ZERO
+    rotation: Vector3 = ZERO
+
+    @property
+    def angular_rate(self) -> Vector3:
+        """Angular rate of the body relative to N along the body axes, rad/s; it includes the earth rate."""
+        (a, b, c), (d, e, f) = self.rate, self.gyro_bias
+        return (a - d, b - e, c - f)
+
+    def point(self, lever: Vector3) -> Vector3:
+        """Return the position of a point of the body in N; `lever` leads to it from the IMU, body axes, m."""
+        x, y, z = so3.rotate(self.attitude, lever)
+        px, py, pz = self.position
+        return (px + x, py + y, pz + z)
+
+    def point_velocity(self, lever: Vector3) -> Vector3:
+        """Return the velocity of a point of the body along N: v + R (w x lever)."""
+        x, y, z = so3.rotate(self.attitude, cross(self.angular_rate, lever))
+        vx, vy, vz = self.velocity
+        return (vx + x, vy + y, vz + z)
+
+    def body_velocity(self, lever: Vector3) -> Vector3:
+        """Return the velocity of a point of the body along the body axes."""
+        x, y, z = so3.rotate(so3.conjugate(self.attitude), self.velocity)
+        a, b, c = cross(self.angular_rate, lever)
+        return (x + a, y + b, z + c)
+
+    @property
+    def yaw(self) -> float:
+        """Yaw of the body in N, rad."""
+        w, x, y, z = self.attitude
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    @property
+    def up(self) -> Vector3:
+        """N's up along the body axes."""
+        return so3.rotate(so3.conjugate(self.attitude), (0.0, 0.0, 1.0))
+
+    def inject(self, error: Array, covariance: Array) -> NavState:
+        """Return the state with an error (n) injected, and the covariance (n, n) after the reset (Sola 7.3)."""
+        e = error.tolist()
+        angle = (e[6], e[7], e[8])
+        size = abs(e[6]) + abs(e[7]) + abs(e[8])
+        attitude = so3.normalize(so3.multiply(so3.exponential(angle), self.attitude)) if size else self.attitude
+        if size > 1e-3:
+            G = np.eye(len(covariance))
+            G[ATTITUDE, ATTITUDE] += so3.skew((0.5 * e[6], 0.5 * e[7], 0.5 * e[8]))
+            covariance = G @ covariance @ G.T
+        px, py, pz = self.position
+        vx, vy, vz = self.velocity
+        gx, gy, gz = self.gyro_bias
+        ax, ay, az = self.accelerometer_bias
+        return self._replace(
+            position=(px + e[0], py + e[1], pz + e[2]),
+            velocity=(vx + e[3], vy + e[4], vz + e[5]),
+            attitude=attitude,
+            gyro_bias=(gx + e[9], gy + e[10], gz + e[11]),
+            accelerometer_bias=(ax + e[12], ay + e[13], az + e[14]),
+            extras=tuple(value + delta for value, delta in zip(self.extras, e[15:], strict=True)),
+            covariance=covariance,
+        )
+
+
+class Earth(NamedTuple):
+    """Gravity at N's origin, m/s2, and the earth rate along N's axes, rad/s."""
+
+    gravity: float = STANDARD_GRAVITY
+    rotation: Vector3 = ZERO
+
+    @classmethod
+    def at(cls, latitude_deg: float, height: float) -> Earth:
+        """Return the values of a place where N is east, north, up."""
+        return cls(earth_model.gravity(latitude_deg, height), earth_model.earth_rate(latitude_deg))
+
+
+class ProcessNoise(NamedTuple):
+    """Spectral densities of the process noise: (rad/s)2/Hz, (m/s2)2/Hz, and of the random walks of the biases.
+
+    `gyros_drive_attitude` is False for a stationary vehicle: its attitude is constant, whatever the gyros measure, so a
+    correction of their bias must not rotate it.
+    """
+
+    gyro: float
+    accelerometer: float
+    gyro_bias: float
+    accelerometer_bias: float
+    gyros_drive_attitude: bool = True
+
+
+def level_attitude(up: Vector3) -> Quaternion:
+    """Return the attitude with yaw 0 of a body that measures up along `up` (body axes, any length)."""
+    x, y, z = up
+    roll = math.atan2(y, z)
+    pitch = math.atan2(-x, math.hypot(y, z))
+    return so3.from_rpy(roll, pitch, 0.0)
+
+
+# --- propagation --------------------------------------------------------------------------------------------
+
+
+def propagate(nav: NavState, utime: int, rate: Vector3, force: Vector3, earth: Earth, base: Vector3) -> NavState:
+    """Propagate the nominal state over one IMU interval, equations (1); the covariance lags behind.
+
+    Parameters
+    ----------
+    utime: end of the interval, not before the state.
+    rate, force: IMU sample at `utime`, rad/s and m/s2 along the body axes, with its biases.
+    base: from the IMU to the rolling frame's origin, body axes, m.
+    """
+    dt = (utime - nav.utime) * 1e-6
+    gx, gy, gz = nav.gyro_bias
+    r, s = nav.rate, nav.force
+    wx, wy, wz = 0.5 * (r[0] + rate[0]) - gx, 0.5 * (r[1] + rate[1]) - gy, 0.5 * (r[2] + rate[2]) - gz
+    q = nav.attitude
+    ex, ey, ez = earth.rotation
+    if ez:
+        a, b, c = so3.rotate((q[0], -q[1], -q[2], -q[3]), earth.rotation)
+        wx, wy, wz = wx - a, wy - b, wz - c
+    ax, ay, az = nav.accelerometer_bias
+    mean_force = (0.5 * (s[0] + force[0]) - ax, 0.5 * (s[1] + force[1]) - ay, 0.5 * (s[2] + force[2]) - az)
+
+    h = 0.5 * dt
+    tx, ty, tz = wx * h, wy * h, wz * h
+    half = so3.small_angle_exponential((tx, ty, tz))
+    whole = so3.small_angle_exponential((wx * dt, wy * dt, wz * dt))
+    middle = so3.multiply(q, half)
+    fx, fy, fz = so3.rotate(middle, mean_force)
+    px, py, pz = nav.position
+    vx, vy, vz = nav.velocity
+    g = earth.gravity
+    # the vertical turns by 1 / radius for each meter from N's origin
+    lean = g / EARTH_RADIUS
+    accx = fx - lean * px - 2.0 * (ey * vz - ez * vy)
+    accy = fy - lean * py - 2.0 * (ez * vx - ex * vz)
+    accz = fz - g + 2.0 * lean * pz - 2.0 * (ex * vy - ey * vx)
+    ux, uy, uz = vx + accx * dt, vy + accy * dt, vz + accz * dt
+    mx, my, mz = 0.5 * (vx + ux), 0.5 * (vy + uy), 0.5 * (vz + uz)
+    bx, by, bz = so3.rotate((middle[0], -middle[1], -middle[2], -middle[3]), (mx, my, mz))
+    rx, ry, rz = nav.travel
+    ox, oy, oz = nav.rotation
+    ix, iy, iz = nav.impulse
+    lx, ly, lz = base
+    return NavState(
+        utime,
+        (px + mx * dt, py + my * dt, pz + mz * dt),
+        (ux, uy, uz),
+        so3.normalize(so3.multiply(q, whole)),
+        nav.gyro_bias,
+        nav.accelerometer_bias,
+        nav.extras,
+        nav.covariance,
+        nav.lag + dt,
+        (ix + fx * dt, iy + fy * dt, iz + fz * dt),
+        rate,
+        force,
+        (
+            rx + (bx + wy * lz - wz * ly) * dt,
+            ry + (by + wz * lx - wx * lz) * dt,
+            rz + (bz + wx * ly - wy * lx) * dt,
+        ),
+        (ox + wx * dt, oy + wy * dt, oz + wz * dt),
+    )
+
+
+def propagate_without_imu(nav: NavState, utime: int, rate: Vector3, base: Vector3) -> NavState:
+    """Propagate the nominal state at constant speed and the angular rate `rate` (rad/s, body axes, relative to N)."""
+    dt = (utime - nav.utime) * 1e-6
+    gx, gy, gz = nav.gyro_bias
+    angle = (rate[0] * dt, rate[1] * dt, rate[2] * dt)
+    attitude = so3.normalize(so3.multiply(nav.attitude, so3.exponential(angle)))
+    bx, by, bz = so3.rotate(so3.conjugate(nav.attitude), nav.velocity)
+    # the velocity turns with the body
+    ux, uy, uz = velocity = so3.rotate(attitude, (bx, by, bz))
+    px, py, pz = nav.position
+    vx, vy, vz = nav.velocity
+    rx, ry, rz = nav.travel
+    ox, oy, oz = nav.rotation
+    lx, ly, lz = base
+    wx, wy, wz = rate
+    return nav._replace(
+        utime=utime,
+        position=(px + 0.5 * (vx + ux) * dt, py + 0.5 * (vy + uy) * dt, pz + 0.5 * (vz + uz) * dt),
+        velocity=velocity,
+        attitude=attitude,
+        lag=nav.lag + dt,
+        rate=(wx + gx, wy + gy, wz + gz),
+        travel=(
+            rx + (bx + wy * lz - wz * ly) * dt,
+            ry + (by + wz * lx - wx * lz) * dt,
+            rz + (bz + wx * ly - wy * lx) * dt,
+        ),
+        rotation=(ox + angle[0], oy + angle[1], oz + angle[2]),
+    )
+
+
+def propagate_covariance(nav: NavState, noise: ProcessNoise, layout: ErrorLayout) -> NavState:
+    """Return the state with its covariance propagated to its instant: P <- F P F' + Q."""
+    dt = nav.lag
+    if dt <= 0.0:
+        return nav
+    decays = np.exp(-dt * layout.decay_rates) if layout.extra_names else None
+    extras = nav.extras
+    workspace, zero = _workspace(layout.size, 1)
+    workspace.x, workspace.P = zero, nav.covariance
+    workspace.predict(
+        F=_transition_matrix(nav, dt, layout, decays, noise.gyros_drive_attitude),
+        Q=_process_noise_matrix(noise, dt, layout, decays),
+    )
+    P: Array = workspace.P
+    if decays is not None:
+        extras = tuple(value * keep for value, keep in zip(extras, decays.tolist(), strict=True))
+    return nav._replace(covariance=P, lag=0.0, impulse=ZERO, extras=extras)
+
+
+def _transition_matrix(
+    nav: NavState, dt: float, layout: ErrorLayout, decays: Array | None, gyros_drive_attitude: bool = True
+) -> Array:
+    """Return F (n, n) over the lag: equations (2) to second order in dt."""
+    n = layout.size
+    F = np.zeros((n, n))
+    ix, iy, iz = nav.impulse
+    (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
+    t, u = -dt, -0.5 * dt * dt
+    k = 0.5 * dt
+    w = t if gyros_drive_attitude else 0.0
+    F.put(
+        _transition_entries(n),
+        (
+            # position by velocity, attitude and accelerometer bias
+            *(dt, dt, dt),
+            *(k * iz, -k * iy, -k * iz, k * ix, k * iy, -k * ix),
+            *(u * a, u * b, u * c, u * d, u * e, u * f, u * g, u * h, u * i),
+            # velocity by attitude and accelerometer bias
+            *(iz, -iy, -iz, ix, iy, -ix),
+            *(t * a, t * b, t * c, t * d, t * e, t * f, t * g, t * h, t * i),
+            # attitude by gyro bias
+            *(w * a, w * b, w * c, w * d, w * e, w * f, w * g, w * h, w * i),
+        ),
+    )
+    diagonal = F.reshape(-1)[:: n + 1]
+    diagonal[:STRAPDOWN] = 1.0
+    if decays is not None:
+        diagonal[STRAPDOWN:] = decays
+    return F
+
+
+def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, decays: Array | None) -> Array:
+    """Return Q (n, n) over the lag; the noise is the same along all axes."""
+    n = layout.size
+    Q = np.zeros((n, n))
+    v = noise.accelerometer * dt
+    p, pv = v * dt * dt / 3.0, v * dt / 2.0
+    w, bg, ba = noise.gyro * dt, noise.gyro_bias * dt, noise.accelerometer_bias * dt
+    diagonal = Q.reshape(-1)[:: n + 1]
+    diagonal[:STRAPDOWN] = (p, p, p, v, v, v, w, w, w, bg, bg, bg, ba, ba, ba)
+    Q[0, 3] = Q[3, 0] = Q[1, 4] = Q[4, 1] = Q[2, 5] = Q[5, 2] = pv
+    if decays is not None:
+        # exact for a Gauss-Markov process; dt, its limit, for a random walk
+        rates = layout.decay_rates
+        share = np.where(rates > 0.0, (1.0 - decays * decays) / np.maximum(2.0 * rates, 1e-300), dt)
+        diagonal[STRAPDOWN:] = layout.noise_densities * share
+    return Q
+
+
+@lru_cache(maxsize=16)
+def _transition_entries(n: int) -> npt.NDArray[np.intp]:
+    """Return the flat indices in an (n, n) matrix of the entries that `_transition_matrix` writes, in its order."""
+    skew = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
+    full = [(r, c) for r in range(3) for c in range(3)]
+    places = [(k, 3 + k) for k in range(3)]
+    places += [(r, 6 + c) for r, c in skew]
+    places += [(r, 12 + c) for r, c in full]
+    places += [(3 + r, 6 + c) for r, c in skew]
+    places += [(3 + r, 12 + c) for r, c in full]
+    places += [(6 + r, 9 + c) for r, c in full]
+    return np.array([r * n + c for r, c in places])
+
+
+# --- update and reset ---------------------------------------------------------------------------------------
+
+
+class Innovation(NamedTuple):
+    """A measurement against the state: residual (m) = measured - predicted = jacobian (m, n) error + noise.
+
+    Attributes
+    ----------
+    noise: covariance (m, m) of the measurement noise.
+    monitored: why the measurement is only compared for the ledger and not used, in a word; empty: it is used.
+    is_separable: if all components together fail the gate, those that pass it alone may be used.
+    inflation_limit: a NIS up to this many times the gate is used with its noise inflated until it passes (P. Huber's
+        weighting) instead of being rejected: for measurements with occasional large errors, which must not be shut out
+        when the state has drifted.
+    """
+
+    residual: Array
+    jacobian: Array
+    noise: Array
+    monitored: str = ""
+    is_separable: bool = False
+    inflation_limit: float = 1.0
+
+
+def update(
+    nav: NavState, innovation: Innovation, settings: FilterSettings, utime: int, source: str, seq: int, kind: str
+) -> tuple[NavState, Decision]:
+    """Fuse a measurement behind its chi-square gate, equations (3).
+
+    `utime`, `source`, `seq` and `kind` identify it in the decision. A rejected one leaves the state as it was.
+    """
+    y, H, R, monitored, is_separable, inflation_limit = innovation
+    if not (np.isfinite(y).all() and np.isfinite(H).all() and np.isfinite(R).all()):
+        return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
+    S = innovation_covariance(nav.covariance, H, R)
+    nis = normalized_innovation_squared(y, S)
+    limit = chi_square_gate(len(y), settings.gate_risk)
+    verdict, reason = Verdict.USED, ""
+    keep = np.ones(len(y), dtype=bool)
+    if monitored:
+        verdict, reason = Verdict.MONITORED, monitored
+    elif not nis <= limit:
+        verdict, reason = Verdict.REJECTED, "gate"
+        if nis <= inflation_limit * limit:
+            # S' = S nis / limit: the NIS becomes the limit
+            verdict, reason = Verdict.USED, "eased"
+            R = R + (nis / limit - 1.0) * S
+            is_separable = False
+        if is_separable and len(y) > 1:
+            single = chi_square_gate(1, settings.gate_risk)
+            fits = y * y <= single * np.diagonal(S)
+            if fits.any() and not fits.all():
+                y_, S_ = y[fits], S[np.ix_(fits, fits)]
+                if normalized_innovation_squared(y_, S_) <= chi_square_gate(len(y_), settings.gate_risk):
+                    verdict, reason = Verdict.USED, "part"
+                    keep = fits
+    decision = Decision(
+        utime,
+        source,
+        seq,
+        kind,
+        verdict,
+        reason,
+        tuple(y.tolist()),
+        tuple(S.ravel().tolist()),
+        tuple(R.ravel().tolist()),
+        nis,
+        limit,
+    )
+    if verdict is not Verdict.USED:
+        return nav, decision
+    if reason == "part":
+        y, H, R = y[keep], H[keep], R[np.ix_(keep, keep)]
+    try:
+        error, P = correct(nav.covariance, y, H, R)
+    except np.linalg.LinAlgError:
+        return nav, decision._replace(verdict=Verdict.REJECTED, reason="singular")
+    return nav.inject(error, P), decision
+
+
+def innovation_covariance(P: Array, H: Array, R: Array) -> Array:
+    """Return S = H P H' + R, (m, m), symmetric."""
+    S = H @ P @ H.T + R
+    return np.asarray(0.5 * (S + S.T))
+
+
+def normalized_innovation_squared(residual: Array, S: Array) -> float:
+    """Return the NIS, residual' S^-1 residual: chi-square distributed for a consistent filter; infinite if S is
+    singular.
+    """
+    if len(residual) == 1:
+        return float(residual[0] * residual[0] / S[0, 0]) if S[0, 0] > 0.0 else math.inf
+    try:
+        return float(residual @ np.linalg.solve(S, residual))
+    except np.linalg.LinAlgError:
+        return math.inf
+
+
+def correct(P: Array, residual: Array, H: Array, R: Array) -> tuple[Array, Array]:
+    """Return the error K y (n) and the covariance (n, n) after an update in Joseph form.
+
+    `P` is (n, n), `residual` (m), `H` (m, n), `R` (m, m). Raises numpy.linalg.LinAlgError if S is singular.
+    """
+    n, m = len(P), len(residual)
+    assert H.shape == (m, n), (H.shape, m, n)
+    assert R.shape == (m, m), R.shape
+    workspace, zero = _workspace(n, m)
+    workspace.x, workspace.P = zero, P
+    workspace.update(residual, R=R, H=H)
+    error: Array = workspace.x
+    after: Array = workspace.P
+    workspace.x = zero
+    return error, 0.5 * (after + after.T)
+
+
+@lru_cache(maxsize=64)
+def _workspace(n: int, m: int) -> tuple[Any, Array]:
+    """Return filterpy's KalmanFilter of n states and m measurements, and its zero error state.
+
+    It is a workspace: each call sets all that it reads, so the functions here are pure. x is one-dimensional; H, R, F
+    and Q are two-dimensional and always given, because its defaults broadcast silently.
+    """
+    workspace = KalmanFilter(dim_x=n, dim_z=m)
+    zero = np.zeros(n)
+    zero.flags.writeable = False
+    workspace.x = zero
+    return workspace, zero
+
+
+def chi_square_survival(value: float, dof: int) -> float:
+    """Return the probability that a chi-square variable of `dof` degrees of freedom exceeds `value`.
+
+    In closed form: Abramowitz and Stegun (1964), 26.4.4 for odd `dof`, 26.4.5 for even.
+    """
+    half = 0.5 * value
+    found = math.erfc(math.sqrt(half)) if dof % 2 else 0.0
+    exponents = (n + 0.5 * (dof % 2) for n in range(dof // 2))
+    return found + math.exp(-half) * math.fsum(half**each / math.gamma(each + 1.0) for each in exponents)
+
+
+@lru_cache(maxsize=256)
+def chi_square_gate(dof: int, risk: float) -> float:
+    """Return the value that a chi-square variable of `dof` degrees of freedom exceeds with probability `risk`."""
+    low, high = 0.0, 1.0
+    while chi_square_survival(high, dof) > risk:
+        low, high = high, 2.0 * high
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (middle, high) if chi_square_survival(middle, dof) > risk else (low, middle)
+    return high
+
+
+# --- divergence ---------------------------------------------------------------------------------------------
+
+
+def is_plausible(nav: NavState, settings: FilterSettings) -> bool:
+    """Return whether position and speed are finite and those of a vehicle: the cheap part of `is_sound`."""
+    # a comparison with nan is false
+    return math.isfinite(sum(nav.position)) and math.hypot(*nav.velocity) <= 2.0 * settings.maximum_speed
+
+
+def is_sound(nav: NavState, settings: FilterSettings) -> bool:
+    """Return whether the state is finite and within its limits; otherwise the filter has diverged."""
+    P = nav.covariance
+    diagonal = np.diagonal(P)
+    if not (np.isfinite(P).all() and (diagonal >= 0.0).all()):
+        return False
+    numbers = (*nav.position, *nav.velocity, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras)
+    if not all(map(math.isfinite, numbers)):
+        return False
+    return (
+        math.hypot(*nav.velocity) <= 2.0 * settings.maximum_speed
+        and math.hypot(*nav.gyro_bias) <= 20.0 * settings.gyro_bias_sigma
+        and math.hypot(*nav.accelerometer_bias) <= 20.0 * settings.accelerometer_bias_sigma
+    )

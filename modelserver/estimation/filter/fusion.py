@@ -1,0 +1,216 @@
+"""One item fused: what its handlers share.
+
+An `Item` is one measurement of a sample at its instant. A handler is a pure function (setup, state, item) -> (state,
+decisions); `fuse_measurement` is the one for every kind that needs no logic of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple, TypeAlias
+
+from modelserver.earth.geodesy import GeodesyError
+from modelserver.estimation.filter import eskf, propagation
+from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample, S
+from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
+from modelserver.messages import (
+    AbsolutePoseSample,
+    Decision,
+    GpsSample,
+    ImuSample,
+    Mode,
+    RangeSample,
+    Sample,
+    SwitchMode,
+    VehicleStatusSample,
+    Verdict,
+)
+
+CONSTRAINT_PERIOD: Final = 0.1
+"""Seconds between two non-holonomic updates, if no wheel sample brings one."""
+
+ZUPT_PERIOD: Final = 0.2
+"""Seconds between two zero-velocity updates."""
+
+IMU_ORIENTATION_PERIOD: Final = 0.5
+"""Seconds between two updates by the IMU's own orientation or magnetometer."""
+
+IMU, MODE, STEERING = "inertial", "mode", "steering"
+"""Kinds of items that are not measurements of the registry."""
+
+
+class Item(NamedTuple):
+    """One measurement of a sample, at its instant. Items are fused in the order of their first four fields.
+
+    `measurement` is None for the propagation by an IMU sample, the steering angle of a vehicle status, and a command to
+    switch the mode.
+    """
+
+    utime: int
+    source: str
+    seq: int
+    part: int
+    kind: str
+    measurement: Measurement | None
+    sample: Sample | SwitchMode
+
+    @property
+    def key(self) -> tuple[int, str, int, int]:
+        """The order of items: instant, source, sequence number, part of the sample."""
+        return (self.utime, self.source, self.seq, self.part)
+
+
+Fused: TypeAlias = tuple[FilterState, tuple[Decision, ...]]
+
+Handler: TypeAlias = Callable[[Setup, FilterState, Item], Fused]
+
+NOTHING: Final[tuple[Decision, ...]] = ()
+
+
+def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
+    """Return the items of a sample."""
+    header = sample.header
+    utime, source, seq = header.utime, header.source, header.seq
+    items: list[Item] = []
+    if isinstance(sample, ImuSample):
+        items.append(Item(utime, source, seq, 0, IMU, None, sample))
+    elif isinstance(sample, SwitchMode):
+        items.append(Item(utime, source, seq, 0, MODE, None, sample))
+    elif isinstance(sample, VehicleStatusSample) and setup.rig.steering is not None:
+        items.append(Item(utime, source, seq, 0, STEERING, None, sample))
+    for part, measurement in enumerate(setup.measurements.get(type(sample), ()), start=1):
+        instant = measurement.get_utime(sample)
+        if instant is not None:
+            items.append(Item(instant, source, seq, part, measurement.kind, measurement, sample))
+    return items
+
+
+# --- decisions ----------------------------------------------------------------------------------------------
+
+
+def reject(item: Item, reason: str) -> Decision:
+    """Return the decision on an item that is rejected before it is compared."""
+    return Decision(item.utime, item.source, item.seq, item.kind, Verdict.REJECTED, reason)
+
+
+def report_reset(item: Item, reason: str) -> Decision:
+    """Return the decision that an item led to: a reset of the state."""
+    return Decision(item.utime, item.source, item.seq, item.kind, Verdict.RESET, reason)
+
+
+def report_event(state: Navigating, kind: str, verdict: Verdict, text: str) -> Decision:
+    """Return a decision of the filter itself."""
+    return Decision(state.nav.utime, "filter", 0, kind, verdict, text)
+
+
+# --- modes --------------------------------------------------------------------------------------------------
+
+_WORLD_SAMPLES = (AbsolutePoseSample, RangeSample)
+
+
+def uses_gnss(mode: Mode) -> bool:
+    """Return whether a mode uses GNSS."""
+    return mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
+
+
+def uses_item(mode: Mode, item: Item) -> bool:
+    """Return whether a mode uses a measurement."""
+    sample = item.sample
+    if isinstance(sample, GpsSample):
+        return uses_gnss(mode)
+    if isinstance(sample, ImuSample):
+        return mode is not Mode.NO_IMU and (mode is not Mode.DEAD_RECKONING or item.kind == "imu_tilt")
+    return not (mode is Mode.DEAD_RECKONING and isinstance(sample, _WORLD_SAMPLES))
+
+
+def accept_fix(setup: Setup, state: FilterState, sample: GpsSample) -> AcceptedFix | str:
+    """Return the fix, or in one word why it is not good enough."""
+    fix = evaluate_fix(sample, setup.settings)
+    geodesy = state.common.geodesy
+    if isinstance(fix, str) or geodesy is None:
+        return fix
+    try:
+        geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0)
+    except GeodesyError:
+        return "range"
+    return fix
+
+
+# --- updates ------------------------------------------------------------------------------------------------
+
+
+def create_context(setup: Setup, state: Navigating, age: float = math.inf, previous: Any = None) -> MeasurementContext:
+    """Return what a measurement is compared with, `age` seconds after the previous one of its source."""
+    return MeasurementContext(
+        state.nav,
+        setup.layout,
+        setup.settings,
+        setup.rig,
+        state.site if isinstance(state, Aligned) else None,
+        state.common.geodesy,
+        state.is_stationary,
+        age,
+        previous,
+        get_steering_angle(setup, state),
+    )
+
+
+def get_steering_angle(setup: Setup, state: Navigating) -> float:
+    """Return the steering angle that the vehicle controller measures now, rad; nan without a fresh one."""
+    signal, steering = setup.rig.steering, state.common.wheels.steering
+    if signal is None or (state.nav.utime - steering.utime) * 1e-6 > signal.max_age:
+        return math.nan
+    return steering.angle
+
+
+def remember(state: S, key: tuple[str, str], item: Item) -> S:
+    """Return the state with an item as the previous one of its source and kind."""
+    common = state.common
+    previous = MappingProxyType({**common.previous, key: PreviousSample(item.utime, item.sample)})
+    return state._replace(common=common._replace(previous=previous))
+
+
+def fuse_constraint(setup: Setup, state: N, kind: str, innovation: Innovation) -> tuple[N, Decision]:
+    """Return the state after an update without a sensor, and the decision."""
+    nav = state.nav
+    nav, decision = eskf.update(nav, innovation, setup.settings, nav.utime, "filter", 0, kind)
+    return state._replace(nav=nav), decision
+
+
+def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]:
+    """Return the state after the non-holonomic constraint, and the decision."""
+    dt = (utime - state.constraints.non_holonomic_utime) * 1e-6
+    state = propagation.propagate_covariance(setup, state)
+    state = state._replace(constraints=state.constraints._replace(non_holonomic_utime=utime))
+    innovation = constraints.non_holonomic(create_context(setup, state), max(dt, 1e-3))
+    return fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
+
+
+def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after a measurement of any kind, behind its gate."""
+    sample, measurement = item.sample, item.measurement
+    if isinstance(state, Leveling) or measurement is None or not uses_item(state.common.mode, item):
+        return state, NOTHING
+    key = (item.source, item.kind)
+    previous = state.common.previous.get(key)
+    age = math.inf if previous is None else (item.utime - previous.utime) * 1e-6
+    if isinstance(sample, ImuSample) and age < IMU_ORIENTATION_PERIOD:
+        return state, NOTHING
+    state = propagation.advance(setup, state, item.utime)
+    context = create_context(setup, state, age, None if previous is None else previous.sample)
+    innovation = measurement.evaluate(context, sample)
+    if isinstance(innovation, str):
+        return state, ((reject(item, innovation),) if innovation else NOTHING)
+    nav, decision = eskf.update(context.nav, innovation, setup.settings, item.utime, item.source, item.seq, item.kind)
+    state = state._replace(nav=nav)
+    if isinstance(state, Aligned) and decision.verdict is Verdict.USED and not isinstance(sample, GpsSample):
+        measures = innovation.jacobian[:, :3] != 0.0
+        offset = state.gnss.offset
+        a, b, c = (item.utime if measures[:, axis].any() else offset.aided_utimes[axis] for axis in range(3))
+        state = state._replace(gnss=state.gnss._replace(offset=offset._replace(aided_utimes=(a, b, c))))
+    return remember(state, key, item), (decision,)

@@ -1,0 +1,353 @@
+"""GNSS position and height: heading alignment before the heading is known, then the logic around the update.
+
+The quality of a fix is checked, the origin captured from the first good ones, and the fix compared with the path of
+dead reckoning. What becomes of a fix at its gate (use, drift, rejection, reset of the position) is decided here, on the
+values of the GNSS monitor.
+"""
+
+from __future__ import annotations
+
+import math
+
+from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic, origin_at
+from modelserver.estimation.filter import (
+    eskf,
+    gnss_monitor,
+    heading_alignment,
+    heading_check,
+    heading_step,
+    latency_estimator,
+    leveling,
+    propagation,
+)
+from modelserver.estimation.filter.eskf import Earth, Innovation, NavState
+from modelserver.estimation.filter.fusion import (
+    NOTHING,
+    Fused,
+    Item,
+    accept_fix,
+    create_context,
+    fuse_measurement,
+    reject,
+    report_reset,
+    uses_gnss,
+)
+from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
+from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
+from modelserver.estimation.filter.measurements.gnss import (
+    GpsPosition,
+    locate_fix,
+    read_velocity,
+    split_variance,
+)
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import (
+    Aligned,
+    FilterState,
+    Leveling,
+    Navigating,
+    PendingDecision,
+    S,
+    Unaligned,
+    is_speed_known,
+)
+from modelserver.estimation.fix_quality import AcceptedFix
+from modelserver.messages import Decision, FixType, GpsSample, Verdict
+from modelserver.transforms import so3
+
+# --- quality and origin -------------------------------------------------------------------------------------
+
+
+def _capture_origin(setup: Setup, state: S, fix: AcceptedFix, utime: int) -> S:
+    """Return the state with a fix more for the origin, which is set once no delayed sample can change it."""
+    common, settings = state.common, setup.settings
+    if common.geodesy is not None or any(each.origin is not None for each in common.pending):
+        return state
+    height = 0.0 if math.isnan(fix.height) else fix.height
+    ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
+    capture, origin = common.capture.add_fix(utime, ecef, fix.sigma, settings)
+    if origin is None and isinstance(state, Aligned) and state.gnss.num_confirmed >= settings.origin_fixes:
+        # fixes that agree with the motion are as good as fixes along a straight line
+        origin = origin_at(fix.latitude_deg, fix.longitude_deg, height)
+    state = state._replace(common=common._replace(capture=capture))
+    if origin is None:
+        return state
+    return _wait_horizon(setup, state, PendingDecision(utime, origin=origin))
+
+
+def _wait_horizon(setup: Setup, state: S, decision: PendingDecision) -> S:
+    """Return the state with a decision of this instant pending until no delayed sample can change it."""
+    due = decision._replace(utime=decision.utime + round(setup.settings.horizon * 1e6))
+    return state._replace(common=state.common._replace(pending=(*state.common.pending, due)))
+
+
+# --- position and height ------------------------------------------------------------------------------------
+
+
+def fuse_fix(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after the position of a fix."""
+    sample, measurement = item.sample, item.measurement
+    assert isinstance(sample, GpsSample)
+    assert isinstance(measurement, GpsPosition)
+    fix = accept_fix(setup, state, sample)
+    if isinstance(fix, str):
+        return state, (reject(item, fix),)
+    is_used = uses_gnss(state.common.mode)
+    if is_used:
+        state = _capture_origin(setup, state, fix, item.utime)
+    if isinstance(state, Leveling):
+        if not setup.uses_imu(state.common.mode) and setup.wheels is None:
+            return leveling.start_level(setup, state, item.utime), NOTHING
+        if _shows_motion(setup, state, sample):
+            return _set_moving(state, item.utime), NOTHING
+        return state, NOTHING
+    state = propagation.advance(setup, state, item.utime)
+    if isinstance(state, Unaligned):
+        return _fuse_unaligned(setup, state, item, sample, fix, is_used)
+    return _fuse_aligned(setup, state, item, sample, measurement, fix, is_used)
+
+
+def _fuse_unaligned(
+    setup: Setup, state: Unaligned, item: Item, sample: GpsSample, fix: AcceptedFix, is_used: bool
+) -> Fused:
+    """Return the state after a fix before the heading is known."""
+    site, earth = state.site, state.earth
+    if site is None:
+        height = 0.0 if math.isnan(fix.height) else fix.height
+        site = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, height)
+        found = Earth.at(fix.latitude_deg, height)
+        # before the heading is known the horizontal part of the earth rate has no direction
+        earth = Earth(found.gravity, (0.0, 0.0, found.rotation[2]))
+    newest = _compare_with_path(setup, state, site, fix, sample.fix_type)
+    if gnss_monitor.shows_motion(state.alignment.last_fix, newest, setup.settings):
+        state = _set_moving(state, newest.utime)
+    state = state._replace(site=site, earth=earth, alignment=state.alignment._replace(last_fix=newest))
+    if not is_used:
+        return state, NOTHING
+    is_known = is_speed_known(state)
+    state, fit = heading_step.align_by_fixes(setup, state, newest)
+    if fit is None:
+        return state, NOTHING
+    nav = state.nav if is_known else heading_alignment.set_speed(state.nav, fit.travel * fit.factor, fit.factor_sigma)
+    aligned = heading_step.initialize(setup, state, nav, fit.rotation, newest)
+    text = f"heading to {math.degrees(fit.rotation.sigma):.1f} deg by {fit.distance:.1f} m driven"
+    return aligned, (report_reset(item, text),)
+
+
+def _fuse_aligned(
+    setup: Setup,
+    state: Aligned,
+    item: Item,
+    sample: GpsSample,
+    measurement: GpsPosition,
+    fix: AcceptedFix,
+    is_used: bool,
+) -> Fused:
+    """Return the state after a fix, with the logic of the GNSS monitor around the update."""
+    settings, layout, nav = setup.settings, setup.layout, state.nav
+    newest = _compare_with_path(setup, state, state.site, fix, sample.fix_type)
+    before = state.gnss.last_fix
+    is_continuous = gnss_monitor.is_continuous(before, newest, settings)
+    since = 0.0 if before is None else (newest.utime - before.utime) * 1e-6
+    if gnss_monitor.shows_motion(before, newest, settings):
+        state = _set_moving(state, newest.utime)
+    state = state._replace(gnss=state.gnss._replace(last_fix=newest))
+    if state.heading_check is not None and is_used:
+        state, decisions = _check_heading(setup, state, newest)
+        if decisions:
+            return state, decisions
+    adds_nothing = _adds_nothing(setup, state, fix)
+    if not adds_nothing:
+        inflated = gnss_monitor.inflate_correlated_error(nav, state.gnss.noise_inflation, since, layout, settings)
+        state = state._replace(nav=inflated)
+    innovation = measurement.evaluate(create_context(setup, state), sample)
+    if isinstance(innovation, str):
+        return state, NOTHING
+    if not is_used or adds_nothing:
+        innovation = innovation._replace(monitored="at_rest" if is_used else "mode")
+    if not is_used:
+        _, decision = eskf.update(nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
+        return state, (decision,)
+    state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
+    if not adds_nothing and decision.verdict is Verdict.USED:
+        gnss = state.gnss.learn_inflation(decision, since, settings)
+        nav = latency_estimator.inflate_latency(
+            state.nav,
+            decision.residual,
+            latency_estimator.get_drift_weight(gnss.noise_inflation, since, settings),
+            layout,
+            is_speed_measured=state.common.measures_wheel_speed(state.nav.utime),
+        )
+        sigma = (newest.correlated, newest.correlated, 0.0)
+        offset = gnss.offset.update(nav, sigma, since, slice(0, 2), layout, settings)
+        state = state._replace(nav=nav, gnss=gnss._replace(offset=offset))
+    return state, (decision,)
+
+
+def _compare_with_path(
+    setup: Setup, state: Navigating, site: LocalFrame, fix: AcceptedFix, fix_type: FixType
+) -> PathFix:
+    """Return a fix beside the state at its instant."""
+    settings, rig, nav = setup.settings, setup.rig, state.nav
+    lever = rig.lever_arm(rig.gps_frame)
+    x, y, z = nav.point(lever)
+    east, north, up = locate_fix(fix, site, z)
+    white_e, correlated_e = split_variance(fix.east_variance, fix_type, settings)
+    white_n, correlated_n = split_variance(fix.north_variance, fix_type, settings)
+    arm = so3.rotate(nav.attitude, rig.pose(rig.gps_frame).xyz)
+    unit_path, accelerated_path, is_known = 0j, 0j, True
+    if isinstance(state, Unaligned):
+        unit_path = state.alignment.unit_path
+        accelerated_path = state.alignment.accelerated_path + to_horizontal(so3.rotate(nav.attitude, lever))
+        is_known = is_speed_known(state)
+    return PathFix(
+        nav.utime,
+        complex(east, north),
+        up,
+        complex(x, y),
+        to_horizontal(arm),
+        unit_path,
+        math.sqrt(0.5 * (white_e + white_n)),
+        math.sqrt(0.5 * (correlated_e**2 + correlated_n**2)),
+        split_variance(fix.up_variance, fix_type, settings)[1],
+        accelerated_path,
+        is_known,
+    )
+
+
+def _shows_motion(setup: Setup, state: Leveling, sample: GpsSample) -> bool:
+    """Return whether fixes show, before leveling, that the vehicle moves: by velocity, or by their positions."""
+    stated = read_velocity(sample, setup.settings)
+    if stated is not None:
+        velocity, R = stated
+        return math.hypot(velocity[0], velocity[1]) > 4.0 * math.sqrt(max(R[0, 0], R[1, 1])) + 0.2
+    fixes = state.common.capture.fixes
+    return len(fixes) > 1 and math.dist(fixes[0][1], fixes[-1][1]) > 4.0 * (fixes[0][2] + fixes[-1][2])
+
+
+def _set_moving(state: S, utime: int) -> S:
+    return state._replace(common=state.common._replace(moving_until=utime + round(MOVING_TIME * 1e6)))
+
+
+def _adds_nothing(setup: Setup, state: Aligned, fix: AcceptedFix) -> bool:
+    """Return whether the vehicle is stationary, and known as well as the fix.
+
+    The time-correlated error would otherwise move a stationary vehicle about (report 7: erratic when stationary).
+    """
+    P = state.nav.covariance
+    return state.is_stationary and max(P[0, 0], P[1, 1]) <= max(fix.sigma, setup.settings.gps_sigma_floor) ** 2 * 1.1
+
+
+def _gate_fix(
+    setup: Setup, state: Aligned, innovation: Innovation, newest: PathFix, item: Item, *, is_continuous: bool
+) -> tuple[Aligned, Decision]:
+    """Return the state after a fix, with what follows from its gate: drift, rejection, reset of the position."""
+    settings, nav, gnss = setup.settings, state.nav, state.gnss
+    utime = nav.utime
+    after, decision = eskf.update(nav, innovation, settings, utime, item.source, item.seq, "gps_position")
+    is_within = decision.statistic <= decision.limit or decision.verdict is Verdict.USED
+    if decision.dof and not decision.statistic <= decision.limit and is_continuous and not gnss.num_rejected:
+        drifted = _fuse_drifted(setup, nav, innovation, item, decision)
+        if drifted is not None:
+            nav, after, decision = drifted
+            is_within = True
+    if decision.verdict is Verdict.MONITORED and is_within:
+        return _confirm(state, utime), decision
+    if decision.verdict is Verdict.USED:
+        shift = math.hypot(after.position[0] - nav.position[0], after.position[1] - nav.position[1])
+        state = _confirm(state, utime)
+        common, gnss = state.common, state.gnss.allow_outlier(nav, innovation, decision)
+        if shift > settings.jump_epoch:
+            common = common._replace(epoch=common.epoch + 1)
+        return state._replace(nav=after, common=common, gnss=gnss), decision
+    if decision.verdict is Verdict.MONITORED:
+        decision = decision._replace(verdict=Verdict.REJECTED, reason="gate")
+    since = (newest.utime - gnss.rejected[-1].utime) * 1e-6 if gnss.rejected else 0.0
+    nav = latency_estimator.inflate_latency(
+        nav,
+        innovation.residual.tolist(),
+        min(since, 2.0),
+        setup.layout,
+        is_speed_measured=state.common.measures_wheel_speed(nav.utime),
+    )
+    state = state._replace(nav=nav, gnss=gnss.reject(utime, newest, settings))
+    pending = state.common.pending
+    if state.gnss.fit_rejected(nav, settings) is not None and not any(each.resets_position for each in pending):
+        state = _wait_horizon(setup, state, PendingDecision(utime, resets_position=True))
+    return state, decision
+
+
+def _fuse_drifted(
+    setup: Setup, nav: NavState, innovation: Innovation, item: Item, decision: Decision
+) -> tuple[NavState, NavState, Decision] | None:
+    """Return the state with the time-correlated error inflated until a fix that drifted passes, the state after the
+    fix, and the decision; None if it does not pass.
+    """
+    settings, layout = setup.settings, setup.layout
+    excess = decision.statistic / decision.dof
+    first = 1.0 + excess * settings.gps_correlation_time / 2.0 * 0.01
+    inflated = gnss_monitor.inflate_correlated_error(nav, first, 1.0, layout, settings)
+    for _ in range(12):
+        after, again = eskf.update(inflated, innovation, settings, nav.utime, item.source, item.seq, "gps_position")
+        if again.statistic <= 2.0 * again.dof:
+            break
+        more = 1.0 + settings.gps_correlation_time * 0.01 * excess
+        inflated = gnss_monitor.inflate_correlated_error(inflated, more, 1.0, layout, settings)
+    if again.verdict is not Verdict.USED:
+        return None
+    return inflated, after, again._replace(reason="drift")
+
+
+def _confirm(state: Aligned, utime: int) -> Aligned:
+    """Return the state after a fix that agrees: rejected ones before it were outliers."""
+    common = state.common
+    if common.pending:
+        common = common._replace(pending=tuple(each for each in common.pending if not each.resets_position))
+    return state._replace(common=common, gnss=state.gnss.confirm(utime))
+
+
+def fuse_height(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after the height of a fix; one that drifts shows that the whole fix does."""
+    if isinstance(state, Aligned) and state.gnss.num_rejected:
+        return state, NOTHING  # the decision on the position is that on the fix
+    previous = state.common.previous.get((item.source, item.kind))
+    state, decisions = fuse_measurement(setup, state, item)
+    if isinstance(state, Aligned) and decisions and decisions[0].residual and previous is not None:
+        since = (item.utime - previous.utime) * 1e-6
+        gnss = state.gnss.learn_inflation(decisions[0], since, setup.settings)
+        if gnss.last_fix is not None and not state.is_stationary:
+            sigma = (0.0, 0.0, gnss.last_fix.up_sigma)
+            offset = gnss.offset.update(state.nav, sigma, since, slice(2, 3), setup.layout, setup.settings)
+            gnss = gnss._replace(offset=offset)
+        state = state._replace(gnss=gnss)
+    return state, decisions
+
+
+def _check_heading(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
+    """Return the state after a fix more for the check of a restored heading: confirmed, corrected, or still neither."""
+    check, rotation, decision = heading_check.update(setup, state, newest)
+    state = state._replace(heading_check=check)
+    if rotation is not None:
+        state = start_epoch(heading_step.initialize(setup, state, state.nav, rotation, newest))
+    return state, () if decision is None else (decision,)
+
+
+def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | None]:
+    """Return the state with its position, and if it was wrong its heading, re-initialized from the rejected fixes."""
+    nav = state.nav
+    fit = state.gnss.fit_rejected(nav, setup.settings)
+    if fit is None:
+        return state, None
+    sigma = math.hypot(fit.rotation.sigma, math.sqrt(nav.covariance[8, 8]))
+    rotation = fit.rotation if abs(fit.rotation.angle) > 3.0 * sigma else Rotation(0.0, 0.0)
+    state = heading_step.initialize(setup, state, nav, rotation, state.gnss.rejected[-1])
+    decision = Decision(
+        nav.utime, "filter", 0, "gps_position", Verdict.RESET, "fixes agree with the way driven, the state does not"
+    )
+    return start_epoch(state), decision
+
+
+def start_epoch(state: Aligned) -> Aligned:
+    """Return the state in a new epoch, without an allowance for earlier outliers."""
+    common = state.common._replace(epoch=state.common.epoch + 1)
+    return state._replace(common=common, gnss=state.gnss._replace(outlier_allowance=0.0))

@@ -1,0 +1,307 @@
+"""Heading: found by the path, by the receiver's velocity, or by anything that measures it outright.
+
+Before the heading is known, N is rotated about up by an unknown angle. `align_by_fixes` fits the path of dead reckoning
+to the fixes, `fuse_velocity` uses the receiver's velocity, `fuse_baseline` a second antenna, `fuse_imu_yaw` the IMU's
+own yaw, `fuse_absolute_pose` a pose of an operator or another source; `initialize` then sets the state in the world.
+Once the filter is aligned these are ordinary measurements.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import Final
+
+import numpy as np
+
+from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
+from modelserver.estimation.filter import (
+    heading_alignment,
+    latency_estimator,
+    leveling,
+    propagation,
+)
+from modelserver.estimation.filter.eskf import Earth, NavState
+from modelserver.estimation.filter.fusion import (
+    NOTHING,
+    Fused,
+    Item,
+    accept_fix,
+    create_context,
+    fuse_measurement,
+    reject,
+    report_reset,
+    uses_gnss,
+)
+from modelserver.estimation.filter.gnss_monitor import GnssMonitor
+from modelserver.estimation.filter.heading_alignment import PathFit, PathFix, Rotation, to_horizontal
+from modelserver.estimation.filter.measurements import MeasurementContext
+from modelserver.estimation.filter.measurements.aiding import AbsolutePose
+from modelserver.estimation.filter.measurements.gnss import (
+    GpsBaseline,
+    get_baseline_sigma,
+    read_velocity,
+)
+from modelserver.estimation.filter.measurements.imu_orientation import ImuYaw, compute_yaw
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import (
+    Aligned,
+    FilterState,
+    Leveling,
+    Navigating,
+    Unaligned,
+    is_speed_known,
+)
+from modelserver.messages import AbsolutePoseSample, GpsSample, ImuSample, Mode, YawSource
+from modelserver.transforms import so3
+
+MAX_FIX_AGE: Final = 1.5
+"""Seconds for which a fix is the position of a vehicle whose heading was just found."""
+
+COURSE_SIGMA: Final = 0.05
+"""Sigma of the course in N, rad, below which the receiver's course measures the heading of N: about that of a course.
+"""
+
+
+# --- by fixes ------------------------------------------------------------------------------------------------
+
+
+def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Unaligned, PathFit | None]:
+    """Return the state with a fix more for the heading, and the fit of the path to the fixes once it is certain."""
+    settings, nav = setup.settings, state.nav
+    segment = heading_alignment.append_fix(state.alignment.fixes, newest, settings.align_window)
+    alignment = state.alignment._replace(fixes=segment, last_fix=newest, is_direction_unknown=False)
+    state = state._replace(alignment=alignment)
+    rate_sigma = math.sqrt(nav.covariance[11, 11])
+    is_known = is_speed_known(state)
+    fixes = heading_alignment.select_known_speed(segment) if is_known else segment
+    fit = heading_alignment.fit_path(fixes, settings, is_unit_path=not is_known, rate_sigma=rate_sigma)
+    if fit is None or fit.rotation.sigma > settings.align_sigma:
+        return state, None
+    if not heading_alignment.is_consistent(fit, newest):
+        return state, None
+    if is_known and not 0.6 < fit.factor < 1.6:
+        # not the distance that was driven: fixes that drift, or wheels that spin
+        return state, None
+    if not is_known:
+        if fit.factor < settings.align_speed:
+            return state, None
+        travel = _find_direction(setup, state, nav.yaw + fit.rotation.angle, fit.factor)
+        if not travel:
+            return state._replace(alignment=alignment._replace(is_direction_unknown=True)), None
+        if travel < 0:
+            fit = heading_alignment.fit_path(segment, settings, is_unit_path=True, rate_sigma=rate_sigma, travel=-1.0)
+    return state, fit
+
+
+def _find_direction(setup: Setup, state: Unaligned, heading: float, speed: float) -> int:
+    """Return 1 for a vehicle of unknown velocity that drives forward, -1 for backward, 0 without evidence.
+
+    `heading` (rad, N once it is rotated) and `speed` (m/s) are those of driving forward along the fixes. Backward the
+    heading would be the opposite one. A wrong choice would last, so none is made without evidence.
+    """
+    if speed > setup.settings.reverse_speed:
+        return 1
+    if not setup.uses_imu(state.common.mode):
+        return 0
+    return heading_alignment.find_direction_of_travel(state.alignment.fixes, heading - state.nav.yaw, setup.settings)
+
+
+def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotation, newest: PathFix) -> Aligned:
+    """Return the state with N rotated by a heading that was found, and the antenna at the newest fix.
+
+    `nav` is the state's own, or that with a speed that was just found: finding it has displaced the position by all
+    that was driven at an unknown speed, so the displacement since the fix is at that speed.
+    """
+    lever = setup.rig.lever_arm(setup.rig.gps_frame)
+    if nav is state.nav:
+        x, y, _ = nav.point(lever)
+        displacement = complex(x, y) - newest.path
+    else:
+        displacement = to_horizontal(nav.point_velocity(lever)) * (nav.utime - newest.utime) * 1e-6
+    displacement *= cmath.rect(1.0, rotation.angle)
+    if isinstance(state, Unaligned):
+        known = heading_alignment.select_known_speed(state.alignment.fixes)
+        nav = latency_estimator.reconcile_latency(nav, latency_estimator.fit_latency(known), setup.layout)
+        gnss = GnssMonitor(last_fix=state.alignment.last_fix)
+    else:
+        gnss = state.gnss
+    nav = heading_alignment.rotate(nav, rotation, setup.layout)
+    nav = heading_alignment.place(nav, newest, displacement, lever, setup.layout)
+    site = state.site
+    assert site is not None
+    latitude, _, height = geodetic_from_ecef(site.ecef)
+    return Aligned(
+        nav,
+        state.imu,
+        state.stationary,
+        state.constraints,
+        state.common._replace(is_clock_stepped=False),
+        Earth.at(latitude, height),
+        site,
+        gnss.restart(nav.utime),
+        state.heading_check if isinstance(state, Aligned) else None,
+    )
+
+
+def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after the receiver's velocity, which gives the heading if it is unknown."""
+    sample = item.sample
+    assert isinstance(sample, GpsSample)
+    if not uses_gnss(state.common.mode) or isinstance(state, Leveling):
+        return state, NOTHING
+    if isinstance(state, Aligned):
+        return fuse_measurement(setup, state, item)
+    if isinstance(accept_fix(setup, state, sample), str):
+        return state, NOTHING
+    state = propagation.advance(setup, state, item.utime)
+    newest = state.alignment.last_fix
+    found = _align_by_velocity(setup, state, sample, item.utime)
+    if found is None or newest is None:
+        return state, NOTHING
+    rotation, speed = found
+    nav = state.nav
+    if math.isfinite(speed):
+        nav = heading_alignment.set_speed(nav, speed, setup.settings.velocity_sigma)
+    text = f"heading, to {math.degrees(rotation.sigma):.1f} deg, by the receiver's velocity"
+    return initialize(setup, state, nav, rotation, newest), (report_reset(item, text),)
+
+
+def _align_by_velocity(setup: Setup, state: Unaligned, sample: GpsSample, utime: int) -> tuple[Rotation, float] | None:
+    """Return the rotation of N by the receiver's velocity, and the speed (nan: known already); None without evidence.
+
+    An unknown speed is signed by the direction of travel; nothing is returned below twice `align_speed`.
+    """
+    settings, nav, newest = setup.settings, state.nav, state.alignment.last_fix
+    stated = read_velocity(sample, settings)
+    if stated is None or newest is None or (utime - newest.utime) * 1e-6 > MAX_FIX_AGE:
+        return None
+    velocity, R = stated
+    z = complex(velocity[0], velocity[1])
+    size = abs(z)
+    sigma_v = math.sqrt(max(R[0, 0], R[1, 1]))
+    if size < settings.align_speed or sigma_v > 0.3 * size:
+        return None
+    sigma = math.hypot(sigma_v / size, 0.03)
+    if is_speed_known(state):
+        v = to_horizontal(nav.point_velocity(setup.rig.lever_arm(setup.rig.gps_frame)))
+        if not 0.6 * size < abs(v) < 1.6 * size:
+            return None
+        across = np.array((-v.imag, v.real)) / abs(v)
+        if across @ nav.covariance[3:5, 3:5] @ across > (COURSE_SIGMA * abs(v)) ** 2:
+            # wheels have measured the speed, and nothing yet that it does not slide
+            return None
+        return Rotation(wrap_angle(cmath.phase(z) - cmath.phase(v)), sigma, nav.angular_rate[2]), math.nan
+    if size < 2.0 * settings.align_speed:
+        return None
+    travel = _find_direction(setup, state, cmath.phase(z), size)
+    if not travel:
+        return None
+    return Rotation(wrap_angle(cmath.phase(travel * z) - nav.yaw), sigma, nav.angular_rate[2]), travel * size
+
+
+def fuse_baseline(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after the direction between two antennas, which measures the heading outright."""
+    sample, measurement = item.sample, item.measurement
+    assert isinstance(sample, GpsSample)
+    assert isinstance(measurement, GpsBaseline)
+    if not uses_gnss(state.common.mode) or isinstance(state, Leveling):
+        return state, NOTHING
+    if isinstance(accept_fix(setup, state, sample), str):
+        return state, NOTHING
+    if isinstance(state, Aligned):
+        return fuse_measurement(setup, state, item)
+    x, y, _ = so3.rotate(state.nav.attitude, measurement.baseline)
+    angle = wrap_angle(sample.baseline_yaw - math.atan2(y, x))
+    return _align_by_azimuth(setup, state, item, angle, get_baseline_sigma(sample))
+
+
+def fuse_imu_yaw(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after the IMU's own yaw, which measures the heading if it is magnetic."""
+    sample, measurement = item.sample, item.measurement
+    assert isinstance(sample, ImuSample)
+    assert isinstance(measurement, ImuYaw)
+    if state.common.mode in (Mode.NO_IMU, Mode.DEAD_RECKONING) or isinstance(state, Leveling):
+        return state, NOTHING
+    if isinstance(state, Aligned):
+        return fuse_measurement(setup, state, item)
+    is_magnetic = sample.yaw_source is YawSource.MAGNETIC
+    if state.site is None or (is_magnetic and not setup.settings.use_magnetometer):
+        return state, NOTHING
+    context = create_context(setup, state)._replace(site=state.site)
+    measured = compute_yaw(context, sample, measurement.mount)
+    if isinstance(measured, str):
+        return state, NOTHING
+    angle = wrap_angle(measured - state.nav.yaw)
+    return _align_by_azimuth(setup, state, item, angle, setup.settings.magnetic_sigma)
+
+
+def _align_by_azimuth(setup: Setup, state: Unaligned, item: Item, angle: float, sigma: float) -> Fused:
+    """Return the state in the world by a measured heading, once there is a fix."""
+    state = propagation.advance(setup, state, item.utime)
+    newest = state.alignment.last_fix
+    if newest is None or (item.utime - newest.utime) * 1e-6 > MAX_FIX_AGE:
+        return state, NOTHING
+    aligned = initialize(setup, state, state.nav, Rotation(angle, sigma), newest)
+    return aligned, (report_reset(item, f"heading, to {math.degrees(sigma):.1f} deg"),)
+
+
+# --- absolute pose ------------------------------------------------------------------------------------------
+
+
+def fuse_absolute_pose(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after an absolute pose; one with position and orientation sets an unaligned state."""
+    sample, measurement = item.sample, item.measurement
+    assert isinstance(sample, AbsolutePoseSample)
+    if isinstance(state, Leveling) and not setup.uses_imu(state.common.mode):
+        state = leveling.start_level(setup, state, item.utime)
+    if not isinstance(state, Unaligned) or state.common.mode is Mode.DEAD_RECKONING:
+        return fuse_measurement(setup, state, item)
+    geodesy = state.common.geodesy
+    if sample.position is None or sample.orientation is None or geodesy is None:
+        return state, NOTHING
+    assert isinstance(measurement, AbsolutePose)
+    state = propagation.advance(setup, state, item.utime)
+    site = state.site or geodesy.tangent
+    context = create_context(setup, state)._replace(site=site)
+    return _set_pose(setup, state, item, measurement, sample, context, site)
+
+
+def _set_pose(
+    setup: Setup,
+    state: Unaligned,
+    item: Item,
+    measurement: AbsolutePose,
+    sample: AbsolutePoseSample,
+    context: MeasurementContext,
+    site: LocalFrame,
+) -> Fused:
+    """Return the state at a position and orientation that an operator or another source measured."""
+    nav = state.nav
+    innovation = measurement.evaluate(context, sample)
+    if isinstance(innovation, str):
+        return state, (reject(item, innovation or "empty"),)
+    # the rotation first, because it may be of any size
+    rotation = Rotation(wrap_angle(float(innovation.residual[5])), math.sqrt(float(innovation.noise[5, 5])))
+    nav = heading_alignment.rotate(nav, rotation, setup.layout)
+    again = measurement.evaluate(context._replace(nav=nav), sample)
+    assert not isinstance(again, str)
+    x, y, z = nav.position
+    a, b, c = again.residual[:3].tolist()
+    P = nav.covariance.copy()
+    P[0:3, :] = 0.0
+    P[:, 0:3] = 0.0
+    P[0:3, 0:3] = again.noise[:3, :3]
+    latitude, _, height = geodetic_from_ecef(site.ecef)
+    aligned = Aligned(
+        nav._replace(position=(x + a, y + b, z + c), covariance=P),
+        state.imu,
+        state.stationary,
+        state.constraints,
+        state.common._replace(is_clock_stepped=False),
+        Earth.at(latitude, height),
+        site,
+        GnssMonitor(last_fix=state.alignment.last_fix, used_utime=nav.utime),
+    )
+    return aligned, (report_reset(item, "position and heading were set"),)

@@ -1,0 +1,94 @@
+"""IMU monitor: does the IMU measure, or repeat and interpolate numbers?
+
+Noise changes the last digit of every real sample. So a unit that repeats one sample for `frozen_time` is frozen, and
+numbers that stay, or change along a straight line in all six components, were made up by a driver that filled a gap.
+Three such samples in a row cannot be chance. While they last, the process noise is that of a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from modelserver.estimation.filter.eskf import ZERO
+from modelserver.messages import ImuSample
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Quaternion, Vector3
+
+MAX_RATE: Final = 35.0
+"""rad/s: 2000 deg/s, the widest range of gyros on vehicles."""
+
+MAX_FORCE: Final = 500.0
+"""m/s2: 50 g, the widest range of accelerometers on vehicles."""
+
+LINE_TOLERANCE: Final = 3e-4
+"""Relative difference of two slopes on one line: stamps of whole microseconds, 100 times a second."""
+
+INTERPOLATED_SAMPLES: Final = 3
+"""Samples in a row on one line, in all six components, that cannot be chance."""
+
+
+class ImuMonitor(NamedTuple):
+    """The last sample of the IMU, and how its numbers change.
+
+    Attributes
+    ----------
+    utime: of the last sample; 0: none yet.
+    rate, force: its angular rate and specific force along the body axes, rad/s and m/s2.
+    changed_utime: the sample since which the numbers have not changed.
+    slope: change of the six numbers, per second; empty: unknown, or they have not changed.
+    num_collinear: samples in a row that continue exactly along that slope.
+    used_utime: the last sample that was used for leveling or propagation.
+    is_interpolated: whether the process noise is that of interpolated samples.
+    """
+
+    utime: int = 0
+    rate: Vector3 = ZERO
+    force: Vector3 = ZERO
+    changed_utime: int = 0
+    slope: tuple[float, ...] = ()
+    num_collinear: int = 0
+    used_utime: int = 0
+    is_interpolated: bool = False
+
+    def update(self, utime: int, rate: Vector3, force: Vector3) -> ImuMonitor:
+        """Return the monitor after a sample."""
+        if not self.utime:
+            return ImuMonitor(utime, rate, force, utime, (), 0, self.used_utime, self.is_interpolated)
+        dt = (utime - self.utime) * 1e-6
+        if dt <= 0.0:
+            return self
+        if rate == self.rate and force == self.force:
+            return self._replace(utime=utime, slope=(), num_collinear=self.num_collinear + 1 if not self.slope else 1)
+        (a, b, c), (d, e, f) = self.rate, self.force
+        (g, h, i), (j, k, m) = rate, force
+        slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
+        is_collinear = bool(self.slope)
+        if is_collinear:
+            for x, y in zip(slope, self.slope, strict=True):
+                if abs(x - y) > LINE_TOLERANCE * (0.3 + abs(x) + abs(y)):
+                    is_collinear = False
+                    break
+        count = self.num_collinear + 1 if is_collinear else 0
+        return ImuMonitor(utime, rate, force, utime, slope, count, self.used_utime, self.is_interpolated)
+
+    @property
+    def seems_interpolated(self) -> bool:
+        """Whether the numbers stay or follow a line, as no noise allows."""
+        return self.num_collinear >= INTERPOLATED_SAMPLES
+
+    def get_frozen_time(self, utime: int) -> float:
+        """Return for how long the numbers have not changed, seconds."""
+        return (utime - self.changed_utime) * 1e-6
+
+
+def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | str:
+    """Return angular rate and specific force along the body axes, rad/s and m/s2; or in one word why not."""
+    rate, force = sample.angular_velocity, sample.specific_force
+    if rate is None or force is None:
+        return "nan"
+    if not (math.isfinite(sum(rate)) and math.isfinite(sum(force))):
+        return "nan"
+    if max(map(abs, rate)) > MAX_RATE or max(map(abs, force)) > MAX_FORCE:
+        return "range"
+    return so3.rotate(mount, rate), so3.rotate(mount, force)

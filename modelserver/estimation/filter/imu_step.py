@@ -1,0 +1,162 @@
+"""IMU sample: leveling, or propagation, with the updates of a stationary vehicle (ZUPT, ZARU) and a rolling one (NHC).
+
+A quiet IMU shows a stationary vehicle only if nothing contradicts it: wheels, fixes that move, the state's own speed.
+Stationary for `recapture_time`, the mean rate recalibrates the gyro biases (ZARU). After a gap that loses the vertical
+the filter levels again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from modelserver.estimation.filter import imu_monitor, leveling, propagation
+from modelserver.estimation.filter.eskf import ZERO
+from modelserver.estimation.filter.fusion import (
+    CONSTRAINT_PERIOD,
+    NOTHING,
+    ZUPT_PERIOD,
+    Fused,
+    Item,
+    create_context,
+    fuse_constraint,
+    fuse_non_holonomic,
+    reject,
+    report_reset,
+)
+from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
+from modelserver.estimation.filter.measurements import constraints
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
+from modelserver.messages import Decision, ImuSample, Mode, Verdict
+
+BIAS_AGE: Final = 600.0
+"""Seconds for which gyro biases that a restart continues with may have drifted: few vehicles drive longer without a
+stop."""
+
+LOST_ATTITUDE_SIGMA: Final = 0.7
+"""Sigma of the attitude, rad, beyond which a gap in the IMU makes the filter level again."""
+
+
+def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after an IMU sample."""
+    sample = item.sample
+    assert isinstance(sample, ImuSample)
+    if state.common.mode is Mode.NO_IMU:
+        return state, NOTHING
+    values = imu_monitor.read_imu(sample, setup.mount)
+    if isinstance(values, str):
+        return state, (reject(item, values),)
+    rate, force = values
+    utime, settings = item.utime, setup.settings
+    imu = state.imu.update(utime, rate, force)
+    if imu.get_frozen_time(utime) > settings.frozen_time:
+        return state._replace(imu=imu), (reject(item, "frozen"),)
+    decisions = NOTHING
+    if imu.seems_interpolated != imu.is_interpolated:
+        imu = imu._replace(is_interpolated=imu.seems_interpolated)
+        if not isinstance(state, Leveling):
+            # the process noise changes from here on
+            state = propagation.propagate_covariance(setup, state)
+            state = state._replace(imu=state.imu._replace(is_interpolated=imu.is_interpolated))
+        if imu.is_interpolated:
+            decisions = (reject(item, "interpolated")._replace(verdict=Verdict.MONITORED),)
+    if isinstance(state, Leveling):
+        detector = state.stationary.update(utime, rate, force, ZERO, settings.gyro_bias_sigma, settings)
+        leveled = leveling.level(setup, state._replace(imu=imu, stationary=detector), utime, rate, force)
+        if isinstance(leveled, Leveling) and leveled.tilt and not leveled.num_samples:
+            return leveled, (reject(item, "gravity" if math.isinf(leveled.tilt) else "mount"),)
+        return leveled, NOTHING
+    nav = state.nav
+    P = nav.covariance
+    bias_sigma = math.sqrt(max(P[9, 9], P[10, 10], P[11, 11]))
+    detector = state.stationary.update(utime, rate, force, nav.gyro_bias, bias_sigma, settings)
+    is_gap = (utime - state.imu.used_utime) * 1e-6 > settings.rate_hold and state.imu.used_utime > 0
+    if is_gap:
+        state = propagation.advance(setup, state, utime)
+        if max(np.diagonal(state.nav.covariance)[6:9]) > LOST_ATTITUDE_SIGMA**2:
+            restarted = Leveling(state.common.restart())
+            return restarted, (report_reset(item, "leveling again after a gap in the IMU samples"),)
+        decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
+    state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
+    state, more = _fuse_constraints(setup, state, utime)
+    return state, decisions + more if more else decisions
+
+
+def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state after the updates without a sensor: those of a stationary vehicle, or of a rolling one."""
+    settings, detector = setup.settings, state.stationary
+    is_stationary = detector.get_quiet_time(utime) >= settings.stationary_time and _may_be_stationary(
+        setup, state, utime
+    )
+    if is_stationary != state.constraints.is_stationary:
+        state = propagation.propagate_covariance(setup, state)
+        constraints_ = state.constraints._replace(is_stationary=is_stationary, zupt_utime=utime)
+        state = state._replace(constraints=constraints_)
+    if is_stationary:
+        if (utime - state.constraints.zupt_utime) * 1e-6 < ZUPT_PERIOD:
+            return state, NOTHING
+        return _fuse_stationary(setup, state, utime)
+    if (utime - state.constraints.non_holonomic_utime) * 1e-6 < CONSTRAINT_PERIOD:
+        return state, NOTHING
+    wheels_utime = state.common.wheels.used_utime
+    if wheels_utime and (utime - wheels_utime) * 1e-6 < settings.wheel_period + CONSTRAINT_PERIOD:
+        return state, NOTHING  # the next wheel sample brings it
+    state, decision = fuse_non_holonomic(setup, state, utime)
+    return state, (decision,)
+
+
+def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state of a stationary vehicle after ZUPT, and ZARU once it has been stationary for long enough."""
+    dt = (utime - state.constraints.zupt_utime) * 1e-6
+    state = propagation.propagate_covariance(setup, state)
+    state = state._replace(constraints=state.constraints._replace(zupt_utime=utime))
+    innovation = constraints.zero_velocity(create_context(setup, state), dt)
+    state, decision = fuse_constraint(setup, state, constraints.ZERO_VELOCITY, innovation)
+    decisions: tuple[Decision, ...] = (decision,)
+    detector = state.stationary
+    if detector.sum_time > 0.0:
+        if detector.get_quiet_time(utime) >= setup.settings.recapture_time:
+            context = create_context(setup, state)
+            innovation = constraints.zero_rate(
+                context, detector.mean_stationary_rate, state.earth.rotation, detector.sum_time
+            )
+            state, decision = fuse_constraint(setup, state, constraints.ZERO_RATE, innovation)
+            decisions = (*decisions, decision)
+            if decision.verdict is Verdict.USED:
+                state = _store_biases(setup, state)
+        state = state._replace(stationary=detector.restart_mean())
+    return state, decisions
+
+
+def _store_biases(setup: Setup, state: N) -> N:
+    """Return the state with its gyro biases stored for a restart, with the variance that they may drift by until then.
+
+    Only biases found while stationary: they depend on nothing else in the state.
+    """
+    nav = state.nav
+    variance = max(nav.covariance[k, k] for k in (9, 10, 11)) + setup.settings.gyro_bias_walk**2 * BIAS_AGE
+    biases = GyroBiases(nav.gyro_bias, math.sqrt(variance))
+    return state._replace(common=state.common._replace(gyro_biases=biases))
+
+
+def _may_be_stationary(setup: Setup, state: Navigating, utime: int) -> bool:
+    """Return whether nothing contradicts a stationary vehicle: wheels, fixes that move, the state's own speed."""
+    settings, nav, common = setup.settings, state.nav, state.common
+    speed = math.hypot(*nav.velocity)
+    P = nav.covariance
+    sigma = math.sqrt(max(P[3, 3], P[4, 4]))
+    if common.mode is not Mode.NO_WHEELS and state.stationary.is_confirmed_by_wheels(utime):
+        # stuck wheels on a smooth road look the same: then fixes have kept the speed
+        return not isinstance(state, Aligned) or speed - 4.0 * sigma < 10.0 * settings.stationary_speed
+    if utime < common.moving_until:
+        return False
+    if state.is_stationary:
+        return speed < 10.0 * settings.stationary_speed
+    if not isinstance(state, Aligned) and sigma > 1.0:
+        # the speed is unknown: a quiet IMU and fixes that stay in place are all there is
+        fix = state.alignment.last_fix
+        return fix is not None and (utime - fix.utime) * 1e-6 < MOVING_TIME
+    return speed - 2.0 * sigma < settings.stationary_speed and speed < 0.5

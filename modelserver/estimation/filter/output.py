@@ -1,0 +1,318 @@
+"""Output: pose in the odom, ENU and UTM frames, its validity and protection levels, motion, navigation state."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
+from modelserver.estimation.filter import eskf, propagation, protection_levels
+from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
+from modelserver.estimation.filter.fusion import uses_gnss
+from modelserver.estimation.filter.measurements.constraints import compute_tilt
+from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
+from modelserver.estimation.filter.odometry import Odometry
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, Navigating
+from modelserver.messages import NAN, Estimate, Invalid, NavigationState, Quality, VehicleMotion
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Quaternion, Vector3
+
+CONVERGENCE_CELL: Final = 200.0
+"""Meters within which one meridian convergence is used: it changes by 3e-5 rad times tan(latitude)."""
+
+FIRST_ORDER_LAG: Final = 0.15
+"""Seconds over which the covariance of a pose is propagated to first order."""
+
+SLOW: Final = 0.3
+"""Speed, m/s, below which only the gyros measure the heading."""
+
+
+# --- estimate -----------------------------------------------------------------------------------------------
+
+
+def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newest: int) -> Estimate:
+    """Return the rolling frame's pose at `utime` from a state not newer; `newest` is the instant of all samples."""
+    geodesy = state.common.geodesy
+    origin = None if geodesy is None else geodesy.origin
+    epoch = state.common.epoch
+    invalid = find_invalid(setup, state, utime)
+    X_odom = odom.pose(utime)
+    if isinstance(state, Leveling):
+        return Estimate(utime, X_odom, invalid=invalid, pose_epoch=epoch, origin=origin)
+    predicted = propagation.predict(setup, state, utime)
+    nav = predicted.nav
+    quality = _find_quality(setup, predicted, nav, utime, newest)
+    odom_covariance = odom.covariance()
+    if not (isinstance(state, Aligned) and isinstance(predicted, Aligned)):
+        return Estimate(
+            utime,
+            X_odom,
+            odom_covariance=odom_covariance,
+            invalid=invalid,
+            quality=quality,
+            pose_epoch=epoch,
+            origin=origin,
+            motion=compute_motion(setup, predicted, nav),
+        )
+    settings, gnss = setup.settings, state.gnss
+    if nav.lag > FIRST_ORDER_LAG:
+        nav = eskf.propagate_covariance(nav, propagation.select_noise(setup, predicted, nav), setup.layout)
+    P = _compute_base_covariance(nav, setup, propagation.select_noise(setup, predicted, nav))
+    silent = 0.0 if state.is_stationary else (utime - gnss.used_utime) * 1e-6
+    offset, variance = gnss.offset.decay(silent, settings)
+    P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
+    horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
+    heading = protection_levels.compute_heading(float(P[5, 5]), settings)
+    if heading > settings.heading_limit:
+        invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
+    if horizontal > settings.horizontal_limit:
+        invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
+        if gnss.num_rejected:
+            invalid |= Invalid.GPS_REJECTED
+    enu = utm = None
+    if geodesy is not None:
+        x, y, z = nav.point(setup.rig.base)
+        position = (x + offset[0], y + offset[1], z + offset[2])
+        enu, utm = _compute_world_poses(geodesy, state.site, position, nav.attitude)
+    return Estimate(
+        utime,
+        X_odom,
+        enu,
+        utm,
+        tuple(P.ravel().tolist()),
+        odom_covariance,
+        invalid,
+        quality,
+        epoch,
+        origin,
+        horizontal,
+        heading,
+        NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
+        compute_motion(setup, predicted, nav),
+    )
+
+
+def _compute_base_covariance(nav: NavState, setup: Setup, noise: ProcessNoise) -> Array:
+    """Return the covariance (6, 6) of the rolling frame along N, from that of the IMU.
+
+    Over a short lag to first order: position by velocity, attitude by gyro bias. That is all that a pose needs, at a
+    fifth of the cost of the whole.
+    """
+    n = setup.layout.size
+    dt = nav.lag
+    x, y, z = so3.rotate(nav.attitude, setup.rig.base)
+    J = np.zeros((6, n))
+    J.put(
+        _base_entries(n),
+        (*(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), *(dt, dt, dt), *(z, -y, -z, x, y, -x)),
+    )
+    if dt > 0.0:
+        (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
+        J[3:, 9:12] = ((-dt * a, -dt * b, -dt * c), (-dt * d, -dt * e, -dt * f), (-dt * g, -dt * h, -dt * i))
+    P: Array = J @ nav.covariance @ J.T
+    p, w = noise.accelerometer * dt**3 / 3.0, noise.gyro * dt
+    P.reshape(-1)[::7] += (p, p, p, w, w, w)
+    return P
+
+
+@lru_cache(maxsize=16)
+def _base_entries(n: int) -> npt.NDArray[np.intp]:
+    """Return the flat indices in a (6, n) matrix of what `_compute_base_covariance` writes, in its order."""
+    rows = [(0, 0), (1, 1), (2, 2), (3, 6), (4, 7), (5, 8), (0, 3), (1, 4), (2, 5)]
+    rows += [(0, 7), (0, 8), (1, 6), (1, 8), (2, 6), (2, 7)]
+    return np.array([r * n + c for r, c in rows])
+
+
+def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime: int) -> float:
+    """Return the seconds until a limit is exceeded without further samples.
+
+    The variance along each axis grows as p + 2 c t + v t^2 + q t^3 / 3 while nothing measures the motion.
+    """
+    settings = setup.settings
+    sampled = max(state.imu.used_utime, 0 if setup.uses_imu(state.common.mode) else nav.utime)
+    left = settings.imu_timeout - (utime - sampled) * 1e-6
+    if state.gnss.used_utime and uses_gnss(state.common.mode):
+        left = min(left, settings.gps_timeout - (utime - state.gnss.used_utime) * 1e-6)
+    left = max(left, 0.0)
+    k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+    limit = settings.horizontal_limit - state.gnss.outlier_allowance
+    C = nav.covariance
+    p = protection_levels.compute_longest_variance(C)
+    v, c = float(max(C[3, 3], C[4, 4])), float(max(C[0, 3], C[1, 4], 0.0))
+    q = setup.coasting.accelerometer
+
+    def level(t: float) -> float:
+        return k * math.sqrt(p + 2.0 * c * t + v * t * t + q * t**3 / 3.0)
+
+    if level(left) <= limit:
+        return left
+    low, high = 0.0, left
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if level(middle) <= limit else (low, middle)
+    return low
+
+
+# --- world --------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _enu_from_site(geodesy: Geodesy, site: LocalFrame) -> Quaternion:
+    return geodesy.tangent.rotation_of(site)
+
+
+@lru_cache(maxsize=64)
+def _grid_from_site(geodesy: Geodesy, site: LocalFrame, east: int, north: int) -> Quaternion:
+    """Return the rotation from the site's axes to grid east, grid north and up in a cell of the site."""
+    ecef = site.to_ecef((east * CONVERGENCE_CELL, north * CONVERGENCE_CELL, 0.0))
+    latitude, longitude, height = geodetic_from_ecef(ecef)
+    there = LocalFrame.at(latitude, longitude, height)
+    return so3.multiply(rotation_about_up(geodesy.convergence(latitude, longitude)), there.rotation_of(site))
+
+
+def _compute_world_poses(
+    geodesy: Geodesy, site: LocalFrame, position: Vector3, attitude: Quaternion
+) -> tuple[Pose, Pose] | tuple[None, None]:
+    """Return the pose in World:ENU and in World:UTM, each from the earth-centered position; None out of range."""
+    ecef = site.to_ecef(position)
+    try:
+        utm = geodesy.to_relative_utm(geodesy.utm_from_ecef(ecef))
+        grid = _grid_from_site(
+            geodesy, site, round(position[0] / CONVERGENCE_CELL), round(position[1] / CONVERGENCE_CELL)
+        )
+    except GeodesyError:
+        return None, None
+    return (
+        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(_enu_from_site(geodesy, site), attitude)),
+        Pose(utm, so3.multiply(grid, attitude)),
+    )
+
+
+# --- validity -----------------------------------------------------------------------------------------------
+
+
+def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
+    """Return the reasons against an estimate at `utime`, except for its protection levels."""
+    # numbers, not members: combining flags costs more than all else here
+    settings, common = setup.settings, state.common
+    invalid = 0
+    if isinstance(state, Aligned):
+        gnss = state.gnss
+        is_stale = gnss.used_utime and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
+        if is_stale and uses_gnss(common.mode):
+            invalid |= 32  # STALE_GPS
+        if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
+            invalid |= 128  # GPS_REJECTED
+    else:
+        invalid |= 8  # NOT_MOVED_YET
+        if isinstance(state, Leveling) or state.alignment.last_fix is None:
+            invalid |= 1  # NO_FIX
+    if setup.uses_imu(common.mode):
+        imu_utime = state.imu.used_utime
+        if not imu_utime:
+            invalid |= 2  # NO_IMU
+        elif (utime - imu_utime) * 1e-6 > settings.imu_timeout:
+            invalid |= 64  # STALE_IMU
+        elif (imu_utime - utime) * 1e-6 > settings.imu_timeout:
+            invalid |= 512  # CLOCK_STEPPED
+    elif not isinstance(state, Leveling) and (utime - state.nav.utime) * 1e-6 > settings.imu_timeout:
+        invalid |= 64  # STALE_IMU
+    if common.geodesy is None:
+        invalid |= 4  # NO_ORIGIN
+    if common.is_clock_stepped:
+        invalid |= 512  # CLOCK_STEPPED
+    tilt = state.tilt if isinstance(state, Leveling) else compute_tilt(state.nav.up) > settings.maximum_tilt
+    if tilt:
+        invalid |= 1024  # TILTED
+    return Invalid(invalid)
+
+
+def _find_quality(setup: Setup, state: Navigating, nav: NavState, utime: int, newest: int) -> Quality:
+    forward = nav.body_velocity(setup.rig.base)[0]
+    quality = 0
+    if state.is_stationary or abs(forward) < SLOW:
+        quality |= 1  # HEADING_FROM_GYRO
+    if utime > newest:
+        quality |= 2  # PREDICTED
+    if forward < -0.1 and not state.is_stationary:
+        quality |= 32  # REVERSING
+    return Quality(quality)
+
+
+# --- motion and navigation state ----------------------------------------------------------------------------
+
+
+def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMotion:
+    """Return the motion: the filter's velocity and angular rate, and the specific force without gravity."""
+    base = setup.rig.base
+    lever = (-base[0], -base[1], -base[2])
+    covariance = TwistCovariance(setup, nav)
+    if state.is_stationary:
+        return VehicleMotion(ZERO, ZERO, ZERO, lever, covariance)
+    acceleration = (NAN, NAN, NAN)
+    if setup.uses_imu(state.common.mode):
+        g = state.earth.gravity
+        (fx, fy, fz), (bx, by, bz), (ux, uy, uz) = nav.force, nav.accelerometer_bias, nav.up
+        acceleration = (fx - bx - g * ux, fy - by - g * uy, fz - bz - g * uz)
+    return VehicleMotion(nav.body_velocity(base), nav.angular_rate, acceleration, lever, covariance)
+
+
+class TwistCovariance(NamedTuple):
+    """The covariance of a motion, computed when it is called."""
+
+    setup: Setup
+    nav: NavState
+
+    def __call__(self) -> tuple[float, ...]:
+        """Return the 36 numbers of velocity and angular rate of the rolling frame along its own axes, row-major."""
+        setup, nav = self.setup, self.nav
+        n = setup.layout.size
+        H = np.zeros((6, n))
+        H[:3] = body_velocity_jacobian(nav, setup.rig.base, n)
+        H[3:, 9:12] = -np.eye(3)
+        twist = H @ nav.covariance @ H.T
+        twist[3:, 3:] += np.eye(3) * setup.settings.gyro_noise**2 / IMU_AVERAGING
+        return tuple(twist.ravel().tolist())
+
+
+def get_navigation_state(setup: Setup, state: FilterState) -> NavigationState | None:
+    """Return the whole state; None while leveling."""
+    if isinstance(state, Leveling):
+        return None
+    nav, common = state.nav, state.common
+    base = setup.rig.base
+    latitude = longitude = height = NAN
+    if isinstance(state, Aligned):
+        latitude, longitude, height = geodetic_from_ecef(state.site.ecef)
+    values = (
+        *nav.position,
+        *nav.velocity,
+        *so3.to_rpy(nav.attitude),
+        *nav.gyro_bias,
+        *nav.accelerometer_bias,
+        *nav.extras,
+    )
+    return NavigationState(
+        nav.utime,
+        common.mode,
+        state.phase,
+        state.is_stationary,
+        find_invalid(setup, state, nav.utime),
+        common.epoch,
+        latitude,
+        longitude,
+        height,
+        Pose(nav.point(base), nav.attitude),
+        nav.body_velocity(base),
+        nav.angular_rate,
+        TwistCovariance(setup, nav)(),
+        setup.layout.names,
+        tuple(map(float, values)),
+        tuple(nav.covariance.ravel().tolist()),
+    )

@@ -1,0 +1,106 @@
+"""Propagation of the state to an instant: by the IMU, by the wheels' turn rate, or at constant velocity.
+
+Between IMU samples, and up to `rate_hold` after the last one, the last sample holds. After that, or without an IMU, the
+speed is constant and the turn rate that of the wheels, if they measure one; the process noise covers what is unknown.
+A stationary vehicle does not turn: what its gyros measure is their bias and the earth rate.
+"""
+
+from __future__ import annotations
+
+from modelserver.estimation.filter import eskf
+from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
+from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import N, Navigating
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Vector3
+
+
+def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
+    """Return the process noise at an instant of the state."""
+    if not setup.uses_imu(state.common.mode):
+        if state.is_stationary:
+            return setup.stationary
+        return setup.rolling if state.common.wheels.measures_speed(nav.utime) else setup.coasting
+    if (nav.utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
+        return setup.coasting
+    return _select_imu_noise(setup, state)
+
+
+def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
+    """Return the process noise while the IMU measures."""
+    if state.is_stationary:
+        return setup.stationary
+    return setup.interpolated if state.imu.is_interpolated else setup.driving
+
+
+def propagate_imu(
+    setup: Setup, state: N, utime: int, rate: Vector3, force: Vector3, stationary: StationaryDetector, imu: ImuMonitor
+) -> N:
+    """Return the state at an IMU sample (`rate`, `force`: body axes); `stationary` and `imu` are those after it."""
+    nav = state.nav
+    if (utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
+        state = predict(setup, state, utime)
+        nav = state.nav
+        noise = select_noise(setup, state, nav)
+        nav = eskf.propagate_covariance(nav, noise, setup.layout)._replace(rate=rate, force=force)
+    else:
+        if state.constraints.is_stationary:
+            turning = _get_stationary_rate(state, nav)
+            nav = eskf.propagate(nav._replace(rate=turning), utime, turning, force, state.earth, setup.rig.base)
+            nav = nav._replace(rate=rate)
+        else:
+            nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
+        if nav.lag >= eskf.COVARIANCE_STEP:
+            nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)
+    return state.with_imu(nav, imu._replace(used_utime=utime), stationary)
+
+
+def predict(setup: Setup, state: N, utime: int) -> N:
+    """Return the state at an instant not before its own, by what is known until then."""
+    if utime <= state.nav.utime:
+        return state
+    return state.with_nav(predict_nav(setup, state, utime))
+
+
+def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
+    """Return the nominal state at a later instant; its covariance is propagated where the process noise changes."""
+    nav = state.nav
+    base = setup.rig.base
+    if setup.uses_imu(state.common.mode):
+        held = state.imu.used_utime + round(setup.settings.rate_hold * 1e6)
+        if nav.utime < held:
+            until = min(utime, held)
+            rate = _get_stationary_rate(state, nav) if state.is_stationary else nav.rate
+            measured = nav.rate
+            nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
+            nav = nav._replace(rate=measured)
+            if until == utime:
+                return nav
+            nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)
+    wheels = state.common.wheels
+    turn = wheels.turn_rate if not state.is_stationary and wheels.measures_speed(nav.utime) else 0.0
+    return eskf.propagate_without_imu(nav, utime, (0.0, 0.0, turn), base)
+
+
+def propagate_covariance(setup: Setup, state: N) -> N:
+    """Return the state with its covariance at its instant."""
+    nav = state.nav
+    if nav.lag <= 0.0:
+        return state
+    return state._replace(nav=eskf.propagate_covariance(nav, select_noise(setup, state, nav), setup.layout))
+
+
+def advance(setup: Setup, state: N, utime: int) -> N:
+    """Return the state with its covariance at an instant not before its own."""
+    return propagate_covariance(setup, predict(setup, state, utime))
+
+
+def _get_stationary_rate(state: Navigating, nav: NavState) -> Vector3:
+    """Return the rate that the gyros of a stationary vehicle measure with the present bias."""
+    a, b, c = nav.gyro_bias
+    if state.earth.rotation == ZERO:
+        return nav.gyro_bias
+    x, y, z = so3.rotate(so3.conjugate(nav.attitude), state.earth.rotation)
+    return (a + x, b + y, c + z)

@@ -1,0 +1,44 @@
+"""Protection levels (integrity): bounds of the horizontal and heading error at the configured risk per hour.
+
+Errors are correlated over `gps_correlation_time`, so an hour has 3600 / that time independent ones, each with its share
+of the risk. Horizontal: the radius of a circular normal error is Rayleigh distributed, P(r > k s) = exp(-k^2 / 2), with
+s the longest axis of the error ellipse. Heading: both sides of a normal distribution.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from statistics import NormalDist
+from typing import Final
+
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.transforms.so3 import Array
+
+HEADING_FLOOR: Final = 0.01
+"""Sigma of the heading, rad, outside the filter: mounts and the rolling frame are good to half a degree."""
+
+
+@lru_cache(maxsize=16)
+def get_factors(risk_per_hour: float, correlation_time: float) -> tuple[float, float]:
+    """Return the standard deviations to the horizontal and to the heading protection level."""
+    risk = min(risk_per_hour * correlation_time / 3600.0, 0.5)
+    return math.sqrt(-2.0 * math.log(risk)), NormalDist().inv_cdf(1.0 - 0.5 * risk)
+
+
+def compute_longest_variance(P: Array) -> float:
+    """Return the variance along the longest axis of the horizontal error ellipse of a covariance, m2."""
+    e, n, c = float(P[0, 0]), float(P[1, 1]), float(P[0, 1])
+    return 0.5 * (e + n) + math.hypot(0.5 * (e - n), c)
+
+
+def compute_horizontal(P: Array, outlier_allowance: float, settings: FilterSettings) -> float:
+    """Return the horizontal protection level, m: of the covariance, plus the allowance for one outlier."""
+    k, _ = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+    return k * math.sqrt(compute_longest_variance(P)) + outlier_allowance
+
+
+def compute_heading(variance: float, settings: FilterSettings) -> float:
+    """Return the heading protection level, rad, at most pi."""
+    _, k = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+    return min(k * math.sqrt(variance + HEADING_FLOOR**2), math.pi)

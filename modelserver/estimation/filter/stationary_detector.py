@@ -1,0 +1,127 @@
+"""Stationary detector: IMU and wheels together.
+
+Each alone can be wrong: a stuck encoder reports 0, and a smooth ride looks stationary to the IMU. The IMU is quiet
+while the variance of rate and force, about a running mean with time constant AVERAGING_TIME, and the mean rate beyond
+its bias are below their limits. Rolling wheels overrule it. Whether a quiet vehicle is stationary also depends on the
+state's own speed and on fixes: see `imu_step`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from modelserver.estimation.filter.eskf import ZERO
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.transforms.so3 import Vector3
+
+AVERAGING_TIME: Final = 0.3
+"""Time constant of the running mean and variance, seconds: a few strokes of an idling engine."""
+
+WHEELS_TIMEOUT: Final = 1.0
+"""Seconds for which a wheel sample counts."""
+
+
+class StationaryDetector(NamedTuple):
+    """Running mean and variance of the IMU, and what the wheels measured last.
+
+    Attributes
+    ----------
+    utime: of the last IMU sample.
+    mean_rate, mean_force: running means, rad/s and m/s2 along the body axes.
+    rate_variance, force_variance: about them, summed over the axes, (rad/s)2 and (m/s2)2.
+    since: first sample (utime) of the present quiet; 0 while it is not quiet.
+    wheels_stationary: None: the wheels do not measure it.
+    wheels_utime: of that wheel sample.
+    rate_sum: integral of the rate since the quiet began or the mean was last used, rad.
+    sum_time: its duration, seconds.
+    """
+
+    utime: int = 0
+    mean_rate: Vector3 = ZERO
+    mean_force: Vector3 = ZERO
+    rate_variance: float = math.inf
+    force_variance: float = math.inf
+    since: int = 0
+    wheels_stationary: bool | None = None
+    wheels_utime: int = 0
+    rate_sum: Vector3 = ZERO
+    sum_time: float = 0.0
+
+    def update(
+        self, utime: int, rate: Vector3, force: Vector3, bias: Vector3, bias_sigma: float, settings: FilterSettings
+    ) -> StationaryDetector:
+        """Return the detector after an IMU sample; `bias` is that of the gyros, with `bias_sigma` on each axis."""
+        dt = (utime - self.utime) * 1e-6
+        if not self.utime or not 0.0 < dt <= settings.rate_hold:
+            return StationaryDetector(
+                utime,
+                rate,
+                force,
+                settings.stationary_rate**2 * 9.0,
+                settings.stationary_force**2 * 9.0,
+                0,
+                self.wheels_stationary,
+                self.wheels_utime,
+            )
+        gain = dt / (AVERAGING_TIME + dt)
+        keep = 1.0 - gain
+        (mx, my, mz), (rx, ry, rz) = self.mean_rate, rate
+        dx, dy, dz = rx - mx, ry - my, rz - mz
+        rate_variance = keep * (self.rate_variance + gain * (dx * dx + dy * dy + dz * dz))
+        mean_rate = (mx + gain * dx, my + gain * dy, mz + gain * dz)
+        (fx, fy, fz), (gx, gy, gz) = self.mean_force, force
+        ex, ey, ez = gx - fx, gy - fy, gz - fz
+        force_variance = keep * (self.force_variance + gain * (ex * ex + ey * ey + ez * ez))
+        mean_force = (fx + gain * ex, fy + gain * ey, fz + gain * ez)
+        a, b, c = mean_rate[0] - bias[0], mean_rate[1] - bias[1], mean_rate[2] - bias[2]
+        most = settings.stationary_rate + 4.0 * bias_sigma
+        is_quiet = (
+            rate_variance < 3.0 * settings.stationary_rate**2
+            and force_variance < 3.0 * settings.stationary_force**2
+            and a * a + b * b + c * c < most * most
+        )
+        are_rolling = self.wheels_stationary is False and (utime - self.wheels_utime) * 1e-6 < WHEELS_TIMEOUT
+        since, rate_sum, sum_time = 0, ZERO, 0.0
+        if is_quiet and not are_rolling:
+            sx, sy, sz = self.rate_sum
+            since = self.since or utime
+            rate_sum, sum_time = (sx + rx * dt, sy + ry * dt, sz + rz * dt), self.sum_time + dt
+        return StationaryDetector(
+            utime,
+            mean_rate,
+            mean_force,
+            rate_variance,
+            force_variance,
+            since,
+            self.wheels_stationary,
+            self.wheels_utime,
+            rate_sum,
+            sum_time,
+        )
+
+    def update_wheels(self, utime: int, are_stationary: bool | None) -> StationaryDetector:
+        """Return the detector after a wheel sample; None: it does not measure whether the wheels are stationary."""
+        if are_stationary is None:
+            return self
+        if are_stationary:
+            return self._replace(wheels_stationary=True, wheels_utime=utime)
+        return self._replace(wheels_stationary=False, wheels_utime=utime, since=0, rate_sum=ZERO, sum_time=0.0)
+
+    def restart_mean(self) -> StationaryDetector:
+        """Return the detector with the integral of the rate restarted."""
+        return self._replace(rate_sum=ZERO, sum_time=0.0)
+
+    @property
+    def mean_stationary_rate(self) -> Vector3:
+        """Mean rate over `sum_time`, rad/s. Only for a `sum_time` above 0."""
+        x, y, z = self.rate_sum
+        return (x / self.sum_time, y / self.sum_time, z / self.sum_time)
+
+    def is_confirmed_by_wheels(self, utime: int) -> bool:
+        """Return whether the wheels are stationary at an instant."""
+        return self.wheels_stationary is True and (utime - self.wheels_utime) * 1e-6 < WHEELS_TIMEOUT
+
+    def get_quiet_time(self, utime: int) -> float:
+        """Return for how long the IMU has been quiet, seconds."""
+        return (utime - self.since) * 1e-6 if self.since else 0.0

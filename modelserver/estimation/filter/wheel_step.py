@@ -1,0 +1,170 @@
+"""Wheel sample: odometry, the zero-velocity update of a vehicle without an IMU, and the non-holonomic constraint.
+
+The IMU bridges `wheel_period` between two comparisons of travel: errors of an encoder, a pulse or an update missed,
+average out over a longer distance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from modelserver.estimation.filter import eskf, leveling, propagation
+from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
+from modelserver.estimation.filter.fusion import (
+    CONSTRAINT_PERIOD,
+    NOTHING,
+    ZUPT_PERIOD,
+    Fused,
+    Item,
+    create_context,
+    fuse_constraint,
+    fuse_non_holonomic,
+    reject,
+    remember,
+)
+from modelserver.estimation.filter.measurements import constraints
+from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import FilterState, Leveling, N, PreviousSample
+from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
+from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
+from modelserver.transforms.so3 import Vector3
+
+SOURCE_TIMEOUT: Final = 2.0
+"""Seconds of silence after which another source of wheels is used: the travel since a sample is that of one source."""
+
+UNKNOWN_SPEED_SIGMA: Final = 2.0
+"""Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
+
+
+def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after a wheel sample."""
+    sample, measurement = item.sample, item.measurement
+    assert isinstance(sample, WheelsSample)
+    assert isinstance(measurement, WheelSpeed)
+    common, settings = state.common, setup.settings
+    if common.mode is Mode.NO_WHEELS:
+        return state, NOTHING
+    in_use = common.previous.get((common.wheels.source, RECEIVED))
+    if common.wheels.source != item.source and in_use and (item.utime - in_use.utime) * 1e-6 < SOURCE_TIMEOUT:
+        return state, (reject(item, "source"),)
+    compared = common.previous.get((item.source, item.kind))
+    previous = _get_wheels(compared)
+    received = _get_wheels(common.previous.get((item.source, RECEIVED)))
+    are_stationary = are_wheels_stationary(sample, received, measurement.contacts, settings)
+    state = state._replace(stationary=state.stationary.update_wheels(item.utime, are_stationary))
+    state = remember(state, (item.source, RECEIVED), item)
+    has_imu = setup.uses_imu(common.mode)
+    if isinstance(state, Leveling):
+        return (state if has_imu else leveling.start_level(setup, state, item.utime)), NOTHING
+    age = math.inf if compared is None else (item.utime - compared.utime) * 1e-6
+    if has_imu and measurement.has_travel(sample, previous) and age < settings.wheel_period - 0.01:
+        return state, NOTHING
+    state = propagation.advance(setup, state, item.utime)
+    state, decisions, is_first_speed = _fuse_speed(setup, state, item, measurement, sample, age, previous)
+    state = state._replace(nav=state.nav._replace(travel=ZERO, rotation=ZERO))
+    state = remember(state, (item.source, item.kind), item)
+    if not has_imu:
+        state, more = _fuse_stationary(setup, state, item.utime, are_stationary is True)
+        decisions += more
+    # the first wheels that measure a speed leave the sideways speed to the constraint
+    since = (item.utime - state.constraints.non_holonomic_utime) * 1e-6
+    if not state.is_stationary and (is_first_speed or since >= 0.5 * CONSTRAINT_PERIOD):
+        state, decision = fuse_non_holonomic(setup, state, item.utime)
+        decisions += (decision,)
+    return state, decisions
+
+
+def _fuse_speed(
+    setup: Setup,
+    state: N,
+    item: Item,
+    measurement: WheelSpeed,
+    sample: WheelsSample,
+    age: float,
+    previous: WheelsSample | None,
+) -> tuple[N, tuple[Decision, ...], bool]:
+    """Return the state after the update by the wheels, the decisions, and whether the speed was unknown before."""
+    settings = setup.settings
+    context = create_context(setup, state, age, previous)
+    innovation = measurement.evaluate(context, sample)
+    if isinstance(innovation, str):
+        return state, ((reject(item, innovation),) if innovation else NOTHING), False
+    is_first_speed = _is_speed_unknown(context.nav)
+    if is_first_speed:
+        # the wheels' error is a share of speed: linearize at the speed that they measure, not at 0
+        nav = _set_speed(context.nav, innovation, setup.rig.base, min(age, settings.wheel_period))
+        again = measurement.evaluate(context._replace(nav=nav), sample)
+        if not isinstance(again, str):
+            context, innovation = context._replace(nav=nav), again
+    nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
+    has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
+    wheels = state.common.wheels._replace(source=item.source)
+    if decision.verdict is Verdict.USED:
+        turn_rate = 0.0
+        if not has_gyro:
+            turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
+        wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
+    return state._replace(nav=nav, common=state.common._replace(wheels=wheels)), (decision,), is_first_speed
+
+
+def _fuse_stationary(setup: Setup, state: N, utime: int, is_stationary: bool) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state after ZUPT by wheels that are stationary: without an IMU they alone show it."""
+    dt = (utime - state.constraints.zupt_utime) * 1e-6
+    state = state._replace(constraints=state.constraints._replace(is_stationary=is_stationary))
+    decisions = NOTHING
+    is_due = dt >= ZUPT_PERIOD
+    if is_stationary and is_due:
+        innovation = constraints.zero_velocity(create_context(setup, state), dt)
+        state, decision = fuse_constraint(setup, state, constraints.ZERO_VELOCITY, innovation)
+        decisions = (decision,)
+    if not is_stationary or is_due:
+        state = state._replace(constraints=state.constraints._replace(zupt_utime=utime))
+    return state, decisions
+
+
+def _set_speed(nav: NavState, innovation: Innovation, base: Vector3, seconds: float) -> NavState:
+    """Return a state of unknown speed at the speed that the wheels measure; all else and the covariance stay.
+
+    `seconds` is the time since the last wheel sample: that distance was travelled at that speed too.
+    """
+    residual, H, R = innovation.residual, innovation.jacobian, innovation.noise
+    try:
+        error, _ = eskf.correct(nav.covariance, residual, H, R)
+    except np.linalg.LinAlgError:
+        return nav
+    x, y, z = error[3:6].tolist()
+    if not math.isfinite(x + y + z):
+        return nav
+    before = nav.body_velocity(base)
+    vx, vy, vz = nav.velocity
+    nav = nav._replace(velocity=(vx + x, vy + y, vz + z))
+    a, b, c = nav.travel
+    dx, dy, dz = (seconds * (new - old) for new, old in zip(nav.body_velocity(base), before, strict=True))
+    return nav._replace(travel=(a + dx, b + dy, c + dz))
+
+
+def _is_speed_unknown(nav: NavState) -> bool:
+    P = nav.covariance
+    return float(P[3, 3] + P[4, 4]) > UNKNOWN_SPEED_SIGMA**2
+
+
+def _get_wheels(previous: PreviousSample | None) -> WheelsSample | None:
+    return previous.sample if previous is not None and isinstance(previous.sample, WheelsSample) else None
+
+
+def fuse_steering(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state with the vehicle controller's steering angle; an angle out of range is rejected."""
+    sample, signal = item.sample, setup.rig.steering
+    assert isinstance(sample, VehicleStatusSample)
+    assert signal is not None
+    angle = sample.steering_angle
+    if not math.isfinite(angle):
+        return state, (reject(item, "nan"),)
+    if abs(angle) > signal.limit:
+        return state, (reject(item, "range"),)
+    wheels = state.common.wheels._replace(steering=SteeringAngle(item.utime, angle))
+    return state._replace(common=state.common._replace(wheels=wheels)), NOTHING
