@@ -214,7 +214,7 @@ def _start_raw(fresh: RawLocalizer, last: Estimate) -> RawLocalizer:
     if last.enu is None or last.covariance is None or last.invalid:
         return fresh
     heading = Heading(
-        known=True,
+        is_known=True,
         offset=math.atan2(*_heading_vector(last.enu)),
         variance=last.covariance[35],
         bias_variance=fresh.heading.bias_variance,

@@ -17,7 +17,7 @@ FILTER = "modelserver/estimation/filter"
 TERMS = {
     # Groves
     "lever arm": "modelserver/transforms/chain.py",
-    "specific force": "modelserver/estimation/raw/attitude.py",
+    "specific force": "modelserver/estimation/raw/motion.py",
     "strapdown": f"{FILTER}/strapdown.py",
     "error state": f"{FILTER}/layout.py",
     "local level": f"{FILTER}/strapdown.py",

@@ -37,9 +37,10 @@ IMU_WAIT_US: Final = 60_000
 
 
 class StampVerdict(Enum):
-    """What a stamp means for its sample."""
+    """What a stamp means for its sample. `DUPLICATE` is of raw mode, which has no buffer to find duplicates in."""
 
     GOOD = "good"
+    DUPLICATE = "duplicate"
     TOO_OLD = "too_old"
     OUT_OF_SEQUENCE = "out_of_sequence"
     FUTURE = "future"

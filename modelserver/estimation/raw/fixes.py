@@ -9,24 +9,29 @@ from dataclasses import dataclass, field, replace
 from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic
 from modelserver.estimation.fix_quality import AcceptedFix
 from modelserver.estimation.raw import track
-from modelserver.estimation.raw.bounds import grown
-from modelserver.estimation.raw.heading import Course, Heading
-from modelserver.estimation.raw.motion import Motion
-from modelserver.estimation.raw.place import Anchor, Jumps, jump_limit, lever_arm
-from modelserver.estimation.raw.rest import Rest, judged
+from modelserver.estimation.raw.heading import CourseResult, Heading
+from modelserver.estimation.raw.motion import RawMotion
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.track import TrackFix
+from modelserver.estimation.raw.stationary import StationaryPlace, update_stationary
+from modelserver.estimation.raw.track import (
+    FixAnchor,
+    JumpMonitor,
+    TrackFix,
+    compute_growth,
+    compute_jump_limit,
+    compute_lever_arm,
+)
 from modelserver.messages import GpsSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3, cross
 
-WORK_REACH = 200.0
+WORK_RANGE = 200.0
 """Metres from the working frame's origin at which it is set anew: so near, its vertical and its north are the
 vehicle's to 3e-5 rad."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fixes:
+class FixMonitor:
     """The state drawn from fixes.
 
     `work` is a tangent plane near the vehicle in which positions are kept; `anchor` the last good fix; `recent`
@@ -35,44 +40,44 @@ class Fixes:
     """
 
     work: LocalFrame | None = None
-    anchor: Anchor | None = None
+    anchor: FixAnchor | None = None
     recent: tuple[TrackFix, ...] = ()
-    stretch: tuple[TrackFix, ...] = ()
-    jumps: Jumps = field(default_factory=Jumps)
-    refusals: int = 0
-    rest: Rest | None = None
+    segment: tuple[TrackFix, ...] = ()
+    jumps: JumpMonitor = field(default_factory=JumpMonitor)
+    num_rejected: int = 0
+    stationary: StationaryPlace | None = None
 
-    def forgotten(self) -> Fixes:
+    def forget_path(self) -> FixMonitor:
         """Return the state without the stretches: their path is broken."""
-        return replace(self, recent=(), stretch=()) if self.recent or self.stretch else self
+        return replace(self, recent=(), segment=()) if self.recent or self.segment else self
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class FixStep:
     """What one fix did: the new states, whether the world pose jumped, and a word where a part was refused."""
 
-    fixes: Fixes
+    fixes: FixMonitor
     heading: Heading
     speed: float = 0.0
     speed_sigma: float = 0.0
-    slow: bool = False
-    jumped: bool = False
-    refused: str = ""
+    is_slow: bool = False
+    has_jumped: bool = False
+    rejected: str = ""
     ecef: Vector3 = (0.0, 0.0, 0.0)
 
 
-def take(
-    fixes: Fixes,
+def update_fixes(
+    fixes: FixMonitor,
     heading: Heading,
     sample: GpsSample,
     fix: AcceptedFix,
-    motion: Motion,
+    motion: RawMotion,
     standing: bool,
     lever: Vector3,
     fallback_height: float,
     turn_variance: float,
     settings: RawSettings,
-) -> Step:
+) -> FixStep:
     """Return what is concluded with one good fix more; `motion` is the base frame's at the fix's instant.
 
     `lever` is the antenna's place in the base frame. A fix that told no height has the height carried to it,
@@ -80,10 +85,10 @@ def take(
     fix's instant that no inertial sample told of yet. A refused fix leaves all but the counts as it was.
     """
     utime = sample.header.utime
-    direction = cmath.rect(1.0, heading.offset) if heading.known else 1.0 + 0j
-    arm, arm_up = lever_arm(motion, lever)
-    swing, _ = lever_arm(motion, cross(motion.rate, lever))
-    fix, ecef = _complete(fixes, fix, motion, arm_up, fallback_height, settings)
+    direction = cmath.rect(1.0, heading.offset) if heading.is_known else 1.0 + 0j
+    arm, arm_up = compute_lever_arm(motion, lever)
+    swing, _ = compute_lever_arm(motion, cross(motion.rate, lever))
+    fix, ecef = _complete_height(fixes, fix, motion, arm_up, fallback_height, settings)
     work = fixes.work or LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
     east, north, up = work.from_ecef(ecef)
     place = complex(east, north)
@@ -92,41 +97,43 @@ def take(
     before = fixes.anchor
     if before is not None:
         dt = (utime - before.utime) * 1e-6
-        carried = known = before.place
+        carried = known = before.position
         speed_sigma = None
-        if heading.known and motion.speed_utime:
-            base, _, _ = before.base(motion, direction)
+        if heading.is_known and motion.speed_utime:
+            base, _, _ = before.propagate_base(motion, direction)
             carried, speed_sigma = base + direction * arm, motion.speed_sigma
         off = abs(place - carried)
         # while fixes are being refused, time alone must not let the same ones in
         within = min(dt, settings.gps_timeout) if fixes.jumps.count else dt
-        limit = jump_limit(within, before.fix.sigma, fix.sigma, speed_sigma, settings)
+        limit = compute_jump_limit(within, before.fix.sigma, fix.sigma, speed_sigma, settings)
         climb = settings.jump_sigmas * math.sqrt(before.fix.up_variance + fix.up_variance)
         if off > limit or abs(up - before.up) > climb + settings.maximum_speed * dt:
-            jumps = fixes.jumps.refused(utime, place, fix.sigma, settings)
-            if not jumps.believed(settings):
-                return Step(replace(fixes, jumps=jumps, refusals=fixes.refusals + 1), heading, refused="jump")
+            jumps = fixes.jumps.reject(utime, place, fix.sigma, settings)
+            if not jumps.is_confirmed(settings):
+                return FixStep(
+                    replace(fixes, jumps=jumps, num_rejected=fixes.num_rejected + 1), heading, rejected="jump"
+                )
             jumped = True
         elif dt > settings.gps_timeout:
             # back after an outage: what a fix on time would not have been allowed is a discontinuity
-            jumped = off > jump_limit(settings.gps_timeout, before.fix.sigma, fix.sigma, speed_sigma, settings) or (
-                speed_sigma is None and abs(place - known) > limit
-            )
+            jumped = off > compute_jump_limit(
+                settings.gps_timeout, before.fix.sigma, fix.sigma, speed_sigma, settings
+            ) or (speed_sigma is None and abs(place - known) > limit)
         if jumped:
-            fixes = replace(fixes.forgotten(), rest=None)
+            fixes = replace(fixes.forget_path(), stationary=None)
 
-    fixes, heading, work = _near(fixes, heading, fix, ecef)
+    fixes, heading, work = _recenter(fixes, heading, fix, ecef)
     east, north, up = work.from_ecef(ecef)
     place = complex(east, north)
-    anchor = Anchor(utime, place, up, fix, motion, arm, arm_up)
+    anchor = FixAnchor(utime, place, up, fix, motion, arm, arm_up)
     newest = TrackFix(utime, place, fix.sigma, motion.path, arm, motion.yaw)
-    recent = track.kept(fixes.recent, newest, settings.speed_window + settings.stationary_time)
-    stretch = track.kept(fixes.stretch, newest, settings.course_window)
-    velocity = _velocity(sample, settings)
-    told = None if velocity is None else (_at_base(velocity.vector, heading, motion, swing), velocity.sigma)
-    slow = track.slow(recent, settings) if told is None else abs(told[0]) <= _slow_limit(told[1], settings)
+    recent = track.append_fix(fixes.recent, newest, settings.speed_window + settings.stationary_time)
+    stretch = track.append_fix(fixes.segment, newest, settings.course_window)
+    velocity = _read_velocity(sample, settings)
+    told = None if velocity is None else (_to_base(velocity.vector, heading, motion, swing), velocity.sigma)
+    slow = track.is_slow(recent, settings) if told is None else abs(told[0]) <= _get_slow_limit(told[1], settings)
     least = max(abs(motion.speed) - 2.0 * motion.speed_sigma, 0.0)
-    rest, heading, slow = judged(fixes.rest, slow, standing, newest, told, least, heading, settings)
+    rest, heading, slow = update_stationary(fixes.stationary, slow, standing, newest, told, least, heading, settings)
     standing = standing and slow
     refused = ""
     if standing:
@@ -134,15 +141,15 @@ def take(
         stretch = (newest,)
         speed, speed_sigma = 0.0, settings.stationary_speed / 2.0
     else:
-        was_known = heading.known
-        heading, met = _course(heading, velocity, stretch, motion, swing, turn_variance, settings)
+        was_known = heading.is_known
+        heading, met = _update_course(heading, velocity, stretch, motion, swing, turn_variance, settings)
         if met is not None:
             stretch = (newest,)
-            refused = "course" if met is Course.REFUSED else ""
-            jumped = jumped or (met is Course.ANEW and was_known)
-        speed, speed_sigma = _speed(heading, velocity, recent, motion, swing, settings)
-    return Step(
-        Fixes(work, anchor, recent, stretch, rest=rest),
+            refused = "course" if met is CourseResult.REJECTED else ""
+            jumped = jumped or (met is CourseResult.RESET and was_known)
+        speed, speed_sigma = _estimate_speed(heading, velocity, recent, motion, swing, settings)
+    return FixStep(
+        FixMonitor(work, anchor, recent, stretch, stationary=rest),
         heading,
         speed,
         speed_sigma,
@@ -153,8 +160,8 @@ def take(
     )
 
 
-def _complete(
-    fixes: Fixes, fix: AcceptedFix, motion: Motion, arm_up: float, fallback_height: float, settings: RawSettings
+def _complete_height(
+    fixes: FixMonitor, fix: AcceptedFix, motion: RawMotion, arm_up: float, fallback_height: float, settings: RawSettings
 ) -> tuple[AcceptedFix, Vector3]:
     """Return the fix with a height, and its earth-centred position."""
     if math.isnan(fix.height):
@@ -166,16 +173,19 @@ def _complete(
             age = max((motion.utime - before.utime) * 1e-6, 0.0)
             height = before.fix.height + motion.z - before.motion.z + arm_up - before.lever_up
             variance = min(
-                before.fix.up_variance + grown(age, motion.speed_sigma, settings), settings.unknown_height_sigma**2
+                before.fix.up_variance + compute_growth(age, motion.speed_sigma, settings),
+                settings.unknown_height_sigma**2,
             )
         fix = replace(fix, height=height, up_variance=variance)
     return fix, ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
 
 
-def _near(fixes: Fixes, heading: Heading, fix: AcceptedFix, ecef: Vector3) -> tuple[Fixes, Heading, LocalFrame]:
+def _recenter(
+    fixes: FixMonitor, heading: Heading, fix: AcceptedFix, ecef: Vector3
+) -> tuple[FixMonitor, Heading, LocalFrame]:
     """Return the states in a working frame that is near the fix, and that frame: the same one, or one set anew."""
     old = fixes.work
-    if old is not None and math.dist(old.ecef, ecef) <= WORK_REACH:
+    if old is not None and math.dist(old.ecef, ecef) <= WORK_RANGE:
         return fixes, heading, old
     work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
     if old is None:
@@ -187,22 +197,24 @@ def _near(fixes: Fixes, heading: Heading, fix: AcceptedFix, ecef: Vector3) -> tu
         return complex(x, y), z
 
     def again(track_fixes: tuple[TrackFix, ...]) -> tuple[TrackFix, ...]:
-        return tuple(replace(each, place=moved(each.place)[0]) for each in track_fixes)
+        return tuple(replace(each, position=moved(each.position)[0]) for each in track_fixes)
 
     anchor = fixes.anchor
     if anchor is not None:
-        place, up = moved(anchor.place, anchor.up)
-        anchor = replace(anchor, place=place, up=up)
+        place, up = moved(anchor.position, anchor.up)
+        anchor = replace(anchor, position=place, up=up)
     turned = so3.logarithm(so3.normalize(work.rotation_of(old)))[2]
     return (
-        Fixes(
+        FixMonitor(
             work,
             anchor,
             again(fixes.recent),
-            again(fixes.stretch),
-            replace(fixes.jumps, place=moved(fixes.jumps.place)[0]) if fixes.jumps.count else fixes.jumps,
-            fixes.refusals,
-            None if fixes.rest is None else replace(fixes.rest, place=moved(fixes.rest.place)[0]),
+            again(fixes.segment),
+            replace(fixes.jumps, position=moved(fixes.jumps.position)[0]) if fixes.jumps.count else fixes.jumps,
+            fixes.num_rejected,
+            None
+            if fixes.stationary is None
+            else replace(fixes.stationary, position=moved(fixes.stationary.position)[0]),
         ),
         replace(heading, offset=math.remainder(heading.offset + turned, math.tau)),
         work,
@@ -210,7 +222,7 @@ def _near(fixes: Fixes, heading: Heading, fix: AcceptedFix, ecef: Vector3) -> tu
 
 
 @dataclass(frozen=True, slots=True)
-class _Velocity:
+class _ReceiverVelocity:
     """The antenna's velocity as the receiver told it, east + i north, m/s; `age` at the fix's instant, s."""
 
     vector: complex
@@ -219,7 +231,7 @@ class _Velocity:
     age: float
 
 
-def _velocity(sample: GpsSample, settings: RawSettings) -> _Velocity | None:
+def _read_velocity(sample: GpsSample, settings: RawSettings) -> _ReceiverVelocity | None:
     """Return the receiver's own velocity, or that of its speed and course; None where it told neither."""
     age = sample.velocity_latency if 0.0 <= sample.velocity_latency <= 2.0 else 0.0
     sigma, course_sigma = settings.velocity_sigma, math.nan
@@ -240,17 +252,17 @@ def _velocity(sample: GpsSample, settings: RawSettings) -> _Velocity | None:
     if not course_sigma > 0.0:
         course_sigma = sigma / max(abs(vector), 1e-3)
     course_sigma = max(course_sigma, settings.heading_floor)
-    return _Velocity(vector, sigma, course_sigma, age)
+    return _ReceiverVelocity(vector, sigma, course_sigma, age)
 
 
-def _slow_limit(sigma: float, settings: RawSettings) -> float:
+def _get_slow_limit(sigma: float, settings: RawSettings) -> float:
     """Return the speed up to which a velocity may be a standing vehicle's: its mean over time tells the rest."""
     return max(sigma, min(settings.stationary_speed + 3.0 * sigma, settings.course_speed))
 
 
-def _at_base(vector: complex, heading: Heading, motion: Motion, swing: complex) -> complex:
+def _to_base(vector: complex, heading: Heading, motion: RawMotion, swing: complex) -> complex:
     """Return the base frame's velocity: the antenna's without its `swing`, what turning gives it along Odom's axes."""
-    if heading.known:
+    if heading.is_known:
         direction = cmath.rect(1.0, heading.offset)
     elif abs(vector) > 0.0:
         direction = vector / abs(vector) * cmath.rect(1.0, -motion.yaw)
@@ -259,38 +271,38 @@ def _at_base(vector: complex, heading: Heading, motion: Motion, swing: complex) 
     return vector - direction * swing
 
 
-def _course(
+def _update_course(
     heading: Heading,
-    velocity: _Velocity | None,
+    velocity: _ReceiverVelocity | None,
     stretch: tuple[TrackFix, ...],
-    motion: Motion,
+    motion: RawMotion,
     swing: complex,
     turn_variance: float,
     settings: RawSettings,
-) -> tuple[Heading, Course | None]:
+) -> tuple[Heading, CourseResult | None]:
     """Return the heading after this fix's course, and what became of it; None where there was none to take."""
     if velocity is not None:
-        vector = _at_base(velocity.vector, heading, motion, swing)
+        vector = _to_base(velocity.vector, heading, motion, swing)
         if abs(vector) < settings.course_speed or velocity.course_sigma > settings.course_sigma_limit:
             return heading, None
         # the course is of the instant the velocity was measured: heading has turned since
         offset = cmath.phase(vector) - (motion.yaw - motion.yaw_rate * velocity.age)
-        return heading.met(offset, velocity.course_sigma**2 + turn_variance, settings)
-    direction = cmath.rect(1.0, heading.offset) if heading.known else None
-    found = track.course(stretch, direction, settings)
+        return heading.update_course(offset, velocity.course_sigma**2 + turn_variance, settings)
+    direction = cmath.rect(1.0, heading.offset) if heading.is_known else None
+    found = track.fit_course(stretch, direction, settings)
     if found is None or found[1] > settings.course_sigma_limit:
         return heading, None
     # the stretch tells the offset of its middle; an error of the bias has turned it since
     half = 0.5 * (stretch[-1].utime - stretch[0].utime) * 1e-6
     variance = found[1] ** 2 + heading.bias_variance * half * half + turn_variance
-    return heading.met(found[0], variance, settings)
+    return heading.update_course(found[0], variance, settings)
 
 
-def _speed(
+def _estimate_speed(
     heading: Heading,
-    velocity: _Velocity | None,
+    velocity: _ReceiverVelocity | None,
     recent: tuple[TrackFix, ...],
-    motion: Motion,
+    motion: RawMotion,
     swing: complex,
     settings: RawSettings,
 ) -> tuple[float, float]:
@@ -298,16 +310,16 @@ def _speed(
 
     Before heading is known the motion is taken as forward, and what is not clearly motion as none.
     """
-    direction = cmath.rect(1.0, heading.offset) if heading.known else 0j
+    direction = cmath.rect(1.0, heading.offset) if heading.is_known else 0j
     if velocity is not None:
-        vector, sigma = _at_base(velocity.vector, heading, motion, swing), velocity.sigma
+        vector, sigma = _to_base(velocity.vector, heading, motion, swing), velocity.sigma
         along = (vector * cmath.rect(1.0, -motion.yaw) * direction.conjugate()).real
     else:
-        slope = track.best_speed(recent, direction, settings)
+        slope = track.fit_best_speed(recent, direction, settings)
         if slope is None:
             return 0.0, settings.maximum_speed / 2.0
         vector, sigma = slope.velocity, slope.sigma
         along = (vector * direction.conjugate()).real
-    if not heading.known:
+    if not heading.is_known:
         along = abs(vector) if abs(vector) > 3.0 * sigma else 0.0
     return max(-settings.maximum_speed, min(along, settings.maximum_speed)), sigma

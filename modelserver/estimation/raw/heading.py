@@ -17,38 +17,38 @@ from modelserver.estimation.raw.settings import RawSettings
 UNKNOWN_VARIANCE = (math.pi / math.sqrt(3.0)) ** 2
 """Variance of a direction of which nothing is known: uniform over the circle."""
 
-_STOOD_GATE = 4.0
+_STATIONARY_GATE = 4.0
 """Sigmas that a rate at rest may be off the bias known."""
 
 
-class Course(Enum):
+class CourseResult(Enum):
     """What became of a course."""
 
-    TAKEN = "taken"
+    USED = "taken"
     BACKWARDS = "backwards"
-    REFUSED = "refused"
-    ANEW = "anew"
+    REJECTED = "refused"
+    RESET = "anew"
 
 
 @dataclass(frozen=True, slots=True)
 class Heading:
     """Offset (rad) and yaw gyro bias (rad/s) with their covariance; `known` once a course was taken."""
 
-    known: bool = False
+    is_known: bool = False
     offset: float = 0.0
     variance: float = UNKNOWN_VARIANCE
     bias: float = 0.0
     bias_variance: float = 0.0
     covariance: float = 0.0
-    refused: int = 0
-    refused_offset: float = 0.0
+    num_rejected: int = 0
+    rejected_offset: float = 0.0
 
     @property
     def sigma(self) -> float:
         """Sigma of the heading, rad."""
         return math.sqrt(self.variance)
 
-    def carried(self, dt: float, settings: RawSettings, measured: bool = True) -> Heading:
+    def propagate(self, dt: float, settings: RawSettings, measured: bool = True) -> Heading:
         """Return the heading `dt` seconds on; `measured` false where no gyro told of the turn.
 
         A step longer than `rate_hold` is measured only so far.
@@ -56,8 +56,8 @@ class Heading:
         if dt <= 0.0:
             return self
         if measured and dt > settings.rate_hold:
-            held = self.carried(settings.rate_hold, settings)
-            return held.carried(dt - settings.rate_hold, settings, measured=False)
+            held = self.propagate(settings.rate_hold, settings)
+            return held.propagate(dt - settings.rate_hold, settings, measured=False)
         b = self.bias_variance
         dt_b = min(dt, 1e4)
         variance = self.variance - 2.0 * self.covariance * dt_b + b * dt_b * dt_b + settings.gyro_noise**2 * dt_b
@@ -72,31 +72,31 @@ class Heading:
         if variance >= UNKNOWN_VARIANCE:
             variance, covariance = UNKNOWN_VARIANCE, 0.0
         return Heading(
-            self.known, self.offset, variance, self.bias, b_new, covariance, self.refused, self.refused_offset
+            self.is_known, self.offset, variance, self.bias, b_new, covariance, self.num_rejected, self.rejected_offset
         )
 
-    def stood(self, rate: float, variance: float) -> Heading:
+    def update_stationary(self, rate: float, variance: float) -> Heading:
         """Return the heading after a yaw rate was measured at rest: what is left of it is bias.
 
         `rate` is without the bias known so far, rad/s, and `variance` its noise. A rate that neither can explain
         is a turn, and changes nothing.
         """
         s = self.bias_variance + variance
-        if rate * rate > _STOOD_GATE**2 * s:
+        if rate * rate > _STATIONARY_GATE**2 * s:
             return self
         k1, k2 = self.covariance / s, self.bias_variance / s
         return Heading(
-            self.known,
+            self.is_known,
             math.remainder(self.offset + k1 * rate, math.tau),
             max(self.variance - k1 * self.covariance, 1e-12),
             self.bias + k2 * rate,
             max(self.bias_variance * (1.0 - k2), 1e-18),
             self.covariance * (1.0 - k2),
-            self.refused,
-            self.refused_offset,
+            self.num_rejected,
+            self.rejected_offset,
         )
 
-    def doubted(self, bias: float, bias_variance: float, seconds: float) -> Heading:
+    def revoke_stationary(self, bias: float, bias_variance: float, seconds: float) -> Heading:
         """Return the heading after it turned out that the vehicle moved while it was taken to stand.
 
         `bias` and `bias_variance` are those of `seconds` ago: what the bias has changed by may be a turn.
@@ -106,19 +106,19 @@ class Heading:
         known = max(bias_variance, self.bias_variance)
         return replace(self, variance=variance, bias=bias, bias_variance=known, covariance=0.0)
 
-    def widened(self, variance: float) -> Heading:
+    def inflate(self, variance: float) -> Heading:
         """Return the heading with `variance` more."""
         return replace(self, variance=min(self.variance + variance, UNKNOWN_VARIANCE))
 
-    def met(self, offset: float, variance: float, settings: RawSettings) -> tuple[Heading, Course]:
+    def update_course(self, offset: float, variance: float, settings: RawSettings) -> tuple[Heading, CourseResult]:
         """Return the heading after a course said `offset` with `variance`, and what became of the course.
 
         Before heading is known the course is taken as forward. Afterwards one about half a turn off is a
         vehicle that drives backwards. A course that fits neither is refused; a run of such, agreeing among
         themselves, is believed.
         """
-        if not self.known:
-            return self._begun(offset, variance), Course.ANEW
+        if not self.is_known:
+            return self._reset(offset, variance), CourseResult.RESET
         innovation = math.remainder(offset - self.offset, math.tau)
         backwards = abs(innovation) > 0.5 * math.pi
         if backwards:
@@ -126,14 +126,14 @@ class Heading:
         s = self.variance + variance
         # sigma above 60 deg: which end is the front can no longer be told
         if self.variance > 1.0:
-            return self._begun(offset, variance), Course.ANEW
+            return self._reset(offset, variance), CourseResult.RESET
         if innovation * innovation > settings.course_gate**2 * s:
-            apart = math.remainder(offset - self.refused_offset, math.tau)
-            agrees = self.refused > 0 and apart * apart <= settings.course_gate**2 * 2.0 * variance
-            count = self.refused + 1 if agrees else 1
+            apart = math.remainder(offset - self.rejected_offset, math.tau)
+            agrees = self.num_rejected > 0 and apart * apart <= settings.course_gate**2 * 2.0 * variance
+            count = self.num_rejected + 1 if agrees else 1
             if count >= settings.course_rejections:
-                return self._begun(offset, variance), Course.ANEW
-            return replace(self, refused=count, refused_offset=offset), Course.REFUSED
+                return self._reset(offset, variance), CourseResult.RESET
+            return replace(self, num_rejected=count, rejected_offset=offset), CourseResult.REJECTED
         k1, k2 = self.variance / s, self.covariance / s
         return (
             Heading(
@@ -144,8 +144,8 @@ class Heading:
                 max(self.bias_variance - k2 * self.covariance, 1e-18),
                 self.covariance * (1.0 - k1),
             ),
-            Course.BACKWARDS if backwards else Course.TAKEN,
+            CourseResult.BACKWARDS if backwards else CourseResult.USED,
         )
 
-    def _begun(self, offset: float, variance: float) -> Heading:
+    def _reset(self, offset: float, variance: float) -> Heading:
         return Heading(True, math.remainder(offset, math.tau), variance, self.bias, self.bias_variance, 0.0, 0)

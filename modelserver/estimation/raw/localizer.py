@@ -12,17 +12,18 @@ from dataclasses import dataclass, replace
 
 from modelserver.earth.geodesy import Geodesy, geodetic_from_ecef
 from modelserver.estimation import fix_quality as gate
+from modelserver.estimation.filter.clock_monitor import StampVerdict
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.estimation.origin import OriginProjection
-from modelserver.estimation.raw import attitude, fixes
-from modelserver.estimation.raw.fixes import Fixes
+from modelserver.estimation.raw import fixes
+from modelserver.estimation.raw.fixes import FixMonitor
 from modelserver.estimation.raw.heading import Heading
-from modelserver.estimation.raw.motion import Motion, yaw_rate
+from modelserver.estimation.raw.motion import RawMotion, compute_yaw_rate, correct_up, get_first_up, read_raw_imu
+from modelserver.estimation.raw.output import estimate
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.stamps import Stamps, Verdict
+from modelserver.estimation.raw.stamps import StampMonitor
 from modelserver.estimation.raw.state import RawState
-from modelserver.estimation.raw.still import Stillness
-from modelserver.estimation.raw.world import estimate
+from modelserver.estimation.raw.stationary import QuietDetector
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     STALE_SENSORS,
@@ -80,9 +81,9 @@ class RawLocalizer(RawState):
         fix); course (a fix whose course was not used) and `OriginLatched`.
         """
         if isinstance(sample, ImuSample):
-            return self._take_imu(sample)
+            return self._process_imu(sample)
         if isinstance(sample, GpsSample):
-            return self._take_gps(sample)
+            return self._process_gps(sample)
         return self, ()
 
     def estimate(self, utime: int) -> Estimate:
@@ -104,22 +105,22 @@ class RawLocalizer(RawState):
     def summary(self, utime: int) -> LocalizerSummary:
         """Return whether the vehicle stands, and when a fix was last used."""
         anchor = self.fixes.anchor
-        standing = self.stillness.standing(utime, self.settings)
+        standing = self.quiet.is_stationary(utime, self.settings)
         return LocalizerSummary(Mode.RAW, None, standing, 0 if anchor is None else anchor.utime)
 
     # --- inertial samples -----------------------------------------------------------------------------------
 
-    def _take_imu(self, sample: ImuSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
+    def _process_imu(self, sample: ImuSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
         utime, settings = sample.header.utime, self.settings
-        stamps, verdict = self.imu_stamps.take(utime, settings)
-        if verdict is Verdict.STEPPED_BACK:
-            self = self._begun_anew(utime, stamps.lost)
-        elif verdict is not Verdict.GOOD:
-            return replace(self, imu_stamps=stamps), _refused(sample, verdict.value)
-        inertial = attitude.read(sample, self.mounts.X_base_imu)
+        stamps, verdict = self.imu_stamps.update(utime, settings)
+        if verdict is StampVerdict.STEPPED_BACK:
+            self = self._restart(utime, stamps.lost_time)
+        elif verdict is not StampVerdict.GOOD:
+            return replace(self, imu_stamps=stamps), _reject(sample, verdict.value)
+        inertial = read_raw_imu(sample, self.mounts.X_base_imu)
         if isinstance(inertial, str):
-            return replace(self, imu_stamps=stamps), _refused(sample, inertial)
-        heading, still, before = self.heading, self.stillness, self.motion
+            return replace(self, imu_stamps=stamps), _reject(sample, inertial)
+        heading, still, before = self.heading, self.quiet, self.motion
         bx, by = self.tilt_bias
         wx, wy, wz = inertial.rate
         rate = (wx - bx, wy - by, wz - heading.bias)
@@ -128,35 +129,35 @@ class RawLocalizer(RawState):
         if before is None or self.imu_utime is None:
             # the first one: there is nothing to integrate from, but it tells where up is
             if before is None:
-                before = Motion(utime)
-            motion = before.advanced(utime, (0.0, 0.0, 0.0), settings)
-            heading = heading.carried((utime - before.utime) * 1e-6, settings, measured=False)
-            known_fixes = known_fixes.forgotten()
-            up = attitude.first_up(inertial) or motion.up
+                before = RawMotion(utime)
+            motion = before.advance(utime, (0.0, 0.0, 0.0), settings)
+            heading = heading.propagate((utime - before.utime) * 1e-6, settings, measured=False)
+            known_fixes = known_fixes.forget_path()
+            up = get_first_up(inertial) or motion.up
         else:
             dt = (utime - self.imu_utime) * 1e-6
             a, b, c = before.rate
             gap = dt > settings.rate_hold
             mean = before.rate if gap else (0.5 * (a + rate[0]), 0.5 * (b + rate[1]), 0.5 * (c + rate[2]))
-            motion = before.advanced(utime, mean, settings)
-            heading = heading.carried((utime - before.utime) * 1e-6, settings)
+            motion = before.advance(utime, mean, settings)
+            heading = heading.propagate((utime - before.utime) * 1e-6, settings)
             if gap:
-                notes = _refused(sample, "gap")
-                known_fixes = known_fixes.forgotten()
+                notes = _reject(sample, "gap")
+                known_fixes = known_fixes.forget_path()
             speed = motion.speed
             lever = self.mounts.X_base_imu.xyz
             up = inertial.up or motion.up
             if inertial.up is None and inertial.force is not None:
-                up = attitude.corrected(up, inertial.force, rate, speed, lever, dt, settings)
-            wz_level = yaw_rate(rate, up)
+                up = correct_up(up, inertial.force, rate, speed, lever, dt, settings)
+            wz_level = compute_yaw_rate(rate, up)
             short = min(dt, settings.rate_hold)
-            still = still.felt(utime, wz_level, short, math.sqrt(heading.bias_variance), settings)
-            if still.standing(utime, settings):
-                rest = known_fixes.rest
-                if rest is None or not heading.known or rest.get_state_to_persist(utime, settings):
-                    heading = heading.stood(wz_level, max(settings.gyro_noise**2 / short, still.variance))
+            still = still.update(utime, wz_level, short, math.sqrt(heading.bias_variance), settings)
+            if still.is_stationary(utime, settings):
+                rest = known_fixes.stationary
+                if rest is None or not heading.is_known or rest.is_bias_certain(utime, settings):
+                    heading = heading.update_stationary(wz_level, max(settings.gyro_noise**2 / short, still.variance))
                 if rest is not None:
-                    heading = rest.unsure(utime, short, heading, settings)
+                    heading = rest.inflate_heading(utime, short, heading, settings)
                 gain = short / (settings.tilt_time + short)
                 bx, by = bx + gain * rate[0], by + gain * rate[1]
                 if speed:
@@ -166,9 +167,9 @@ class RawLocalizer(RawState):
             RawLocalizer(
                 self.mounts,
                 settings,
-                self.projected,
+                self.projection,
                 motion,
-                _kept(self.history, motion),
+                _append_motion(self.history, motion),
                 heading,
                 still,
                 (bx, by),
@@ -178,7 +179,7 @@ class RawLocalizer(RawState):
                 self.gps_stamps,
                 utime,
                 self.pose_epoch,
-                self.stepped,
+                self.is_clock_stepped,
                 max(self.newest, utime),
             ),
             notes,
@@ -186,68 +187,68 @@ class RawLocalizer(RawState):
 
     # --- fixes ----------------------------------------------------------------------------------------------
 
-    def _take_gps(self, sample: GpsSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
+    def _process_gps(self, sample: GpsSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
         utime, settings = sample.header.utime, self.settings
-        stamps, verdict = self.gps_stamps.take(utime, settings)
-        if verdict is Verdict.STEPPED_BACK:
-            self = self._begun_anew(utime, stamps.lost)
-        elif verdict is not Verdict.GOOD:
-            return replace(self, gps_stamps=stamps), _refused(sample, verdict.value)
+        stamps, verdict = self.gps_stamps.update(utime, settings)
+        if verdict is StampVerdict.STEPPED_BACK:
+            self = self._restart(utime, stamps.lost_time)
+        elif verdict is not StampVerdict.GOOD:
+            return replace(self, gps_stamps=stamps), _reject(sample, verdict.value)
         fix = gate.evaluate_fix(sample, settings)
-        if not isinstance(fix, str) and self.projected is not None and not self.projected.is_in_zone(fix):
+        if not isinstance(fix, str) and self.projection is not None and not self.projection.is_in_zone(fix):
             fix = "range"
         if isinstance(fix, str):
-            refused = replace(self.fixes, refusals=self.fixes.refusals + 1)
-            return replace(self, gps_stamps=stamps, fixes=refused), _refused(sample, fix)
+            refused = replace(self.fixes, num_rejected=self.fixes.num_rejected + 1)
+            return replace(self, gps_stamps=stamps, fixes=refused), _reject(sample, fix)
 
-        motion, heading = self.motion or Motion(utime), self.heading
+        motion, heading = self.motion or RawMotion(utime), self.heading
         ahead = (utime - motion.utime) * 1e-6
         if ahead > settings.imu_timeout:
             # no inertial samples: what was predicted so far is what Odom keeps. Samples that merely lag behind
             # the fixes must still find their place, so until then the prediction is for the fix alone
-            heading = heading.carried(ahead, settings)
+            heading = heading.propagate(ahead, settings)
             ahead = 0.0
-            motion = motion.advanced(utime, motion.rate, settings)
-        then = self.motion_at(utime, motion)
-        step = fixes.take(
+            motion = motion.advance(utime, motion.rate, settings)
+        then = self.get_motion_at(utime, motion)
+        step = fixes.update_fixes(
             self.fixes,
             heading,
             sample,
             fix,
             then,
-            self.stillness.standing(utime, settings),
+            self.quiet.is_stationary(utime, settings),
             self.mounts.X_base_antenna.xyz,
             math.nan if self.origin is None else self.origin.height,
             (settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)) ** 2,
             settings,
         )
-        notes = _refused(sample, step.refused) if step.refused else ()
+        notes = _reject(sample, step.rejected) if step.rejected else ()
         result = replace(
             self,
             motion=motion,
             fixes=step.fixes,
             heading=step.heading,
             gps_stamps=stamps,
-            pose_epoch=self.pose_epoch + (1 if step.jumped else 0),
+            pose_epoch=self.pose_epoch + (1 if step.has_jumped else 0),
         )
-        if step.refused == "jump":
+        if step.rejected == "jump":
             return result, notes
-        result, latched = result._placed(utime, step.ecef, fix.sigma)
+        result, latched = result._set_origin(utime, step.ecef, fix.sigma)
         return (
             replace(
                 result,
                 motion=replace(motion, speed=step.speed, speed_utime=utime, speed_sigma=step.speed_sigma),
-                stillness=replace(self.stillness, slow=step.slow),
-                stepped=self.stepped and not step.heading.known,
+                quiet=replace(self.quiet, is_slow=step.is_slow),
+                is_clock_stepped=self.is_clock_stepped and not step.heading.is_known,
                 newest=max(self.newest, utime),
             ),
             notes + latched,
         )
 
-    def _placed(self, utime: int, ecef: Vector3, sigma: float) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
+    def _set_origin(self, utime: int, ecef: Vector3, sigma: float) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
         """Return the localizer with the origin set, where it can be, and its axes at the new fix."""
         notes: tuple[LocalizerEvent, ...] = ()
-        capture, projected = self.capture, self.projected
+        capture, projected = self.capture, self.projection
         if projected is None:
             capture, origin = capture.add_fix(utime, ecef, sigma, self.settings)
             if origin is not None:
@@ -256,11 +257,11 @@ class RawLocalizer(RawState):
         if projected is not None and self.fixes.work is not None:
             latitude, longitude, _ = geodetic_from_ecef(ecef)
             projected = projected.at(latitude, longitude, self.fixes.work)
-        return replace(self, capture=capture, projected=projected), notes
+        return replace(self, capture=capture, projection=projected), notes
 
     # --- shared ---------------------------------------------------------------------------------------------
 
-    def _begun_anew(self, utime: int, lost: float) -> RawLocalizer:
+    def _restart(self, utime: int, lost: float) -> RawLocalizer:
         """Return the localizer after its clock was set back: only Odom, the origin and the biases stay.
 
         How the vehicle moved for the `lost` seconds until that was certain is not known.
@@ -283,22 +284,22 @@ class RawLocalizer(RawState):
             motion=motion,
             history=(),
             heading=Heading(bias=self.heading.bias, bias_variance=self.heading.bias_variance),
-            stillness=Stillness(),
-            fixes=Fixes(),
-            imu_stamps=Stamps(),
-            gps_stamps=Stamps(),
+            quiet=QuietDetector(),
+            fixes=FixMonitor(),
+            imu_stamps=StampMonitor(),
+            gps_stamps=StampMonitor(),
             imu_utime=None,
             pose_epoch=self.pose_epoch + 1,
-            stepped=True,
+            is_clock_stepped=True,
             newest=utime,
         )
 
 
-def _refused(sample: ImuSample | GpsSample, reason: str) -> tuple[LocalizerEvent, ...]:
+def _reject(sample: ImuSample | GpsSample, reason: str) -> tuple[LocalizerEvent, ...]:
     return (Rejected(f"sensor:{sample.header.source}", reason),)
 
 
-def _kept(history: tuple[Motion, ...], motion: Motion) -> tuple[Motion, ...]:
+def _append_motion(history: tuple[RawMotion, ...], motion: RawMotion) -> tuple[RawMotion, ...]:
     """Return the history with a motion more, thinned and bounded."""
     if not history:
         return (motion,)

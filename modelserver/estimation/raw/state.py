@@ -6,12 +6,12 @@ import cmath
 from dataclasses import dataclass, field
 
 from modelserver.estimation.origin import OriginCapture, OriginProjection
-from modelserver.estimation.raw.fixes import Fixes
+from modelserver.estimation.raw.fixes import FixMonitor
 from modelserver.estimation.raw.heading import Heading
-from modelserver.estimation.raw.motion import Motion, between
+from modelserver.estimation.raw.motion import RawMotion, interpolate_motion
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.stamps import Stamps
-from modelserver.estimation.raw.still import Stillness
+from modelserver.estimation.raw.stamps import StampMonitor
+from modelserver.estimation.raw.stationary import QuietDetector
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import Origin
 
@@ -22,38 +22,38 @@ class RawState:
 
     mounts: Mounts
     settings: RawSettings
-    projected: OriginProjection | None = None
-    motion: Motion | None = None
-    history: tuple[Motion, ...] = field(default=(), repr=False)
+    projection: OriginProjection | None = None
+    motion: RawMotion | None = None
+    history: tuple[RawMotion, ...] = field(default=(), repr=False)
     heading: Heading = field(default_factory=Heading)
-    stillness: Stillness = field(default_factory=Stillness)
+    quiet: QuietDetector = field(default_factory=QuietDetector)
     tilt_bias: tuple[float, float] = (0.0, 0.0)
-    fixes: Fixes = field(default_factory=Fixes)
+    fixes: FixMonitor = field(default_factory=FixMonitor)
     capture: OriginCapture = field(default_factory=OriginCapture)
-    imu_stamps: Stamps = field(default_factory=Stamps)
-    gps_stamps: Stamps = field(default_factory=Stamps)
+    imu_stamps: StampMonitor = field(default_factory=StampMonitor)
+    gps_stamps: StampMonitor = field(default_factory=StampMonitor)
     imu_utime: int | None = None
     pose_epoch: int = 0
-    stepped: bool = False
+    is_clock_stepped: bool = False
     newest: int = 0
 
     @property
     def origin(self) -> Origin | None:
         """The origin of World:UTM, None before it is set."""
-        return None if self.projected is None else self.projected.geodesy.origin
+        return None if self.projection is None else self.projection.geodesy.origin
 
-    def motion_at(self, utime: int, newest: Motion) -> Motion:
+    def get_motion_at(self, utime: int, newest: RawMotion) -> RawMotion:
         """Return the motion at `utime`: predicted from `newest`, or looked up in what is kept."""
         if utime >= newest.utime or not self.history:
-            return newest.advanced(utime, newest.rate, self.settings)
+            return newest.advance(utime, newest.rate, self.settings)
         after = newest
         for motion in reversed(self.history):
             if motion.utime <= utime:
-                return between(motion, after, utime)
+                return interpolate_motion(motion, after, utime)
             after = motion
         return after
 
     @property
     def direction(self) -> complex:
         """exp(i offset): turns Odom's horizontal axes to east and north; 1 before heading is known."""
-        return cmath.rect(1.0, self.heading.offset) if self.heading.known else 1.0 + 0j
+        return cmath.rect(1.0, self.heading.offset) if self.heading.is_known else 1.0 + 0j

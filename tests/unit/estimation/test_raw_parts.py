@@ -17,13 +17,19 @@ from support_localization import GEODESY, MOUNTS, START
 from modelserver.errors import UnknownFrameError
 from modelserver.estimation import fix_quality as gate
 from modelserver.estimation.origin import OriginCapture
-from modelserver.estimation.raw import bounds, track
-from modelserver.estimation.raw.attitude import read
-from modelserver.estimation.raw.heading import Course, Heading
-from modelserver.estimation.raw.motion import Motion, attitude, levelled, roll_pitch
+from modelserver.estimation.raw import output as bounds
+from modelserver.estimation.raw import track
+from modelserver.estimation.raw.heading import CourseResult, Heading
+from modelserver.estimation.raw.motion import (
+    RawMotion,
+    compute_attitude,
+    compute_roll_pitch,
+    read_raw_imu,
+    to_level_axes,
+)
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.stamps import Stamps, Verdict
-from modelserver.estimation.raw.track import TrackFix
+from modelserver.estimation.raw.stamps import StampMonitor, StampVerdict
+from modelserver.estimation.raw.track import TrackFix, compute_growth
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.estimation.settings import FixSettings
 from modelserver.geometry.model import Model
@@ -100,22 +106,22 @@ def test_a_mount_that_the_model_lacks_is_an_error():
 
 
 def verdicts(*seconds):
-    stamps, found = Stamps(), []
+    stamps, found = StampMonitor(), []
     for t in seconds:
-        stamps, verdict = stamps.take(round(t * SECOND), S)
+        stamps, verdict = stamps.update(round(t * SECOND), S)
         found.append(verdict)
     return found
 
 
 def test_stamps_in_order_repeated_and_late():
-    good, duplicate, order = Verdict.GOOD, Verdict.DUPLICATE, Verdict.ORDER
+    good, duplicate, order = StampVerdict.GOOD, StampVerdict.DUPLICATE, StampVerdict.OUT_OF_SEQUENCE
     assert verdicts(5.0, 5.1, 5.1, 5.05, 5.2, 14.9) == [good, good, duplicate, order, good, good]
 
 
 def test_one_odd_stamp_is_the_samples_fault_three_in_a_row_the_clocks():
-    good, order, future = Verdict.GOOD, Verdict.ORDER, Verdict.FUTURE
+    good, order, future = StampVerdict.GOOD, StampVerdict.OUT_OF_SEQUENCE, StampVerdict.FUTURE
     assert verdicts(100.0, 50.0, 100.1) == [good, order, good]
-    assert verdicts(100.0, 50.0, 50.1, 50.2, 50.3) == [good, order, order, Verdict.STEPPED_BACK, good]
+    assert verdicts(100.0, 50.0, 50.1, 50.2, 50.3) == [good, order, order, StampVerdict.STEPPED_BACK, good]
     assert verdicts(100.0, 50.0, 40.0, 30.0) == [good, order, order, order]
     assert verdicts(100.0, 500.0, 100.1, 100.2) == [good, future, good, good]
     assert verdicts(100.0, 500.0, 500.1, 500.2, 500.3) == [good, future, future, good, good]
@@ -179,18 +185,18 @@ angles = st.floats(-1.4, 1.4)
 def test_up_holds_roll_and_pitch(roll, pitch, yaw):
     R = Rotation.from_euler("xyz", [roll, pitch, yaw])
     up = tuple(R.inv().apply([0.0, 0.0, 1.0]))
-    assert roll_pitch(up) == pytest.approx((roll, pitch), abs=1e-9)
-    assert attitude(up, yaw) == pytest.approx(so3.from_rpy(roll, pitch, yaw), abs=1e-9)
+    assert compute_roll_pitch(up) == pytest.approx((roll, pitch), abs=1e-9)
+    assert compute_attitude(up, yaw) == pytest.approx(so3.from_rpy(roll, pitch, yaw), abs=1e-9)
     level = Rotation.from_euler("xyz", [roll, pitch, 0.0]).apply([1.0, -2.0, 3.0])
-    assert levelled(up, (1.0, -2.0, 3.0)) == pytest.approx(tuple(level), abs=1e-9)
+    assert to_level_axes(up, (1.0, -2.0, 3.0)) == pytest.approx(tuple(level), abs=1e-9)
 
 
 @given(angles, angles, st.tuples(*[st.floats(-1, 1)] * 3))
 def test_motion_turns_as_a_rotation_does(roll, pitch, rate):
     R = Rotation.from_euler("xyz", [roll, pitch, 0.4])
-    motion = Motion(0, yaw=0.4, up=tuple(R.inv().apply([0.0, 0.0, 1.0])))
+    motion = RawMotion(0, yaw=0.4, up=tuple(R.inv().apply([0.0, 0.0, 1.0])))
     for i in range(1, 21):
-        motion = motion.advanced(i * 1000, rate, S)
+        motion = motion.advance(i * 1000, rate, S)
     expected = R * Rotation.from_rotvec([each * 0.02 for each in rate])
     got = Rotation.from_quat(motion.pose.wxyz, scalar_first=True)
     assert (expected.inv() * got).magnitude() < 2e-3  # 1 ms Euler steps of yaw
@@ -198,12 +204,12 @@ def test_motion_turns_as_a_rotation_does(roll, pitch, rate):
 
 @given(st.floats(-5, 5), st.floats(-0.5, 0.5), st.floats(0.3, 8.0), st.integers(1, 50))
 def test_one_long_step_ends_where_many_short_ones_do(speed, turn, seconds, n):
-    motion = Motion(START, rate=(0.0, 0.0, turn), speed=speed, speed_utime=START)
-    whole = motion.advanced(START + round(seconds * 1e6), motion.rate, S)
-    parts = motion.advanced(START + round(S.rate_hold * 1e6), motion.rate, S)
+    motion = RawMotion(START, rate=(0.0, 0.0, turn), speed=speed, speed_utime=START)
+    whole = motion.advance(START + round(seconds * 1e6), motion.rate, S)
+    parts = motion.advance(START + round(S.rate_hold * 1e6), motion.rate, S)
     for i in range(1, n + 1):
         t = START + round((S.rate_hold + (seconds - S.rate_hold) * i / n) * 1e6)
-        parts = parts.advanced(t, (0.0, 0.0, 0.0), S)
+        parts = parts.advance(t, (0.0, 0.0, 0.0), S)
     assert (parts.x, parts.y, parts.yaw) == pytest.approx((whole.x, whole.y, whole.yaw), abs=1e-6)
     assert math.hypot(whole.x, whole.y) <= abs(speed) * 2.0 * S.gps_timeout + 1e-9
 
@@ -224,7 +230,7 @@ def inertial(**changes):
     ],
 )
 def test_a_bad_inertial_sample_is_refused_in_a_word(changes, word):
-    assert read(inertial(**changes), MOUNTS.X_base_imu) == word
+    assert read_raw_imu(inertial(**changes), MOUNTS.X_base_imu) == word
 
 
 @given(angles, angles, st.floats(-3, 3), st.sampled_from((OrientationReference.ENU, OrientationReference.NED)))
@@ -238,7 +244,7 @@ def test_gravity_is_read_from_the_device_whatever_its_reference_and_mount(roll, 
     sample = inertial(
         orientation=tuple(R.as_quat(scalar_first=True)), orientation_reference=reference, specific_force=force
     )
-    found = read(sample, MOUNTS.X_base_imu)
+    found = read_raw_imu(sample, MOUNTS.X_base_imu)
     assert found.up == pytest.approx(tuple(R_world_base.inv().apply([0, 0, 1])), abs=1e-9)
     assert found.rate == pytest.approx(tuple(R_base_imu.apply([0.1, 0.2, 0.3])), abs=1e-12)
 
@@ -250,19 +256,19 @@ def test_a_device_whose_vertical_contradicts_its_specific_force_is_refused():
     level = tuple(R.as_quat(scalar_first=True))
     right = inertial(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
     wrong = replace(right, orientation_reference=OrientationReference.NED)
-    assert read(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
-    assert read(wrong, MOUNTS.X_base_imu) == "orientation"
+    assert read_raw_imu(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
+    assert read_raw_imu(wrong, MOUNTS.X_base_imu) == "orientation"
     # hard braking tilts the force, but not that far; a shock is not near g and says nothing of where up is
     braking = tuple(R.inv().apply([-6.0, 0.0, 9.8]))
-    assert read(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
+    assert read_raw_imu(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
     shock = tuple(R.inv().apply([0.0, 0.0, -30.0]))
-    assert read(replace(right, specific_force=shock), MOUNTS.X_base_imu).up is not None
+    assert read_raw_imu(replace(right, specific_force=shock), MOUNTS.X_base_imu).up is not None
 
 
 @pytest.mark.parametrize("q", [(0.0,) * 4, (math.nan,) * 4, (2.0, 0.0, 0.0, 0.0)])
 def test_an_orientation_that_is_no_rotation_is_left_out(q):
     sample = inertial(orientation=q, orientation_reference=OrientationReference.ENU)
-    assert read(sample, MOUNTS.X_base_imu).up is None
+    assert read_raw_imu(sample, MOUNTS.X_base_imu).up is None
 
 
 # --- heading ------------------------------------------------------------------------------------------------
@@ -271,57 +277,57 @@ KNOWN = Heading(True, 0.5, 0.01, 0.0, 1e-6)
 
 
 def test_the_first_course_sets_the_heading():
-    heading, met = Heading().met(2.0, 0.02, S)
-    assert met is Course.ANEW
-    assert (heading.known, heading.offset, heading.variance) == (True, 2.0, 0.02)
+    heading, met = Heading().update_course(2.0, 0.02, S)
+    assert met is CourseResult.RESET
+    assert (heading.is_known, heading.offset, heading.variance) == (True, 2.0, 0.02)
 
 
 def test_courses_draw_heading_by_their_weight_across_the_cut():
-    heading, met = replace(KNOWN, offset=math.pi - 0.05).met(-math.pi + 0.05, 0.01, S)
-    assert met is Course.TAKEN
+    heading, met = replace(KNOWN, offset=math.pi - 0.05).update_course(-math.pi + 0.05, 0.01, S)
+    assert met is CourseResult.USED
     assert abs(heading.offset) == pytest.approx(math.pi)
     assert heading.variance == pytest.approx(0.005)
 
 
 def test_a_course_half_a_turn_off_is_driving_backwards():
-    heading, met = KNOWN.met(0.5 + math.pi + 0.1, 0.01, S)
-    assert met is Course.BACKWARDS
+    heading, met = KNOWN.update_course(0.5 + math.pi + 0.1, 0.01, S)
+    assert met is CourseResult.BACKWARDS
     assert heading.offset == pytest.approx(0.55)
 
 
 def test_a_course_that_fits_neither_is_refused_until_a_run_of_them_agrees():
     heading = KNOWN
     for i in range(S.course_rejections - 1):
-        heading, met = heading.met(0.5 + math.pi / 2, 0.001, S)
-        assert (met, heading.refused, heading.offset) == (Course.REFUSED, i + 1, 0.5)
-    heading, met = heading.met(0.5 + math.pi / 2, 0.001, S)
-    assert met is Course.ANEW
+        heading, met = heading.update_course(0.5 + math.pi / 2, 0.001, S)
+        assert (met, heading.num_rejected, heading.offset) == (CourseResult.REJECTED, i + 1, 0.5)
+    heading, met = heading.update_course(0.5 + math.pi / 2, 0.001, S)
+    assert met is CourseResult.RESET
     assert heading.offset == pytest.approx(0.5 + math.pi / 2)
 
 
 def test_refused_courses_that_disagree_are_no_run():
     heading = KNOWN
     for i in range(20):
-        heading, met = heading.met(0.5 + (1 if i % 2 else -1) * math.pi / 2, 0.001, S)
-        assert met is Course.REFUSED
+        heading, met = heading.update_course(0.5 + (1 if i % 2 else -1) * math.pi / 2, 0.001, S)
+        assert met is CourseResult.REJECTED
 
 
 def test_standing_tells_the_bias_and_the_bias_the_drift():
     heading = replace(KNOWN, bias_variance=S.gyro_bias_sigma**2)
     true_bias = 0.01
     for _ in range(1000):  # 20 s
-        heading = heading.carried(0.02, S).stood(true_bias - heading.bias, S.gyro_noise**2 / 0.02)
+        heading = heading.propagate(0.02, S).update_stationary(true_bias - heading.bias, S.gyro_noise**2 / 0.02)
     assert heading.bias == pytest.approx(true_bias, abs=1e-4)
     settled = heading
     grown = settled
     for _ in range(600):
-        grown = grown.carried(0.1, S)
+        grown = grown.propagate(0.1, S)
     assert math.degrees(grown.sigma - settled.sigma) < 2.0  # the report: 1 to 2 deg a minute
 
 
 def test_unmeasured_turns_make_heading_unsure_but_never_more_than_unknown():
-    assert KNOWN.carried(1.0, S, measured=False).sigma > KNOWN.carried(1.0, S).sigma
-    assert KNOWN.carried(1e12, S, measured=False).variance == pytest.approx(math.pi**2 / 3)
+    assert KNOWN.propagate(1.0, S, measured=False).sigma > KNOWN.propagate(1.0, S).sigma
+    assert KNOWN.propagate(1e12, S, measured=False).variance == pytest.approx(math.pi**2 / 3)
 
 
 # --- track --------------------------------------------------------------------------------------------------
@@ -344,26 +350,26 @@ def path_fixes(speed, turn, offset, n=12, dt=0.5, lever=0.4 - 0.3j):
 @given(st.floats(0.5, 10), st.floats(-0.4, 0.4).filter(lambda w: abs(w) > 1e-3) | st.just(0.0), st.floats(-3, 3))
 def test_speed_and_course_of_an_arc_are_exact(speed, turn, offset):
     made = path_fixes(speed, turn, offset)
-    found = track.course(made, None, S)
+    found = track.fit_course(made, None, S)
     assert found is not None
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=0.05)  # the arm's phase is iterated
-    found = track.course(made, cmath.rect(1.0, offset), S)
+    found = track.fit_course(made, cmath.rect(1.0, offset), S)
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=1e-9)
-    slope = track.best_speed(made, cmath.rect(1.0, offset), S)
+    slope = track.fit_best_speed(made, cmath.rect(1.0, offset), S)
     assert abs(slope.velocity) == pytest.approx(speed, abs=1e-6)
 
 
 def test_a_sure_receiver_tells_speed_from_a_short_stretch_and_an_unsure_one_from_a_long():
-    sure = track.best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
-    unsure = track.best_speed(tuple(replace(f, sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
+    sure = track.fit_best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
+    unsure = track.fit_best_speed(tuple(replace(f, sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
     assert sure.seconds < unsure.seconds <= S.speed_window
 
 
 def test_a_stretch_is_bounded():
     fixes = ()
     for i in range(500):
-        fixes = track.kept(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
-        assert len(fixes) <= track.MOST_FIXES
+        fixes = track.append_fix(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
+        assert len(fixes) <= track.MAX_TRACK_FIXES
         assert fixes[-1].utime - fixes[0].utime <= 30 * SECOND
 
 
@@ -397,24 +403,24 @@ def test_an_origin_is_found_on_the_move_but_not_in_scattered_fixes():
 
 
 def test_bounds_are_passed_with_the_stated_probability():
-    horizontal, heading = bounds.factors(1e-3)
+    horizontal, heading = bounds.get_factors(1e-3)
     assert math.exp(-(horizontal**2) / 2) == pytest.approx(1e-3)
     assert math.erfc(heading / math.sqrt(2)) == pytest.approx(1e-3)
 
 
 def test_the_time_to_the_limit_is_where_the_bound_meets_it():
     variance, sigma_v = 4.0, 0.3
-    t = bounds.seconds_to_horizontal_limit(variance, 0.0, sigma_v, S)
-    bound = bounds.factors(S.risk)[0] * math.sqrt(variance + bounds.grown(t, sigma_v, S))
+    t = bounds.compute_seconds_to_limit(variance, 0.0, sigma_v, S)
+    bound = bounds.get_factors(S.risk)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
     assert bound == pytest.approx(S.horizontal_limit)
-    assert bounds.seconds_to_horizontal_limit(1e6, 0.0, sigma_v, S) == 0.0
+    assert bounds.compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
 
 
 def test_an_error_of_yaw_moves_the_base_about_the_antenna():
     good = gate.evaluate_fix(fix(), S)
-    cov = bounds.covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
+    cov = bounds.compute_covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
     assert cov[0] == pytest.approx(good.east_variance + 0.16)
     assert cov[7] == pytest.approx(good.north_variance + 0.09)
     assert cov[1] == cov[6] == pytest.approx(0.12)
     assert (cov[5], cov[11]) == pytest.approx((0.04, 0.03))
-    assert bounds.longest(cov[0], cov[7], cov[1]) == pytest.approx(good.east_variance + 0.25)
+    assert bounds.compute_longest_variance(cov[0], cov[7], cov[1]) == pytest.approx(good.east_variance + 0.25)
