@@ -10,7 +10,7 @@ import numpy as np
 from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
-from modelserver.estimation.filter.eskf import Nav
+from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.sensor_rig import Kinematics, Mounts, SensorRig
@@ -62,8 +62,8 @@ def rig(
     )
 
 
-def some_nav(setup: Setup, seed: int, *, extras: bool = True) -> Nav:
-    """A state of anything, the further states 0 unless wanted; the fixes' latency is always 0."""
+def some_nav(setup: Setup, seed: int, *, extras: bool = True) -> NavState:
+    """A random state; its additional states are 0 without `extras`, and the latency of fixes is always 0."""
     rng = np.random.default_rng(seed)
     names = setup.layout.extra_names
     values = rng.uniform(-0.1, 0.1, len(names)) if extras else np.zeros(len(names))
@@ -73,7 +73,7 @@ def some_nav(setup: Setup, seed: int, *, extras: bool = True) -> Nav:
         return a, b, c
 
     roll, pitch, _ = three(0.4)
-    return Nav(
+    return NavState(
         START_UTIME,
         three(40.0),
         three(6.0),
@@ -88,7 +88,7 @@ def some_nav(setup: Setup, seed: int, *, extras: bool = True) -> Nav:
 
 
 def drive(seconds: float, seed: int = 3, imu_hz: float = 50.0, **given: object) -> tuple[Simulation, list[Event]]:
-    """An eight after three seconds at rest, and what arrives in its first seconds."""
+    """A figure eight after three stationary seconds, and the samples of its first seconds."""
     options = {
         "gps_frame": ANTENNA,
         "imu_frame": IMU,
@@ -116,9 +116,9 @@ def process_all(localizer: FilterLocalizer, samples: list[Event]) -> FilterLocal
 
 
 def same(a: object, b: object) -> bool:
-    """Whether two values are the same to the last bit, arrays by their bytes."""
+    """Return whether two values are the same to the last bit, arrays by their bytes."""
     if callable(a) and callable(b):
-        # what is worked out when it is called
+        # values that are computed when they are called
         return same(a(), b())
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.shape == b.shape and a.tobytes() == b.tobytes()

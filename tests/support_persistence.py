@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from modelserver.estimation.filter.persistence import named
+from modelserver.estimation.filter.persistence import get_setup_hash
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import PersistedPose, PersistedState
 from tests.support_filter import RIG
@@ -35,7 +35,7 @@ PERSISTED = PersistedState(
     UTIME,
     5_000_000_000,
     "",
-    named(SETUP),
+    get_setup_hash(SETUP),
     UTIME - 10_000,
     SETUP.layout.names,
     (0.001, -0.002, 0.003),
