@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 EXEMPT = (
     "modelserver/estimation/raw/",
-    "tests/unit/estimation/",
+    "tests/unit/estimation/test_raw_",
     "tests/unit/test_language.py",
     "lcmtypes/mslcm/",
 )

@@ -1,4 +1,4 @@
-"""Every measurement against the state: nothing left where state and sample agree, and its Jacobian by differences."""
+"""Every measurement model: residual 0 where state and sample agree, and its Jacobian by finite differences."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from support_cart import (
 )
 
 from modelserver.earth.geodesy import geodetic_from_ecef
+from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.measurements import (
     REGISTRY,
     Innovation,
@@ -30,7 +31,6 @@ from modelserver.estimation.filter.measurements import (
     constraints,
 )
 from modelserver.estimation.filter.measurements.gnss import read_velocity
-from modelserver.estimation.filter.eskf import Nav, cross
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.magnetometer import magnetic_field
@@ -51,7 +51,7 @@ from modelserver.messages import (
 )
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import Pose, so3
-from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.so3 import Quaternion, Vector3, cross
 
 SETTINGS = FilterSettings(use_magnetometer=True)
 FOUR = tuple(WHEELS)
@@ -61,10 +61,10 @@ SEEDS = range(4)
 DT = 0.4
 
 
-# --- what each sensor would say of a state ------------------------------------------------------------------
+# --- what each sensor measures in a state -------------------------------------------------------------------
 
 
-def fix(nav: Nav, the_rig: SensorRig, **more: object) -> GpsSample:
+def create_fix(nav: NavState, the_rig: SensorRig, **more: object) -> GpsSample:
     lever = the_rig.lever_arm(ANTENNA)
     latitude, longitude, height = geodetic_from_ecef(SITE.to_ecef(nav.point(lever)))
     east, north, _ = (
@@ -79,7 +79,7 @@ def fix(nav: Nav, the_rig: SensorRig, **more: object) -> GpsSample:
     )  # fmt: skip
 
 
-def course(nav: Nav, the_rig: SensorRig) -> GpsSample:
+def create_course(nav: NavState, the_rig: SensorRig) -> GpsSample:
     lever = the_rig.lever_arm(ANTENNA)
     latitude, longitude, _ = geodetic_from_ecef(SITE.to_ecef(nav.point(lever)))
     x, y, _ = nav.point_velocity(lever)
@@ -88,7 +88,9 @@ def course(nav: Nav, the_rig: SensorRig) -> GpsSample:
     )
 
 
-def inertial(nav: Nav, the_rig: SensorRig, reference: OrientationReference = OrientationReference.ENU) -> ImuSample:
+def create_imu_sample(
+    nav: NavState, the_rig: SensorRig, reference: OrientationReference = OrientationReference.ENU
+) -> ImuSample:
     mount = model().get_transformation(IMU, "Cart:Base").pose.wxyz
     q = so3.multiply(nav.attitude, mount)
     if reference is OrientationReference.NED:
@@ -107,51 +109,54 @@ def inertial(nav: Nav, the_rig: SensorRig, reference: OrientationReference = Ori
     )
 
 
-def steering(the_rig: SensorRig, name: str) -> float:
+def get_steering(the_rig: SensorRig, name: str) -> float:
     return 0.3 if the_rig.kinematics == "ackermann" and name in STEERED else 0.0
 
 
-def speeds(nav: Nav, the_rig: SensorRig, names: tuple[str, ...]) -> dict[str, float]:
-    """How fast each wheel rolls by rigid-body motion, in which the further states have no part."""
+def compute_speeds(nav: NavState, the_rig: SensorRig, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the speed of each wheel by rigid-body motion, without the additional states."""
     found = {}
     for name in names:
         contact = the_rig.pose(WHEELS[name]).xyz
-        v = np.add(nav.body_velocity(the_rig.base), np.cross(nav.turn_rate, contact))
-        found[name] = math.cos(steering(the_rig, name)) * v[0] + math.sin(steering(the_rig, name)) * v[1]
+        v = np.add(nav.body_velocity(the_rig.base), np.cross(nav.angular_rate, contact))
+        found[name] = math.cos(get_steering(the_rig, name)) * v[0] + math.sin(get_steering(the_rig, name)) * v[1]
     return found
 
 
-def wheels(nav: Nav, the_rig: SensorRig, names: tuple[str, ...] = ("RL", "RR")) -> WheelsSample:
+def create_wheels(nav: NavState, the_rig: SensorRig, names: tuple[str, ...] = ("RL", "RR")) -> WheelsSample:
     return WheelsSample(
         HEADER,
-        tuple(WheelSample(n, speed=v, steering=steering(the_rig, n)) for n, v in speeds(nav, the_rig, names).items()),
+        tuple(
+            WheelSample(n, speed=v, steering=get_steering(the_rig, n))
+            for n, v in compute_speeds(nav, the_rig, names).items()
+        ),
     )
 
 
-def in_enu(nav: Nav, the_rig: SensorRig, frame: str) -> Pose:
-    """A frame's pose in World:ENU, by way of the earth's centre."""
+def find_pose_in_enu(nav: NavState, the_rig: SensorRig, frame: str) -> Pose:
+    """Return a frame's pose in World:ENU, through earth-centered coordinates."""
     turn = so3.conjugate(SITE.rotation_of(GEODESY.tangent))
     place = GEODESY.tangent.from_ecef(SITE.to_ecef(nav.point(the_rig.lever_arm(frame))))
     return Pose(place, so3.multiply(turn, so3.multiply(nav.attitude, the_rig.pose(frame).wxyz)))
 
 
-def pose(nav: Nav, the_rig: SensorRig, reference: str) -> AbsolutePoseSample:
-    X = in_enu(nav, the_rig, CAMERA)
+def create_pose(nav: NavState, the_rig: SensorRig, reference: str) -> AbsolutePoseSample:
+    X = find_pose_in_enu(nav, the_rig, CAMERA)
     X = GEODESY.pose_in_utm(X) if reference == "World:UTM" else X
     return AbsolutePoseSample(HEADER, CAMERA, reference, X.xyz, X.wxyz)
 
 
-def distance(nav: Nav, the_rig: SensorRig) -> RangeSample:
+def create_range(nav: NavState, the_rig: SensorRig) -> RangeSample:
     beacon = (300.0, -150.0, 20.0)
-    place = in_enu(nav, the_rig, CAMERA).xyz
+    place = find_pose_in_enu(nav, the_rig, CAMERA).xyz
     return RangeSample(HEADER, CAMERA, "b", beacon, "World:ENU", math.dist(place, beacon), 0.2)
 
 
-def moved(nav: Nav, the_rig: SensorRig) -> RelativePoseSample:
-    """The frame's way in a tenth of a second at constant twist, by small steps."""
+def create_relative_pose(nav: NavState, the_rig: SensorRig) -> RelativePoseSample:
+    """Return the motion of the frame in a tenth of a second at constant twist, by small steps."""
     n, dt = 400, 0.1
     X_BF = the_rig.pose(CAMERA)
-    v, w = nav.body_velocity(the_rig.base), nav.turn_rate
+    v, w = nav.body_velocity(the_rig.base), nav.angular_rate
     step = Pose(
         (v[0] * dt / n, v[1] * dt / n, v[2] * dt / n), so3.exponential((w[0] * dt / n, w[1] * dt / n, w[2] * dt / n))
     )
@@ -165,36 +170,36 @@ def moved(nav: Nav, the_rig: SensorRig) -> RelativePoseSample:
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of measurement, of which vehicle, and its sample; `left` is what a sound one may leave."""
+    """A kind of measurement, its vehicle and its sample; `tolerance` is that of the residual."""
 
     kind: str
     sample: object
     rig: SensorRig
-    left: float = 1e-7
+    tolerance: float = 1e-7
 
 
 PAIR, SKID, ACKERMANN = rig(), rig("skid_steer", FOUR), rig("ackermann", ("FL", "FR"))
 CASES = {
-    "position": Case("gps_position", fix, PAIR, 2e-7),
-    "height": Case("gps_height", fix, PAIR, 2e-7),
-    "velocity": Case("gps_velocity", fix, PAIR),
-    "course and speed": Case("gps_velocity", course, PAIR),
-    "baseline": Case("gps_baseline", fix, PAIR),
-    "tilt": Case("imu_tilt", inertial, PAIR),
-    "tilt ned": Case("imu_tilt", lambda nav, the_rig: inertial(nav, the_rig, OrientationReference.NED), PAIR),
-    "yaw": Case("imu_yaw", inertial, PAIR),
-    "magnetometer": Case("magnetometer", inertial, PAIR),
-    "wheels": Case("wheel_speed", wheels, PAIR),
-    "wheels that skid": Case("wheel_speed", lambda nav, the_rig: wheels(nav, the_rig, FOUR), SKID),
-    "wheels that steer": Case("wheel_speed", lambda nav, the_rig: wheels(nav, the_rig, ("FL", "FR")), ACKERMANN),
-    "pose in ENU": Case("absolute_pose", lambda nav, the_rig: pose(nav, the_rig, "World:ENU"), PAIR, 2e-7),
-    "pose in UTM": Case("absolute_pose", lambda nav, the_rig: pose(nav, the_rig, "World:UTM"), PAIR, 1e-5),
-    "range": Case("range", distance, PAIR, 2e-7),
-    "relative pose": Case("relative_pose", moved, PAIR, 1e-3),
+    "position": Case("gps_position", create_fix, PAIR, 2e-7),
+    "height": Case("gps_height", create_fix, PAIR, 2e-7),
+    "velocity": Case("gps_velocity", create_fix, PAIR),
+    "course and speed": Case("gps_velocity", create_course, PAIR),
+    "baseline": Case("gps_baseline", create_fix, PAIR),
+    "tilt": Case("imu_tilt", create_imu_sample, PAIR),
+    "tilt ned": Case("imu_tilt", lambda nav, the_rig: create_imu_sample(nav, the_rig, OrientationReference.NED), PAIR),
+    "yaw": Case("imu_yaw", create_imu_sample, PAIR),
+    "magnetometer": Case("magnetometer", create_imu_sample, PAIR),
+    "wheels": Case("wheel_speed", create_wheels, PAIR),
+    "wheels that skid": Case("wheel_speed", lambda nav, the_rig: create_wheels(nav, the_rig, FOUR), SKID),
+    "wheels that steer": Case("wheel_speed", lambda nav, the_rig: create_wheels(nav, the_rig, ("FL", "FR")), ACKERMANN),
+    "pose in ENU": Case("absolute_pose", lambda nav, the_rig: create_pose(nav, the_rig, "World:ENU"), PAIR, 2e-7),
+    "pose in UTM": Case("absolute_pose", lambda nav, the_rig: create_pose(nav, the_rig, "World:UTM"), PAIR, 1e-5),
+    "range": Case("range", create_range, PAIR, 2e-7),
+    "relative pose": Case("relative_pose", create_relative_pose, PAIR, 1e-3),
 }
 
 
-def prepared(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, MeasurementContext, Sample]:
+def prepare(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, MeasurementContext, Sample]:
     setup = Setup(case.rig, SETTINGS)
     nav = some_nav(setup, seed, extras=extras)
     sample = case.sample(nav, case.rig)  # type: ignore[operator]
@@ -202,130 +207,134 @@ def prepared(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, Measu
     return measurement, MeasurementContext(nav, setup.layout, SETTINGS, case.rig, SITE, GEODESY), sample
 
 
-def compared(measurement: Measurement, scene: MeasurementContext, sample: Sample) -> Innovation:
-    found = measurement.compare(scene, sample)
+def evaluate(measurement: Measurement, context: MeasurementContext, sample: Sample) -> Innovation:
+    found = measurement.evaluate(context, sample)
     assert isinstance(found, Innovation), found
     return found
 
 
-def differences(residual: object, nav: Nav, size: int) -> np.ndarray:
-    """The Jacobian by differences: what is put into the state is taken from the residual."""
+def differentiate(residual: object, nav: NavState, size: int) -> np.ndarray:
+    """Return the Jacobian by finite differences: what is injected into the state is subtracted from the residual."""
     columns = []
     for k in range(size):
         error = np.zeros(size)
         error[k] = STEP
-        ahead = residual(nav.injected(error, nav.covariance))  # type: ignore[operator]
-        behind = residual(nav.injected(-error, nav.covariance))  # type: ignore[operator]
+        ahead = residual(nav.inject(error, nav.covariance))  # type: ignore[operator]
+        behind = residual(nav.inject(-error, nav.covariance))  # type: ignore[operator]
         columns.append((behind - ahead) / (2.0 * STEP))
     return np.array(columns).T
 
 
-def test_given_the_registered_measurements_then_each_has_its_case_here():
+def test_given_the_registered_measurements_then_each_has_a_case_here():
     assert {case.kind for case in CASES.values()} == set(REGISTRY)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", CASES)
-def test_given_a_sample_of_the_very_state_when_compared_then_nothing_is_left(name, seed):
+def test_given_a_sample_of_the_state_itself_then_the_residual_is_0(name, seed):
     case = CASES[name]
-    found = compared(*prepared(case, seed, extras=False))
-    assert np.abs(found.residual).max() < case.left
+    found = evaluate(*prepare(case, seed, extras=False))
+    assert np.abs(found.residual).max() < case.tolerance
     assert np.linalg.eigvalsh(found.noise)[0] > 0.0
     assert found.noise == pytest.approx(found.noise.T, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", CASES)
-def test_given_a_state_when_it_is_off_a_little_then_the_residual_goes_as_the_jacobian_says(name, seed):
-    measurement, scene, sample = prepared(CASES[name], seed, extras=True)
-    H = compared(measurement, scene, sample).jacobian
-    by_differences = differences(
-        lambda nav: compared(measurement, scene._replace(nav=nav), sample).residual, scene.nav, scene.layout.size
+def test_given_a_small_error_of_the_state_then_the_residual_follows_the_jacobian(name, seed):
+    measurement, context, sample = prepare(CASES[name], seed, extras=True)
+    H = evaluate(measurement, context, sample).jacobian
+    numerical = differentiate(
+        lambda nav: evaluate(measurement, context._replace(nav=nav), sample).residual, context.nav, context.layout.size
     )
-    assert by_differences == pytest.approx(H, abs=1e-5)
+    assert numerical == pytest.approx(H, abs=1e-5)
     assert np.abs(H).max() > 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", ["wheels", "wheels that skid", "wheels that steer"])
-def test_given_wheels_by_their_travel_when_the_motion_is_steady_then_residual_and_jacobian_are_those_of_speeds(
-    name, seed
-):
-    measurement, scene, speed = prepared(CASES[name], seed, extras=True)
+def test_given_wheels_that_measure_travel_in_steady_motion_then_residual_and_jacobian_are_those_of_speeds(name, seed):
+    measurement, context, speed = prepare(CASES[name], seed, extras=True)
     assert isinstance(speed, WheelsSample)
     before = WheelsSample(
         SensorHeader(START_UTIME - round(DT * 1e6), "test"),
         tuple(WheelSample(w.name, travel=7.0) for w in speed.wheels),
     )
-    way = WheelsSample(
+    travelled = WheelsSample(
         speed.header, tuple(WheelSample(w.name, travel=7.0 + DT * w.speed, steering=w.steering) for w in speed.wheels)
     )
 
-    def steady(nav: Nav) -> MeasurementContext:
-        rolled, turned = nav.body_velocity(scene.rig.base), nav.turn_rate
+    def create_steady_context(nav: NavState) -> MeasurementContext:
+        velocity, rate = nav.body_velocity(context.rig.base), nav.angular_rate
         nav = nav._replace(
-            rolled=(rolled[0] * DT, rolled[1] * DT, rolled[2] * DT),
-            turned=(turned[0] * DT, turned[1] * DT, turned[2] * DT),
+            travel=(velocity[0] * DT, velocity[1] * DT, velocity[2] * DT),
+            rotation=(rate[0] * DT, rate[1] * DT, rate[2] * DT),
         )
-        return scene._replace(nav=nav, age=DT, before=before)
+        return context._replace(nav=nav, age=DT, previous=before)
 
-    found = compared(measurement, steady(scene.nav), way)
-    assert found.residual == pytest.approx(compared(measurement, scene, speed).residual, abs=1e-9)
-    by_differences = differences(
-        lambda nav: compared(measurement, steady(nav), way).residual, scene.nav, scene.layout.size
+    found = evaluate(measurement, create_steady_context(context.nav), travelled)
+    assert found.residual == pytest.approx(evaluate(measurement, context, speed).residual, abs=1e-9)
+    numerical = differentiate(
+        lambda nav: evaluate(measurement, create_steady_context(nav), travelled).residual,
+        context.nav,
+        context.layout.size,
     )
-    assert by_differences == pytest.approx(found.jacobian, abs=1e-5)
+    assert numerical == pytest.approx(found.jacobian, abs=1e-5)
 
 
-# --- what is known without a sensor -------------------------------------------------------------------------
+# --- constraints --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_given_a_constraint_when_the_state_is_off_a_little_then_the_residual_goes_as_its_jacobian_says(seed):
+def test_given_a_small_error_of_the_state_then_the_residual_of_a_constraint_follows_its_jacobian(seed):
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, seed)
-    scene = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)
+    context = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)
     rolling = Setup(rig(wheels=()), SETTINGS)
     bare = MeasurementContext(some_nav(rolling, seed), rolling.layout, SETTINGS, rolling.rig)
-    for each, know in (
-        (scene, lambda s: constraints.non_holonomic(s, 0.1)),
+    for each, constrain in (
+        (context, lambda s: constraints.non_holonomic(s, 0.1)),
         (bare, lambda s: constraints.non_holonomic(s, 0.1)),
-        (scene, lambda s: constraints.zero_velocity(s, 0.1)),
-        (scene, lambda s: constraints.zero_rate(s, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 1.0)),
+        (context, lambda s: constraints.zero_velocity(s, 0.1)),
+        (context, lambda s: constraints.zero_rate(s, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 1.0)),
     ):
-        by_differences = differences(
-            lambda nav, each=each, know=know: know(each._replace(nav=nav)).residual, each.nav, each.layout.size
+        numerical = differentiate(
+            lambda nav, each=each, constrain=constrain: constrain(each._replace(nav=nav)).residual,
+            each.nav,
+            each.layout.size,
         )
-        assert by_differences == pytest.approx(know(each).jacobian, abs=1e-5)
+        assert numerical == pytest.approx(constrain(each).jacobian, abs=1e-5)
 
 
-def test_given_a_vehicle_that_does_what_it_must_when_compared_then_nothing_is_left():
+def test_given_a_vehicle_that_moves_as_constrained_then_the_residuals_are_0():
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, 3, extras=False)
     forward = so3.rotate(nav.attitude, (3.0, 0.0, 0.0))
-    arm = so3.rotate(nav.attitude, cross(nav.turn_rate, PAIR.base))
+    arm = so3.rotate(nav.attitude, cross(nav.angular_rate, PAIR.base))
     rolling = nav._replace(velocity=(forward[0] - arm[0], forward[1] - arm[1], forward[2] - arm[2]))
-    scene = MeasurementContext(rolling, setup.layout, SETTINGS, PAIR)
-    assert constraints.non_holonomic(scene, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
-    standing = scene._replace(nav=nav._replace(velocity=(0.0, 0.0, 0.0)))
-    assert constraints.zero_velocity(standing, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
+    context = MeasurementContext(rolling, setup.layout, SETTINGS, PAIR)
+    assert constraints.non_holonomic(context, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
+    stationary = context._replace(nav=nav._replace(velocity=(0.0, 0.0, 0.0)))
+    assert constraints.zero_velocity(stationary, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
     earth = (0.0, 4.7e-5, 5.6e-5)
-    felt = np.add(nav.gyro_bias, so3.rotate(so3.conjugate(nav.attitude), earth))
-    assert constraints.zero_rate(scene, tuple(felt), earth, 1.0).residual == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    measured = np.add(nav.gyro_bias, so3.rotate(so3.conjugate(nav.attitude), earth))
+    assert constraints.zero_rate(context, tuple(measured), earth, 1.0).residual == pytest.approx(
+        [0.0, 0.0, 0.0], abs=1e-12
+    )
 
 
-# --- what is refused, and what is taken instead -------------------------------------------------------------
+# --- what is rejected, and what is used instead -------------------------------------------------------------
 
 
-def refusal(kind: str, sample: Sample, **scene: object) -> str | Innovation:
+def evaluate_sample(kind: str, sample: Sample, **given: object) -> str | Innovation:
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, 1)
-    given = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)._replace(**scene)
+    context = MeasurementContext(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)._replace(**given)
     (measurement,) = (each for each in setup.measurements[type(sample)] if each.kind == kind)
-    return measurement.compare(given, sample)
+    return measurement.evaluate(context, sample)
 
 
-def turned(q: Quaternion) -> ImuSample:
+def create_oriented_sample(q: Quaternion) -> ImuSample:
     return ImuSample(HEADER, (0.0,) * 3, (0.0,) * 3, None, q, OrientationReference.ENU)
 
 
@@ -340,8 +349,8 @@ NAN3: Vector3 = (math.nan, 0.0, 0.0)
         ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=math.nan),)), "nan"),
         ("wheel_speed", WheelsSample(HEADER, (WheelSample("nobody", speed=1.0),)), "names"),
         ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=1e3),)), "range"),
-        ("imu_tilt", turned((0.0, 0.0, 0.0, 0.0)), "orientation"),
-        ("imu_tilt", turned((math.nan, 0.0, 0.0, 0.0)), "orientation"),
+        ("imu_tilt", create_oriented_sample((0.0, 0.0, 0.0, 0.0)), "orientation"),
+        ("imu_tilt", create_oriented_sample((math.nan, 0.0, 0.0, 0.0)), "orientation"),
         ("magnetometer", ImuSample(HEADER, magnetic_field=NAN3), "nan"),
         ("magnetometer", ImuSample(HEADER, magnetic_field=(9e-5, 0.0, 9e-5)), "disturbed"),
         ("absolute_pose", AbsolutePoseSample(HEADER, "Cart:Nowhere", "World:ENU", (0.0,) * 3), "frame"),
@@ -358,35 +367,35 @@ NAN3: Vector3 = (math.nan, 0.0, 0.0)
         ("relative_pose", RelativePoseSample(HEADER, CAMERA, START_UTIME - 1000, NAN3, so3.IDENTITY), "nan"),
     ],
 )
-def test_given_a_sample_that_says_nothing_when_compared_then_one_word_tells_why(kind, sample, word):
-    assert refusal(kind, sample) == word
+def test_given_a_sample_that_measures_nothing_then_the_reason_is_one_word(kind, sample, word):
+    assert evaluate_sample(kind, sample) == word
 
 
-def test_given_no_place_in_the_world_when_compared_then_what_is_of_the_world_waits_and_is_not_counted():
+def test_given_an_unaligned_state_then_measurements_in_the_world_wait_and_are_not_counted():
     setup = Setup(PAIR, SETTINGS)
     nav = some_nav(setup, 1)
     for name in ("position", "height", "velocity", "baseline", "yaw", "magnetometer", "pose in ENU", "range"):
         case = CASES[name]
-        assert refusal(case.kind, case.sample(nav, PAIR), site=None) == ""  # type: ignore[operator]
+        assert evaluate_sample(case.kind, case.sample(nav, PAIR), site=None) == ""  # type: ignore[operator]
 
 
-def test_given_a_beacon_too_near_when_compared_then_its_direction_is_not_known():
+def test_given_a_beacon_too_near_then_its_direction_is_unknown():
     setup = Setup(PAIR, SETTINGS)
-    near = in_enu(some_nav(setup, 1), PAIR, CAMERA).xyz
-    assert refusal("range", RangeSample(HEADER, CAMERA, "b", near, "World:ENU", 0.1)) == "near"
+    near = find_pose_in_enu(some_nav(setup, 1), PAIR, CAMERA).xyz
+    assert evaluate_sample("range", RangeSample(HEADER, CAMERA, "b", near, "World:ENU", 0.1)) == "near"
 
 
-def test_given_a_magnetic_heading_in_vertical_gyro_mode_then_it_is_compared_and_not_used():
-    measurement, scene, sample = prepared(CASES["magnetometer"], 1, extras=False)
-    found = compared(measurement, scene._replace(settings=FilterSettings()), sample)
+def test_given_a_magnetic_heading_in_vertical_gyro_mode_then_it_is_monitored_and_not_used():
+    measurement, context, sample = prepare(CASES["magnetometer"], 1, extras=False)
+    found = evaluate(measurement, context._replace(settings=FilterSettings()), sample)
     assert found.monitored == "vertical_gyro"
-    assert compared(measurement, scene, sample).monitored == ""
+    assert evaluate(measurement, context, sample).monitored == ""
 
 
-def test_given_a_velocity_without_covariance_or_a_slow_course_then_the_settings_speak():
-    told = read_velocity(GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, velocity=(1.0, 2.0, 3.0)), SETTINGS)
-    assert told is not None
-    assert told[1] == pytest.approx(np.eye(3) * SETTINGS.velocity_sigma**2)
+def test_given_a_velocity_without_covariance_or_a_slow_course_then_the_settings_decide():
+    stated = read_velocity(GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, velocity=(1.0, 2.0, 3.0)), SETTINGS)
+    assert stated is not None
+    assert stated[1] == pytest.approx(np.eye(3) * SETTINGS.velocity_sigma**2)
     slow = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=0.9 * SETTINGS.course_speed, course=1.0)
     assert read_velocity(slow, SETTINGS) is None
     fast = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=10.0, course=0.5, speed_sigma=0.2, course_sigma=0.1)

@@ -1,4 +1,4 @@
-"""The strapdown against a simulated drive, its transition by differences, its covariance against many runs."""
+"""Propagation against a simulated drive, its transition matrix by differences, its covariance against many runs."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import math
 
 import numpy as np
 import pytest
-from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, model, rig, some_nav
+from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_nav
 
-from modelserver.estimation.filter import motion, strapdown
+from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.error_layout import STRAPDOWN
-from modelserver.estimation.filter.eskf import ZERO, Nav, cross
+from modelserver.estimation.filter.eskf import ZERO, Earth, NavState, ProcessNoise
+from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState
-from modelserver.estimation.filter.eskf import Earth, Noise
+from modelserver.estimation.filter.state import Aligned, Common, MotionConstraints
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import ImuSample
 from modelserver.simulation import ImuModel, Simulation, Terrain, Timing, Trajectory, Wave, figure_eight
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
+from modelserver.transforms.so3 import cross
 
 SETUP = Setup(rig())
 N = SETUP.layout.size
@@ -32,9 +34,9 @@ def earth_here() -> Earth:
 
 
 @pytest.mark.slow
-def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_right_within_millimetres(monkeypatch):
+def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_position_is_right_to_a_centimeter(monkeypatch):
     # the simulator's vertical is that of the origin everywhere
-    monkeypatch.setattr(strapdown, "EARTH_RADIUS", 1e15)
+    monkeypatch.setattr(eskf, "EARTH_RADIUS", 1e15)
     terrain = Terrain(0.05, -0.03, (Wave(0.8, 30.0, 0.4), Wave(0.3, 17.0, -1.0, 1.0)))
     simulation = Simulation(
         model(), "Cart:Base", Trajectory(figure_eight(3.0, 8.0, stationary=1.0, ramp=2.0, laps=3), yaw=0.7), ORIGIN,
@@ -46,12 +48,12 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_r
     lever = SETUP.rig.imu
     arm = so3.rotate(truth.enu.wxyz, cross(truth.twist[1], lever))
 
-    def felt(sample: ImuSample) -> tuple[so3.Vector3, so3.Vector3]:
+    def read_sample(sample: ImuSample) -> tuple[so3.Vector3, so3.Vector3]:
         assert sample.angular_velocity is not None
         assert sample.specific_force is not None
         return so3.rotate(mount, sample.angular_velocity), so3.rotate(mount, sample.specific_force)
 
-    rate, force = felt(samples[0])
+    rate, force = read_sample(samples[0])
     vx, vy, vz = truth.velocity
     nav = some_nav(SETUP, 1)._replace(
         utime=samples[0].header.utime,
@@ -64,36 +66,36 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_r
         force=force,
     )
     for sample in samples[1:]:
-        nav = strapdown.carried(nav, sample.header.utime, *felt(sample), earth, SETUP.rig.base)
+        nav = eskf.propagate(nav, sample.header.utime, *read_sample(sample), earth, SETUP.rig.base)
     truth = simulation.truth(nav.utime)
     assert nav.utime - START_UTIME > 59_000_000
     assert math.dist(nav.point(SETUP.rig.base), truth.enu.xyz) < 0.01
     assert math.hypot(*so3.logarithm(so3.multiply(nav.attitude, so3.conjugate(truth.enu.wxyz)))) < 2e-5
     assert nav.body_velocity(SETUP.rig.base) == pytest.approx(truth.twist[0], abs=2e-3)
-    # the rolling frame's way along the body, which the wheels are held against
-    assert abs(nav.rolled[1]) < 0.02
-    assert nav.rolled[0] > 100.0
-    assert nav.turned[2] == pytest.approx(truth.yaw - 0.7, abs=0.2)
+    # the distance travelled by the rolling frame along the body, which the wheels are compared with
+    assert abs(nav.travel[1]) < 0.02
+    assert nav.travel[0] > 100.0
+    assert nav.rotation[2] == pytest.approx(truth.yaw - 0.7, abs=0.2)
 
 
-def test_given_no_inertial_unit_when_coasting_in_a_turn_then_the_velocity_turns_with_the_body():
+def test_given_no_imu_when_coasting_in_a_turn_then_the_velocity_turns_with_the_body():
     nav = some_nav(SETUP, 2)._replace(velocity=(3.0, 0.0, 0.0), attitude=so3.IDENTITY, gyro_bias=(0.01, 0.0, 0.02))
     for n in range(100):
-        nav = strapdown.coasted(nav, START_UTIME + (n + 1) * 10_000, (0.0, 0.0, 0.5), SETUP.rig.base)
+        nav = eskf.propagate_without_imu(nav, START_UTIME + (n + 1) * 10_000, (0.0, 0.0, 0.5), SETUP.rig.base)
     assert nav.velocity == pytest.approx((3.0 * math.cos(0.5), 3.0 * math.sin(0.5), 0.0))
     assert nav.yaw == pytest.approx(0.5)
     start = some_nav(SETUP, 2).position
     assert nav.position[0] - start[0] == pytest.approx(6.0 * math.sin(0.5), abs=1e-3)
     assert nav.position[1] - start[1] == pytest.approx(6.0 * (1.0 - math.cos(0.5)), abs=1e-3)
-    assert nav.turn_rate == pytest.approx((0.0, 0.0, 0.5))
+    assert nav.angular_rate == pytest.approx((0.0, 0.0, 0.5))
     assert nav.lag == pytest.approx(1.0)
 
 
 # --- errors -------------------------------------------------------------------------------------------------
 
 
-def between(a: Nav, b: Nav) -> np.ndarray:
-    """The error that put into `a` gives `b`."""
+def find_error(a: NavState, b: NavState) -> np.ndarray:
+    """Return the error that gives `b` when injected into `a`."""
     turn = so3.logarithm(so3.normalize(so3.multiply(b.attitude, so3.conjugate(a.attitude))))
     parts = [np.subtract(getattr(b, key), getattr(a, key)) for key in ("position", "velocity")]
     parts += [np.array(turn)]
@@ -101,53 +103,53 @@ def between(a: Nav, b: Nav) -> np.ndarray:
     return np.concatenate(parts + [np.subtract(getattr(b, key), getattr(a, key)) for key in keys])
 
 
-def off(nav: Nav, dt: float) -> float:
-    """The largest difference between the transition over `dt` and what becomes of small errors."""
+def find_largest_error(nav: NavState, dt: float) -> float:
+    """Return the largest difference between the transition matrix over `dt` and propagated small errors."""
     utime, rate, force, earth = nav.utime + round(dt * 1e6), (0.2, -0.1, 0.4), (0.5, 0.3, 9.9), earth_here()
 
-    def step(given: Nav) -> Nav:
-        return strapdown.carried(given, utime, rate, force, earth, SETUP.rig.base)
+    def step(given: NavState) -> NavState:
+        return eskf.propagate(given, utime, rate, force, earth, SETUP.rig.base)
 
     after = step(nav)
-    F = strapdown._transition(after, dt, SETUP.layout, np.ones(N - STRAPDOWN))
+    F = eskf._transition_matrix(after, dt, SETUP.layout, np.ones(N - STRAPDOWN))
     h = 1e-6
     columns = []
     for k in range(N):
         error = np.zeros(N)
         error[k] = h
-        ahead, behind = step(nav.injected(error, nav.covariance)), step(nav.injected(-error, nav.covariance))
-        columns.append((between(after, ahead) - between(after, behind)) / (2.0 * h))
+        ahead, behind = step(nav.inject(error, nav.covariance)), step(nav.inject(-error, nav.covariance))
+        columns.append((find_error(after, ahead) - find_error(after, behind)) / (2.0 * h))
     return float(np.abs(np.array(columns).T - F).max())
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_given_small_errors_when_carried_then_they_go_as_the_transition_says_to_second_order(seed):
+def test_given_small_errors_when_propagated_then_they_follow_the_transition_matrix_to_second_order(seed):
     nav = some_nav(SETUP, seed)
-    whole, half = off(nav, 0.04), off(nav, 0.02)
-    # what is left out: the gyro's bias by way of attitude within one step, g dt^2 / 2, and the earth's turning
+    whole, half = find_largest_error(nav, 0.04), find_largest_error(nav, 0.02)
+    # left out: the gyro bias through the attitude within one step, g dt^2 / 2, and the earth rate
     assert whole < 0.6 * 10.0 * 0.04**2
     assert half < 0.27 * whole + 5e-6
 
 
-def test_given_states_that_fade_when_caught_up_then_they_do_so_exactly_and_keep_their_steady_variance():
+def test_given_gauss_markov_states_when_propagated_then_they_decay_exactly_and_keep_their_steady_variance():
     nav = some_nav(SETUP, 1)
     P = nav.covariance.copy()
     at = SETUP.layout.index("gps_wander_east")
     P[at, at] = 1.0
     nav = nav._replace(covariance=P, lag=7.0)
-    after = strapdown.caught_up(nav, SETUP.driving, SETUP.layout)
+    after = eskf.propagate_covariance(nav, SETUP.driving, SETUP.layout)
     keep = math.exp(-7.0 / SETUP.settings.gps_correlation_time)
     assert after.extras[at - STRAPDOWN] == pytest.approx(keep * nav.extras[at - STRAPDOWN])
     assert after.covariance[at, at] == pytest.approx(1.0)
     assert after.lag == 0.0
-    assert strapdown.caught_up(after, SETUP.driving, SETUP.layout) is after
+    assert eskf.propagate_covariance(after, SETUP.driving, SETUP.layout) is after
 
 
 @pytest.mark.slow
-def test_given_two_hundred_noisy_runs_then_their_spread_is_what_the_covariance_says():
+def test_given_two_hundred_noisy_runs_then_their_covariance_is_that_of_the_filter():
     rng = np.random.default_rng(5)
     dt, steps, runs = 0.05, 160, 200
-    noise = Noise(0.002**2, 0.03**2, 0.0, 0.0)
+    noise = ProcessNoise(0.002**2, 0.03**2, 0.0, 0.0)
     base = SETUP.rig.base
     P = np.zeros((N, N))
     sigmas = {0: 0.1, 3: 0.05, 6: 0.01, 9: 0.002, 12: 0.02}
@@ -158,15 +160,15 @@ def test_given_two_hundred_noisy_runs_then_their_spread_is_what_the_covariance_s
         accelerometer_bias=ZERO, covariance=P, rate=(0.0, 0.0, 0.1), force=(0.1, 0.2, 9.8),
     )  # fmt: skip
 
-    def run(nav: Nav, errors: np.ndarray | None) -> Nav:
+    def run(nav: NavState, errors: np.ndarray | None) -> NavState:
         for k in range(steps):
             rate, force = (0.0, 0.0, 0.1), (0.1, 0.2, 9.8)
             if errors is not None:
-                # felt too much: what is true is less by the noise
+                # the measured value is the true one plus noise
                 rate, force = tuple(np.add(rate, errors[k, :3])), tuple(np.add(force, errors[k, 3:]))
-            nav = strapdown.carried(nav, START_UTIME + round((k + 1) * dt * 1e6), rate, force, Earth(), base)
+            nav = eskf.propagate(nav, START_UTIME + round((k + 1) * dt * 1e6), rate, force, Earth(), base)
             if errors is None:
-                nav = strapdown.caught_up(nav, noise, SETUP.layout)
+                nav = eskf.propagate_covariance(nav, noise, SETUP.layout)
         return nav
 
     nominal = run(start, None)
@@ -174,31 +176,32 @@ def test_given_two_hundred_noisy_runs_then_their_spread_is_what_the_covariance_s
     for _ in range(runs):
         error = np.sqrt(np.diagonal(P)) * rng.normal(size=N)
         scale = np.repeat((0.002, 0.03), 3) / math.sqrt(dt)
-        found.append(between(nominal, run(start.injected(error, P), rng.normal(size=(steps, 6)) * scale)))
+        found.append(find_error(nominal, run(start.inject(error, P), rng.normal(size=(steps, 6)) * scale)))
     ratio = np.var(np.array(found)[:, :STRAPDOWN], axis=0) / np.diagonal(nominal.covariance)[:STRAPDOWN]
     assert ratio.min() > 0.65
     assert ratio.max() < 1.5
-    # position goes with velocity, and both with tilt: the correlations are as large
-    spread, said = np.corrcoef(np.array(found)[:, :9].T), nominal.covariance[:9, :9]
-    sigma = np.sqrt(np.diagonal(said))
-    assert np.abs(spread - said / np.outer(sigma, sigma)).max() < 0.3
+    # position correlates with velocity, and both with tilt: the correlations are as large
+    correlation, expected = np.corrcoef(np.array(found)[:, :9].T), nominal.covariance[:9, :9]
+    sigma = np.sqrt(np.diagonal(expected))
+    assert np.abs(correlation - expected / np.outer(sigma, sigma)).max() < 0.3
 
 
-# --- when nothing is felt -----------------------------------------------------------------------------------
+# --- gaps ---------------------------------------------------------------------------------------------------
 
 
-def test_given_a_gap_when_bridged_then_the_last_sample_is_held_for_a_while_and_then_it_coasts():
+def test_given_a_gap_then_the_last_sample_is_held_for_a_while_and_then_the_state_coasts():
     setup = SETUP
     nav = some_nav(setup, 1)._replace(attitude=so3.IDENTITY, velocity=(2.0, 0.0, 0.0), gyro_bias=ZERO)
-    nav = nav._replace(rate=(0.0, 0.0, 0.5), force=(0.0, 0.0, strapdown.STANDARD_GRAVITY), accelerometer_bias=ZERO)
-    state = FilterState(nav=nav, imu_utime=nav.utime)
-    held = motion.predicted(setup, state, nav.utime + 150_000)
+    nav = nav._replace(rate=(0.0, 0.0, 0.5), force=(0.0, 0.0, eskf.STANDARD_GRAVITY), accelerometer_bias=ZERO)
+    state = Aligned(
+        nav, ImuMonitor(used_utime=nav.utime), StationaryDetector(), MotionConstraints(), Common(), Earth(), SITE
+    )
+    held = propagation.predict_nav(setup, state, nav.utime + 150_000)
     assert held.yaw == pytest.approx(0.075)
-    later = motion.predicted(setup, state, nav.utime + 1_000_000)
+    later = propagation.predict_nav(setup, state, nav.utime + 1_000_000)
     assert later.yaw == pytest.approx(0.5 * setup.settings.rate_hold)
     assert math.hypot(*later.velocity) == pytest.approx(2.0, abs=0.1)
-    caught = motion.caught_up(setup, state._replace(nav=later)).nav
-    assert caught is not None
-    # what nobody measured for 0.8 s
+    caught = propagation.propagate_covariance(setup, state._replace(nav=later)).nav
+    # 0.8 s without a measurement
     assert caught.covariance[8, 8] > nav.covariance[8, 8] + 0.5 * setup.settings.gap_rate_sigma**2
-    assert motion.at(setup, state, nav.utime) is state
+    assert propagation.advance(setup, state, nav.utime) is state
