@@ -1,4 +1,4 @@
-"""Time in the filter: any order of arrival gives one state, Odom never jumps, the modes hand over, the past is kept."""
+"""Time in the filter: one state for any order of arrival, Odom without jumps, switches of mode, past estimates."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support_cart import MOUNTS, ORIGIN, drive, localizer, process_all, rig, same
 
-from modelserver.estimation.filter import items
+from modelserver.estimation.filter.fusion import split_sample
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import FilterState, Leveling
 from modelserver.estimation.filter.timeline import Timeline
 from modelserver.estimation.history import History
 from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
@@ -46,86 +47,93 @@ WARM, CHUNK, AFTER = 12.0, 0.9, 1.5
 
 
 @lru_cache
-def events() -> tuple[Event, ...]:
+def simulate_events() -> tuple[Event, ...]:
     gps = GpsModel(Timing(5.0, latency=0.05), velocity_latency=0.1)
     return tuple(sorted(drive(20.0, imu_hz=IMU_HZ, gps_model=gps)[1], key=lambda each: each.header.utime))
 
 
-def within(start: float, end: float) -> list[Event]:
-    return [each for each in events() if start <= (each.header.utime - START_UTIME) * 1e-6 < end]
+def select_events(start: float, end: float) -> list[Event]:
+    return [each for each in simulate_events() if start <= (each.header.utime - START_UTIME) * 1e-6 < end]
 
 
 @lru_cache
-def warm() -> FilterLocalizer:
-    found = process_all(localizer(), within(0.0, WARM))
+def drive_until_aligned() -> FilterLocalizer:
+    found = process_all(localizer(), select_events(0.0, WARM))
     assert found.head.phase is Phase.ALIGNED
     return found
 
 
 @lru_cache
-def in_order() -> FilterLocalizer:
-    return process_all(warm(), within(WARM, WARM + CHUNK))
+def drive_in_order() -> FilterLocalizer:
+    return process_all(drive_until_aligned(), select_events(WARM, WARM + CHUNK))
 
 
 # --- one state, whatever the order --------------------------------------------------------------------------
+
+
+def drop_pending(state: FilterState) -> FilterState:
+    """Return the state without its pending decisions."""
+    return state._replace(common=state.common._replace(pending=()))
 
 
 @pytest.mark.slow
 @settings(max_examples=20, phases=(Step.explicit, Step.reuse, Step.generate), deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(0, 12))
 def test_given_any_order_of_arrival_within_the_horizon_then_the_state_is_the_same_to_the_bit(rng, twice):
-    samples = within(WARM, WARM + CHUNK)
+    samples = select_events(WARM, WARM + CHUNK)
     samples += rng.sample(samples, twice)
     rng.shuffle(samples)
-    found = process_all(warm(), samples)
-    assert found.timeline.settled(found.clocks.complete_to())
-    assert same(found.head, in_order().head)
-    assert [each.item.key for each in found.timeline.entries] == [each.item.key for each in in_order().timeline.entries]
-    utime = in_order().utime + 50_000
+    found = process_all(drive_until_aligned(), samples)
+    assert found.timeline.is_fused(found.clocks.get_complete_utime())
+    assert same(found.head, drive_in_order().head)
+    assert [each.item.key for each in found.timeline.entries] == [
+        each.item.key for each in drive_in_order().timeline.entries
+    ]
+    utime = drive_in_order().utime + 50_000
     assert same(
         *(
             dataclasses.astuple(replace(each.estimate(utime), odom=None, odom_covariance=None))
-            for each in (found, in_order())
+            for each in (found, drive_in_order())
         )
     )
 
 
-def test_given_any_order_when_what_follows_has_come_then_the_states_are_still_the_same():
-    samples = within(WARM, WARM + CHUNK)
+def test_given_any_order_of_arrival_when_later_samples_follow_then_the_states_remain_the_same():
+    samples = select_events(WARM, WARM + CHUNK)
     random.Random(1).shuffle(samples)
-    after = within(WARM + CHUNK, WARM + CHUNK + AFTER)
-    one, other = process_all(process_all(warm(), samples), after), process_all(in_order(), after)
+    after = select_events(WARM + CHUNK, WARM + CHUNK + AFTER)
+    one, other = process_all(process_all(drive_until_aligned(), samples), after), process_all(drive_in_order(), after)
     assert same(one.head, other.head)
     assert same(one.timeline.base, other.timeline.base)
 
 
-def test_given_a_small_budget_then_the_same_state_comes_in_the_end_and_answers_go_on_meanwhile():
+def test_given_a_small_budget_then_the_final_state_is_the_same_and_estimates_continue_meanwhile():
     small = localizer(FilterSettings(replay_budget=16))
-    small = process_all(small, within(0.0, WARM))
-    chunk = within(WARM, WARM + CHUNK)
+    small = process_all(small, select_events(0.0, WARM))
+    chunk = select_events(WARM, WARM + CHUNK)
     late = next(each for each in chunk if isinstance(each, GpsSample))
     rest = [each for each in chunk if each is not late]
     found = process_all(process_all(small, rest), [late])
-    assert not found.timeline.settled(found.clocks.complete_to())
-    assert found.utime == in_order().utime
+    assert not found.timeline.is_fused(found.clocks.get_complete_utime())
+    assert found.utime == drive_in_order().utime
     assert found.estimate(found.utime).invalid == Invalid(0)
-    after = within(WARM + CHUNK, WARM + CHUNK + AFTER)
-    found, other = process_all(found, after), process_all(in_order(), after)
-    assert found.timeline.settled(found.clocks.complete_to())
-    assert same(found.head._replace(pending=()), other.head._replace(pending=()))
+    after = select_events(WARM + CHUNK, WARM + CHUNK + AFTER)
+    found, other = process_all(found, after), process_all(drive_in_order(), after)
+    assert found.timeline.is_fused(found.clocks.get_complete_utime())
+    assert same(drop_pending(found.head), drop_pending(other.head))
 
 
-def test_given_a_sample_later_than_the_horizon_then_it_is_refused_and_says_so():
-    chunk = within(WARM, WARM + CHUNK + AFTER)
+def test_given_a_sample_older_than_the_horizon_then_it_is_rejected_with_the_reason():
+    chunk = select_events(WARM, WARM + CHUNK + AFTER)
     late = next(each for each in chunk if isinstance(each, GpsSample))
-    done = process_all(warm(), [each for each in chunk if each is not late])
+    done = process_all(drive_until_aligned(), [each for each in chunk if each is not late])
     after, notes = done.process(late)
-    # its source has been heard of since
+    # its source has published since
     assert {(note.verdict, note.reason) for note in notes if isinstance(note, Decision)} == {
         (Verdict.REJECTED, "out_of_sequence")
     }
     assert same(after.head, done.head)
-    done = process_all(warm(), [each for each in chunk if not isinstance(each, GpsSample)])
+    done = process_all(drive_until_aligned(), [each for each in chunk if not isinstance(each, GpsSample)])
     after, notes = done.process(late)
     assert {(note.verdict, note.reason) for note in notes if isinstance(note, Decision)} == {
         (Verdict.REJECTED, "too_old")
@@ -133,9 +141,9 @@ def test_given_a_sample_later_than_the_horizon_then_it_is_refused_and_says_so():
     assert same(after.head, done.head)
 
 
-def test_given_a_sample_twice_then_the_second_is_refused_whatever_it_counts():
-    samples = within(WARM, WARM + CHUNK)
-    done = process_all(warm(), samples)
+def test_given_a_sample_twice_then_the_second_is_rejected_whatever_its_sequence_number():
+    samples = select_events(WARM, WARM + CHUNK)
+    done = process_all(drive_until_aligned(), samples)
     for again in [each for each in samples if isinstance(each, GpsSample)]:
         renumbered = replace(again, header=replace(again.header, seq=again.header.seq + 1))
         for each in (again, renumbered):
@@ -145,41 +153,41 @@ def test_given_a_sample_twice_then_the_second_is_refused_whatever_it_counts():
             assert same(after.head, done.head)
 
 
-def test_given_more_items_than_a_horizon_may_hold_then_late_ones_are_refused(monkeypatch):
-    monkeypatch.setattr("modelserver.estimation.filter.timeline.MOST", 10)
-    samples = within(WARM, WARM + CHUNK)
-    done = process_all(warm(), [each for each in samples if isinstance(each, ImuSample)])
+def test_given_more_items_than_a_horizon_can_hold_then_delayed_ones_are_rejected(monkeypatch):
+    monkeypatch.setattr("modelserver.estimation.filter.timeline.MAX_ITEMS", 10)
+    samples = select_events(WARM, WARM + CHUNK)
+    done = process_all(drive_until_aligned(), [each for each in samples if isinstance(each, ImuSample)])
     _, notes = done.process(next(each for each in samples if isinstance(each, GpsSample)))
     assert {note.reason for note in notes if isinstance(note, Decision)} == {"overload"}
 
 
-def test_given_items_when_settled_then_what_became_of_each_is_told_once_in_order():
-    setup = warm().setup
-    timeline = Timeline(warm().head)
-    samples = within(WARM, WARM + CHUNK)
+def test_given_items_when_settled_then_the_decisions_on_each_are_reported_once_in_order():
+    setup = drive_until_aligned().setup
+    timeline = Timeline(drive_until_aligned().head)
+    samples = select_events(WARM, WARM + CHUNK)
     for sample in reversed(samples):
-        for item in items.items(setup, sample):
-            longer = timeline.with_item(item)
+        for item in split_sample(setup, sample):
+            longer = timeline.insert(item)
             assert not isinstance(longer, str)
             timeline = longer[0]
-    assert timeline.newest is warm().head
-    timeline = timeline.worked(setup, 10_000, samples[-1].header.utime)
+    assert timeline.newest is drive_until_aligned().head
+    timeline = timeline.fuse(setup, 10_000, samples[-1].header.utime)
     middle = timeline.entries[len(timeline.entries) // 2].item.utime
-    first, told = timeline.settled_before(middle)
-    rest, more = first.settled_before(middle + 10**9)
+    first, decisions = timeline.settle(middle)
+    rest, more = first.settle(middle + 10**9)
     assert rest.entries == ()
     assert same(rest.base, timeline.newest)
-    assert (*told, *more) == tuple(decision for entry in timeline.entries for decision in entry.decisions)
-    assert first.settled_before(middle) == (first, ())
-    assert timeline.state_at(0) is timeline.base
-    assert timeline.state_at(timeline.entries[3].item.utime).nav is not None
+    assert (*decisions, *more) == tuple(decision for entry in timeline.entries for decision in entry.decisions)
+    assert first.settle(middle) == (first, ())
+    assert timeline.get_state_at(0) is timeline.base
+    assert not isinstance(timeline.get_state_at(timeline.entries[3].item.utime), Leveling)
 
 
 # --- Odom ---------------------------------------------------------------------------------------------------
 
 
-def steps(asked: list[tuple[int, Estimate]]) -> list[tuple[float, float, float]]:
-    """Seconds, metres and radians from each pose in Odom to the next."""
+def list_steps(asked: list[tuple[int, Estimate]]) -> list[tuple[float, float, float]]:
+    """Return seconds, meters and radians from each pose in Odom to the next."""
     found = []
     for (_, a), (_, b) in itertools.pairwise(asked):
         moved = a.odom.inverse() @ b.odom
@@ -190,7 +198,7 @@ def steps(asked: list[tuple[int, Estimate]]) -> list[tuple[float, float, float]]
     return found
 
 
-def asked_after_each(found: FilterLocalizer | ModeLocalizer, samples: list[Event | SwitchMode]):
+def estimate_after_each(found: FilterLocalizer | ModeLocalizer, samples: list[Event | SwitchMode]):
     estimates = []
     for sample in samples:
         found, _ = found.process(sample)
@@ -201,79 +209,82 @@ def asked_after_each(found: FilterLocalizer | ModeLocalizer, samples: list[Event
 
 def check_smooth(estimates: list[tuple[int, Estimate]], most: float = 3.3) -> None:
     assert len(estimates) > 100
-    for seconds, metres, radians in steps(estimates):
-        assert metres <= most * abs(seconds) + 0.01
+    for seconds, meters, radians in list_steps(estimates):
+        assert meters <= most * abs(seconds) + 0.01
         assert radians <= 1.5 * abs(seconds) + 0.02
 
 
-def shifted(sample: GpsSample, degrees: float) -> GpsSample:
+def shift_fix(sample: GpsSample, degrees: float) -> GpsSample:
     return replace(sample, latitude_deg=sample.latitude_deg + degrees)
 
 
-def test_given_fixes_that_jump_and_come_late_when_taken_then_odom_goes_on_without_a_step():
+def test_given_fixes_that_jump_and_are_delayed_then_odom_continues_without_a_step():
     rng = random.Random(4)
     late = [
-        (each.header.utime + (rng.randrange(700_000) if isinstance(each, GpsSample) else 0), each) for each in events()
+        (each.header.utime + (rng.randrange(700_000) if isinstance(each, GpsSample) else 0), each)
+        for each in simulate_events()
     ]
     samples: list[Event | SwitchMode] = []
     for _, each in sorted(late, key=lambda pair: pair[0]):
         jump = isinstance(each, GpsSample) and (each.header.utime - START_UTIME) > 13_000_000
-        samples.append(shifted(each, 3e-4) if jump and isinstance(each, GpsSample) else each)
-    done, estimates = asked_after_each(localizer(), samples)
+        samples.append(shift_fix(each, 3e-4) if jump and isinstance(each, GpsSample) else each)
+    done, estimates = estimate_after_each(localizer(), samples)
     check_smooth(estimates)
     assert done.head.phase is Phase.ALIGNED
 
 
-def test_given_a_lasting_jump_that_begins_an_epoch_then_odom_does_not_feel_it():
+def test_given_a_lasting_jump_that_starts_an_epoch_then_odom_does_not_change():
     quick = FilterSettings(recovery_time=2.0, recovery_fixes=5)
     samples = [
-        shifted(each, 3e-4) if isinstance(each, GpsSample) and each.header.utime > START_UTIME + 10_000_000 else each
+        shift_fix(each, 3e-4) if isinstance(each, GpsSample) and each.header.utime > START_UTIME + 10_000_000 else each
         for each in drive(22.0, imu_hz=IMU_HZ)[1]
     ]
-    done, estimates = asked_after_each(localizer(quick), samples)
-    assert done.head.epoch > 0
+    done, estimates = estimate_after_each(localizer(quick), samples)
+    assert done.head.common.epoch > 0
     check_smooth(estimates)
     worlds = [estimate.enu.xyz for _, estimate in estimates if estimate.enu is not None]
     assert max(math.dist(a, b) for a, b in itertools.pairwise(worlds)) > 20.0
 
 
-def test_given_a_clock_that_is_set_back_then_odom_stands_still_until_the_motion_is_known_again():
+def test_given_a_clock_that_is_set_back_then_odom_stops_until_the_motion_is_known_again():
     back = 3_000_000_000
-    moved = [replace(each, header=replace(each.header, utime=each.header.utime - back)) for each in within(WARM, 20.0)]
-    before = warm()
+    moved = [
+        replace(each, header=replace(each.header, utime=each.header.utime - back)) for each in select_events(WARM, 20.0)
+    ]
+    before = drive_until_aligned()
     where = before.estimate(before.utime).odom
     done, asked = before, []
     for sample in moved:
         done, _ = done.process(sample)
         asked.append(done.estimate(sample.header.utime))
-    begun = [each for each in asked if each.pose_epoch > before.head.epoch]
-    assert len(begun) > 50
-    assert begun[0].invalid & Invalid.CLOCK_STEPPED
-    assert math.dist(begun[0].odom.xyz, where.xyz) < 0.2
-    for a, b in itertools.pairwise(begun):
+    restarted = [each for each in asked if each.pose_epoch > before.head.common.epoch]
+    assert len(restarted) > 50
+    assert restarted[0].invalid & Invalid.CLOCK_STEPPED
+    assert math.dist(restarted[0].odom.xyz, where.xyz) < 0.2
+    for a, b in itertools.pairwise(restarted):
         assert math.dist(a.odom.xyz, b.odom.xyz) <= 3.3 * abs(b.utime - a.utime) * 1e-6 + 0.02
     assert done.utime > 0
     covariance = done.estimate(done.utime).odom_covariance
     assert covariance is not None
-    # the seconds that nobody saw, at any speed a vehicle has, and no more
+    # the unobserved seconds, at any speed of a vehicle, and no more
     assert 0.01 < math.sqrt(covariance[0]) < 1000.0
 
 
 # --- modes --------------------------------------------------------------------------------------------------
 
 
-def wish(utime: int, mode: Mode) -> SwitchMode:
+def create_switch(utime: int, mode: Mode) -> SwitchMode:
     return SwitchMode(SensorHeader(utime, "console"), mode)
 
 
-def moding(mode: Mode = Mode.FULL) -> ModeLocalizer:
+def start_modes(mode: Mode = Mode.FULL) -> ModeLocalizer:
     return ModeLocalizer.start(LocalizerConfig(Setup(rig()), RawSettings(), MOUNTS), mode, ORIGIN)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [Mode.FULL, Mode.RAW])
-def test_given_switches_between_filter_and_raw_mode_then_odom_goes_on_and_epochs_count(first):
-    found, seen = moding(first), []
+def test_given_switches_between_filter_and_raw_mode_then_odom_continues_and_epochs_increase(first):
+    found, seen = start_modes(first), []
     samples = drive(24.0)[1]
     at = {round(len(samples) * share): mode for share, mode in ((0.5, Mode.RAW), (0.75, Mode.FULL))}
     if first is Mode.RAW:
@@ -283,7 +294,7 @@ def test_given_switches_between_filter_and_raw_mode_then_odom_goes_on_and_epochs
             utime = found.utime
             before = found.estimate(utime)
             assert before.invalid == Invalid(0)
-            found, notes = found.process(wish(utime, at[n]))
+            found, notes = found.process(create_switch(utime, at[n]))
             (note,) = notes
             assert isinstance(note, Decision)
             assert (note.verdict, note.kind) == (Verdict.RESET, "mode")
@@ -295,20 +306,20 @@ def test_given_switches_between_filter_and_raw_mode_then_odom_goes_on_and_epochs
         found, _ = found.process(sample)
         seen.append((found.utime, found.estimate(found.utime)))
     known = [pair for pair in seen if pair[0]]
-    for seconds, metres, _ in steps(known):
-        assert metres <= 3.3 * abs(seconds) + 0.03
+    for seconds, meters, _ in list_steps(known):
+        assert meters <= 3.3 * abs(seconds) + 0.03
     epochs = [estimate.pose_epoch for _, estimate in known]
     assert epochs == sorted(epochs)
     assert known[-1][1].invalid == Invalid(0)
 
 
-def test_given_a_filter_begun_from_raw_mode_then_what_is_older_than_that_is_refused_and_time_does_not_go_back():
+def test_given_a_filter_started_from_raw_mode_then_older_samples_are_rejected_and_time_does_not_go_back():
     samples = drive(14.0)[1]
-    found = moding(Mode.RAW)
+    found = start_modes(Mode.RAW)
     for sample in samples:
         found, _ = found.process(sample)
     utime = found.utime
-    found, _ = found.process(wish(utime, Mode.FULL))
+    found, _ = found.process(create_switch(utime, Mode.FULL))
     assert isinstance(found.active, FilterLocalizer)
     assert found.active.head.phase is Phase.ALIGNED
     old = next(
@@ -320,13 +331,13 @@ def test_given_a_filter_begun_from_raw_mode_then_what_is_older_than_that_is_refu
 
 
 @pytest.mark.parametrize("mode", [Mode.NO_WHEELS, Mode.NO_GPS, Mode.NO_IMU, Mode.DEAD_RECKONING])
-def test_given_a_wish_for_another_mode_of_the_filter_then_nothing_jumps_and_it_says_so(mode):
-    found = process_all(localizer(), within(0.0, WARM))
+def test_given_a_command_for_another_mode_of_the_filter_then_nothing_jumps_and_the_mode_is_reported(mode):
+    found = process_all(localizer(), select_events(0.0, WARM))
     utime = found.utime
     before = found.estimate(utime)
-    found, _ = found.process(wish(utime + 1, mode))
+    found, _ = found.process(create_switch(utime + 1, mode))
     assert found.mode is mode
-    found, estimates = asked_after_each(found, within(WARM, 16.0))
+    found, estimates = estimate_after_each(found, select_events(WARM, 16.0))
     check_smooth([(utime, before), *estimates])
     assert found.mode is mode
     state = found.navigation(found.utime)
@@ -335,41 +346,41 @@ def test_given_a_wish_for_another_mode_of_the_filter_then_nothing_jumps_and_it_s
     assert found.estimate(found.utime).pose_epoch == before.pose_epoch
 
 
-def test_given_a_wish_for_what_there_is_already_or_cannot_be_then_nothing_changes():
-    found = moding(Mode.RAW)
-    assert found.process(wish(START_UTIME, Mode.RAW)) == (found, ())
+def test_given_a_command_for_the_present_or_an_impossible_mode_then_nothing_changes():
+    found = start_modes(Mode.RAW)
+    assert found.process(create_switch(START_UTIME, Mode.RAW)) == (found, ())
     bare = ModeLocalizer.start(LocalizerConfig(Setup(rig(gps=False)), RawSettings(), None), Mode.FULL)
-    after, notes = bare.process(wish(START_UTIME, Mode.RAW))
+    after, notes = bare.process(create_switch(START_UTIME, Mode.RAW))
     assert after is bare
     assert notes == (Rejected("command:console", "no_raw_mode"),)
     with pytest.raises(ValueError, match="raw mode needs a GPS and an inertial unit"):
         ModeLocalizer.start(LocalizerConfig(Setup(rig(gps=False)), RawSettings(), None), Mode.RAW)
 
 
-# --- the past -----------------------------------------------------------------------------------------------
+# --- past estimates -----------------------------------------------------------------------------------------
 
 
-def test_given_deferred_estimates_in_a_history_then_they_are_what_was_known_then():
-    found, history = warm(), History(60.0)
-    told: list[Estimate] = []
-    for sample in within(WARM, 16.0):
+def test_given_deferred_estimates_in_a_history_then_they_are_those_of_their_time():
+    found, history = drive_until_aligned(), History(60.0)
+    estimates: list[Estimate] = []
+    for sample in select_events(WARM, 16.0):
         found, _ = found.process(sample)
-        if not told or found.utime > told[-1].utime:
+        if not estimates or found.utime > estimates[-1].utime:
             deferred = found.defer_estimate(found.utime)
             assert isinstance(deferred, Deferred)
             history = history.append(deferred)
-            told.append(found.estimate(found.utime))
-    assert len(told) > 50
-    for each in told:
+            estimates.append(found.estimate(found.utime))
+    assert len(estimates) > 50
+    for each in estimates:
         assert same(dataclasses.astuple(history.at(each.utime)), dataclasses.astuple(each))
-    between = history.at((told[5].utime + told[6].utime) // 2)
+    between = history.at((estimates[5].utime + estimates[6].utime) // 2)
     assert between.enu is not None
-    assert told[5].enu is not None
-    assert math.dist(between.enu.xyz, told[5].enu.xyz) < 0.2
+    assert estimates[5].enu is not None
+    assert math.dist(between.enu.xyz, estimates[5].enu.xyz) < 0.2
 
 
-def test_given_a_time_within_the_horizon_when_asked_then_the_state_of_then_answers():
-    found = in_order()
+def test_given_a_time_within_the_horizon_then_the_estimate_is_by_the_state_of_that_time():
+    found = drive_in_order()
     for back in (0, 100_000, 400_000, 800_000):
         utime = found.utime - back
         truth = drive(0.1)[0].truth(utime)
@@ -384,12 +395,14 @@ def test_given_a_time_within_the_horizon_when_asked_then_the_state_of_then_answe
 
 def test_given_a_first_stamp_of_a_far_future_then_a_better_source_sets_the_time_and_the_pose_comes():
     stray = WheelsSample(SensorHeader(START_UTIME + 10**15, "stray"), ())
-    found = process_all(localizer(), (stray, *within(0.0, WARM)))
+    found = process_all(localizer(), (stray, *select_events(0.0, WARM)))
     assert not found.estimate(found.utime).invalid
-    assert found.utime == within(0.0, WARM)[-1].header.utime
+    assert found.utime == select_events(0.0, WARM)[-1].header.utime
 
 
 def test_given_a_first_stamp_of_a_far_future_then_a_lesser_source_cannot_set_the_time():
     stray = ImuSample(SensorHeader(START_UTIME + 10**15, "stray"))
-    found = process_all(localizer(), (stray, *(each for each in within(0.0, WARM) if isinstance(each, GpsSample))))
+    found = process_all(
+        localizer(), (stray, *(each for each in select_events(0.0, WARM) if isinstance(each, GpsSample)))
+    )
     assert found.clocks.newest == START_UTIME + 10**15
