@@ -1,4 +1,4 @@
-"""Starting while it rolls: nothing takes a vehicle that backs up for one that drives forward, with wheels or without.
+"""Start on the move: a vehicle that backs up is never taken for one that drives forward, with wheels or without.
 
 The vehicle is the Raptor as its vehicle file ships: encoders without an angle on the front wheels, which steer.
 """
@@ -56,11 +56,11 @@ STOPS_BACK = (AT_ONCE, DrivePhase(15.0), DrivePhase(2.0, 0.0), DrivePhase(5.0), 
 
 
 @lru_cache(maxsize=1)
-def raptor() -> Vehicle:
+def load_raptor() -> Vehicle:
     return load_vehicle(load_config(RAPTOR), str(RAPTOR))
 
 
-def raptor_drive(
+def drive_raptor(
     phases: tuple[DrivePhase, ...],
     seconds: float,
     seed: int = 1,
@@ -69,8 +69,8 @@ def raptor_drive(
     status: bool = True,
     transform: Transform = leave_unchanged,
 ) -> Run:
-    """The shipped Raptor on a drive; without `wheels` there are no samples of them, without `status` no angle."""
-    vehicle, config = raptor(), raptor().config
+    """Drive the shipped Raptor; without `wheels` there are no samples of them, without `status` no angle."""
+    vehicle, config = load_raptor(), load_raptor().config
     assert config.sensors.gps is not None
     assert config.sensors.imu is not None
     assert config.sensors.wheels is not None
@@ -89,66 +89,68 @@ def raptor_drive(
         wheels_model=WheelsModel(WHEELS_TIMING, steered=frozenset(frames)),
         status_model=StatusModel(1.5) if status else None,
     )
-    makings = vehicle.make_localizer_setup()
-    assert makings is not None
+    prepared = vehicle.make_localizer_setup()
+    assert prepared is not None
 
-    def as_encoders(events: Iterable[Event]) -> Iterable[Event]:
+    def drop_angles(events: Iterable[Event]) -> Iterable[Event]:
         for event in transform(events):
             if isinstance(event, WheelsSample):
                 event = replace(event, wheels=tuple(replace(each, steering=math.nan) for each in event.wheels))
             yield event
 
-    return drive(run, seconds, transform=as_encoders, every=0.1, localizer=FilterLocalizer.start(makings.setup, ORIGIN))
+    return drive(
+        run, seconds, transform=drop_angles, every=0.1, localizer=FilterLocalizer.start(prepared.setup, ORIGIN)
+    )
 
 
-def unsigned(events: Iterable[Event]) -> Iterable[Event]:
-    """Encoders that count up whichever way the wheels turn, and do not say which."""
+def drop_direction(events: Iterable[Event]) -> Iterable[Event]:
+    """Yield samples of encoders that count up in both directions, and do not measure which."""
     counted: dict[str, tuple[float, float]] = {}
     for event in events:
         if isinstance(event, WheelsSample):
             wheels = []
             for each in event.wheels:
-                last, way = counted.get(each.name, (each.travel, 0.0))
-                way += abs(each.travel - last)
-                counted[each.name] = (each.travel, way)
+                last, travel = counted.get(each.name, (each.travel, 0.0))
+                travel += abs(each.travel - last)
+                counted[each.name] = (each.travel, travel)
                 wheels.append(
                     WheelSample(
-                        each.name, way, each.travel_sigma, abs(each.speed), each.speed_sigma, Direction.UNSIGNED
+                        each.name, travel, each.travel_sigma, abs(each.speed), each.speed_sigma, Direction.UNSIGNED
                     )
                 )
             event = replace(event, wheels=tuple(wheels))
         yield event
 
 
-def first_valid(run: Run) -> float:
+def find_first_valid(run: Run) -> float:
     return next((row.t for row in run.rows if row.valid), math.inf)
 
 
-def wheels_used(run: Run) -> tuple[int, int]:
+def count_used_wheels(run: Run) -> tuple[int, int]:
     return len(run.decisions("wheel_speed", Verdict.USED)), len(run.decisions("wheel_speed"))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("status", [True, False])
 def test_given_the_raptors_wheels_when_it_starts_rolling_backward_then_the_heading_is_right_at_once(status, seed):
-    run = raptor_drive(CURVES_BACK, 25.0, seed, status=status)
-    assert first_valid(run) < 7.0
+    run = drive_raptor(CURVES_BACK, 25.0, seed, status=status)
+    assert find_first_valid(run) < 7.0
     assert find_longest_misleading(run) <= 1.0
     assert max(abs(row.heading) for row in run.rows if row.valid) < math.radians(10.0)
-    used, measured = wheels_used(run)
+    used, measured = count_used_wheels(run)
     assert used == measured > 40
 
 
-@pytest.mark.parametrize("transform", [leave_unchanged, unsigned])
+@pytest.mark.parametrize("transform", [leave_unchanged, drop_direction])
 @pytest.mark.parametrize("phases", [CURVES_BACK, BRAKES_BACK, STOPS_BACK])
 def test_given_no_direction_when_it_rolls_backward_then_heading_waits_for_accelerations_and_is_right(phases, transform):
-    run = raptor_drive(phases, 40.0, wheels=transform is unsigned, status=False, transform=transform)
+    run = drive_raptor(phases, 40.0, wheels=transform is drop_direction, status=False, transform=transform)
     # nothing is decided on the straight before the bend, the brakes or the stop
-    assert 10.0 < first_valid(run) < 32.0
+    assert 10.0 < find_first_valid(run) < 32.0
     assert find_longest_misleading(run) <= 1.0
     assert max(abs(row.heading) for row in run.rows if row.valid) < math.radians(25.0)
-    if transform is unsigned:
-        used, measured = wheels_used(run)
+    if transform is drop_direction:
+        used, measured = count_used_wheels(run)
         assert 0 < used < measured
         assert run.decisions("wheel_speed", Verdict.REJECTED, "direction")
 
@@ -156,19 +158,19 @@ def test_given_no_direction_when_it_rolls_backward_then_heading_waits_for_accele
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_given_a_straight_at_steady_speed_without_a_direction_then_no_heading_is_valid_and_the_reason_is_found(sign):
     phases = tuple(replace(each, speed=each.speed and -sign * each.speed) for each in STRAIGHT_BACK)
-    run = raptor_drive(phases, 30.0, wheels=False, status=False)
-    assert first_valid(run) == math.inf
+    run = drive_raptor(phases, 30.0, wheels=False, status=False)
+    assert find_first_valid(run) == math.inf
     found = run.localizer.summary(run.localizer.utime).findings
     assert "direction" in [each.reason for each in found]
 
 
 def test_given_a_speed_that_no_vehicle_backs_up_with_then_it_drives_forward():
-    run = raptor_drive((DrivePhase(1e-3, 9.0), DrivePhase(60.0)), 12.0, wheels=False, status=False)
-    assert first_valid(run) < 8.0
+    run = drive_raptor((DrivePhase(1e-3, 9.0), DrivePhase(60.0)), 12.0, wheels=False, status=False)
+    assert find_first_valid(run) < 8.0
     assert find_longest_misleading(run) <= 1.0
 
 
-def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_cost_nothing():
+def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_do_no_harm():
     phases = (
         DrivePhase(4.0),
         DrivePhase(2.0, 3.0),
@@ -176,7 +178,7 @@ def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_cost_
         DrivePhase(9.0),
     )
 
-    def angles(events: Iterable[Event]) -> Iterable[Event]:
+    def corrupt_angles(events: Iterable[Event]) -> Iterable[Event]:
         for event in events:
             t = (event.header.utime - START_UTIME) * 1e-6
             if isinstance(event, VehicleStatusSample):
@@ -186,8 +188,8 @@ def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_cost_
                     event = replace(event, steering_angle=1.2)
             yield event
 
-    run = raptor_drive(phases, 28.0, transform=angles)
-    used, measured = wheels_used(run)
+    run = drive_raptor(phases, 28.0, transform=corrupt_angles)
+    used, measured = count_used_wheels(run)
     assert used == measured
     assert find_longest_misleading(run) <= 0.5
     assert {each.reason for each in run.ledger if each.kind == "steering"} == {"range"}

@@ -1,4 +1,4 @@
-"""The filter and sensors that fail: numbers that are none, clocks that step, wheels that slip, an iron bridge."""
+"""The filter and sensors that fail: non-finite numbers, clocks that step, wheels that slip, magnetic disturbances."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIELD = magnetic_field(50.27, -111.18, 700.0, START_UTIME)
 ODD = (math.nan, math.inf, -math.inf)
 
 
-def _all_well(found: Run, begin: float, most: float = 1.2) -> None:
+def _check_all(found: Run, begin: float, most: float = 1.2) -> None:
     rows = found.between(begin)
     assert all(row.valid for row in rows)
     assert max(row.off for row in rows) < most
@@ -43,7 +43,7 @@ def _all_well(found: Run, begin: float, most: float = 1.2) -> None:
     assert all(row.off < row.estimate.horizontal_protection_level for row in rows)
 
 
-def _numbers_only(found: Run) -> None:
+def _check_finite(found: Run) -> None:
     for row in found.rows:
         numbers = (*row.estimate.odom.xyz, *row.estimate.odom.wxyz)
         if row.estimate.enu is not None:
@@ -51,8 +51,8 @@ def _numbers_only(found: Run) -> None:
         assert all(map(math.isfinite, numbers))
 
 
-def _put(sample: Event, field: str, value: float) -> Event:
-    """The sample with a number, or the second number of a vector, or a wheel's number, replaced."""
+def _replace_number(sample: Event, field: str, value: float) -> Event:
+    """Return the sample with a number, the second number of a vector, or a wheel's number replaced."""
     if isinstance(sample, WheelsSample):
         first, *others = sample.wheels
         return replace(sample, wheels=(replace(first, **{field: value}), *others))
@@ -77,8 +77,8 @@ SPREADS = ("position_covariance", "velocity_covariance", "speed_sigma", "course_
 SPREADS += ("travel_sigma", "angular_velocity_covariance")
 
 
-def _spoilt(events, source: str) -> Iterator[Event]:
-    """Every fifth sample of a source from the 20th second on has an odd number in one field, all in turn."""
+def _corrupt(events, source: str) -> Iterator[Event]:
+    """Yield samples; those of a source after the 20th second have an odd number in one field after the other."""
     odd = [(field, value) for field in FIELDS[source] for value in ODD]
     odd += [(field, value) for field in FIELDS[source] if field in SPREADS for value in (0.0, -1.0)]
     every = 1 if source == "gps" else 3
@@ -87,24 +87,24 @@ def _spoilt(events, source: str) -> Iterator[Event]:
         if event.header.source == source and event.header.utime > START_UTIME + 20_000_000:
             count += 1
             if count % every == 0:
-                yield _put(event, *odd[(count // every) % len(odd)])
+                yield _replace_number(event, *odd[(count // every) % len(odd)])
                 continue
         yield event
 
 
 @pytest.mark.parametrize("source", list(FIELDS))
-def test_given_numbers_that_are_none_in_every_field_when_driven_then_the_pose_stays_right(source):
+def test_given_non_finite_numbers_in_every_field_then_the_pose_stays_right(source):
     run = simulation(
         EIGHT, second_gps_frame="Car:Second", imu_model=replace(IMU, magnetometer=MagnetometerModel(FIELD))
     )
 
-    found = drive(run, 45.0, transform=lambda events: _spoilt(events, source))
+    found = drive(run, 45.0, transform=lambda events: _corrupt(events, source))
 
-    _numbers_only(found)
-    _all_well(found, 20.0)
+    _check_finite(found)
+    _check_all(found, 20.0)
 
 
-def test_given_messages_twice_when_driven_then_each_counts_once():
+def test_given_messages_twice_then_each_is_used_once():
     once = drive(simulation(EIGHT), 35.0)
     twice = drive(simulation(EIGHT), 35.0, transform=lambda events: faults.duplicate(events, 3, 0.3, max_delay=0.05))
 
@@ -113,24 +113,24 @@ def test_given_messages_twice_when_driven_then_each_counts_once():
     assert {word.reason for word in twice.ledger if word.verdict is Verdict.REJECTED} <= {"duplicate"}
 
 
-def test_given_the_receivers_clock_set_back_when_driven_then_only_its_fixes_are_refused():
+def test_given_the_clock_of_the_receiver_set_back_then_only_its_fixes_are_rejected():
     back_at = START_UTIME + 30_000_000
 
     found = drive(simulation(EIGHT), 50.0, transform=lambda events: faults.step_clock_back(events, back_at, 5.0, "gps"))
 
-    refused = [word for word in found.decisions("gps_position", Verdict.REJECTED) if word.utime >= back_at - 5_000_000]
-    assert {word.reason for word in refused} <= {"out_of_sequence", "too_old"}
-    assert refused
+    rejected = [word for word in found.decisions("gps_position", Verdict.REJECTED) if word.utime >= back_at - 5_000_000]
+    assert {word.reason for word in rejected} <= {"out_of_sequence", "too_old"}
+    assert rejected
     assert len({row.estimate.pose_epoch for row in found.between(20.0)}) == 1
-    _all_well(found, 20.0)
+    _check_all(found, 20.0)
 
 
 @pytest.mark.parametrize("seconds", [100.0, -3600.0], ids=["back", "ahead"])
-def test_given_the_computers_clock_set_when_driven_then_the_pose_comes_back_and_odom_goes_on(seconds):
+def test_given_the_clock_of_the_computer_set_then_the_pose_is_valid_again_and_odom_continues(seconds):
     at = START_UTIME + 30_000_000
     run = simulation(EIGHT)
     localizer = FilterLocalizer.start(Setup(RIG), ORIGIN)
-    poses, anew, epochs = [], [], []
+    poses, later, epochs = [], [], []
     true = list(run.events(75.0))
     for original, event in zip(true, faults.step_clock_back(true, at, seconds), strict=True):
         localizer, _ = localizer.process(event)
@@ -139,31 +139,31 @@ def test_given_the_computers_clock_set_when_driven_then_the_pose_comes_back_and_
         if original.header.utime < at - 100_000:
             epochs.append(estimate.pose_epoch)
         if original.header.utime > at + 30_000_000:
-            anew.append((estimate, run.truth(estimate.utime + round(seconds * 1e6)).enu))
+            later.append((estimate, run.truth(estimate.utime + round(seconds * 1e6)).enu))
 
     for (before, a), (after, b) in pairwise(poses):
-        # over a time that nobody saw Odom goes on as it did for half a second at most
+        # over an unobserved time Odom continues as before for half a second at most
         assert math.dist(a, b) < 0.05 + 2.6 * min(max((after - before) * 1e-6, 0.02), 0.5)
-    assert all(estimate.enu is not None and not estimate.invalid for estimate, _ in anew)
-    assert max(math.dist(estimate.enu.xyz[:2], true.xyz[:2]) for estimate, true in anew) < 1.5
+    assert all(estimate.enu is not None and not estimate.invalid for estimate, _ in later)
+    assert max(math.dist(estimate.enu.xyz[:2], true.xyz[:2]) for estimate, true in later) < 1.5
     if seconds > 0.0:
-        assert anew[-1][0].pose_epoch > epochs[-1]
+        assert later[-1][0].pose_epoch > epochs[-1]
 
 
-def test_given_one_stamp_far_ahead_when_driven_then_that_sample_alone_is_refused():
-    def ahead(events):
+def test_given_one_stamp_far_ahead_then_that_sample_alone_is_rejected():
+    def set_ahead(events):
         for event in events:
             odd = event.header.source == "gps" and event.header.seq == 100
             yield replace(event, header=replace(event.header, utime=event.header.utime + 10**10)) if odd else event
 
-    found = drive(simulation(EIGHT), 40.0, transform=ahead)
+    found = drive(simulation(EIGHT), 40.0, transform=set_ahead)
 
     assert [word.seq for word in found.ledger if word.reason == "future"][:1] == [100]
     assert len([word for word in found.decisions("gps_position") if word.reason == "future"]) == 1
-    _all_well(found, 20.0)
+    _check_all(found, 20.0)
 
 
-def test_given_an_inertial_unit_that_freezes_when_driven_then_it_is_refused_and_the_pose_is_not_valid():
+def test_given_an_imu_that_freezes_then_it_is_rejected_and_the_pose_is_not_valid():
     found = drive(simulation(EIGHT, imu_model=replace(IMU, frozen_from=25.0)), 40.0)
 
     assert found.decisions("inertial", Verdict.REJECTED, "frozen")
@@ -171,7 +171,7 @@ def test_given_an_inertial_unit_that_freezes_when_driven_then_it_is_refused_and_
     assert found.at(24.0).valid
 
 
-def test_given_gaps_of_the_inertial_unit_when_driven_then_they_are_bridged_and_the_bound_covers_the_error():
+def test_given_gaps_of_the_imu_then_they_are_bridged_and_the_protection_level_covers_the_error():
     model = replace(IMU, outages=((25.0, 25.4), (30.0, 32.0)))
 
     found = drive(simulation(EIGHT, imu_model=model), 45.0)
@@ -193,14 +193,14 @@ def test_given_gaps_of_the_inertial_unit_when_driven_then_they_are_bridged_and_t
     ],
     ids=["one_stuck", "all_stuck", "one_swapped", "bursts"],
 )
-def test_given_wheels_that_fail_when_driven_with_fixes_then_the_pose_stays_right(encoder):
+def test_given_wheels_that_fail_with_fixes_then_the_pose_stays_right(encoder):
     found = drive(simulation(EIGHT, wheels_model=WheelsModel(WHEELS_TIMING, encoder=encoder)), 50.0)
 
-    _all_well(found, 22.0, most=1.5)
+    _check_all(found, 22.0, most=1.5)
     assert not any(row.estimate.invalid for row in found.between(26.0))
 
 
-def test_given_gravity_along_another_axis_than_the_mount_says_when_driven_then_the_pose_is_never_valid_and_says_why():
+def test_given_gravity_along_another_axis_than_by_the_mount_then_the_pose_is_never_valid_and_the_reason_is_reported():
     wrong = rig(imu=Pose.from_rpy((0.3, -0.3, 0.5), 0.0, 0.0, 0.0))
 
     found = drive(simulation(EIGHT), 40.0, on=wrong)
@@ -213,31 +213,31 @@ def test_given_gravity_along_another_axis_than_the_mount_says_when_driven_then_t
 PULLED = ((30.0, 40.0, (3e-5, 0.0, 5e-5)),)
 
 
-def test_given_iron_beside_the_way_when_magnetic_headings_are_used_then_the_field_is_refused():
+def test_given_iron_beside_the_path_when_magnetic_headings_are_used_then_the_field_is_rejected():
     model = replace(IMU, magnetometer=MagnetometerModel(FIELD, noise=2e-7, disturbances=PULLED))
 
     found = drive(simulation(EIGHT, imu_model=model), 45.0, settings=FilterSettings(use_magnetometer=True))
 
-    refused = [found.seconds(word) for word in found.decisions("magnetometer", Verdict.REJECTED)]
-    assert len([t for t in refused if 30.0 <= t < 40.0]) >= 15
+    rejected = [found.seconds(word) for word in found.decisions("magnetometer", Verdict.REJECTED)]
+    assert len([t for t in rejected if 30.0 <= t < 40.0]) >= 15
     assert found.decisions("magnetometer", Verdict.USED)
-    _all_well(found, 20.0)
+    _check_all(found, 20.0)
 
 
-def test_given_a_field_that_is_wrong_always_when_in_vertical_gyro_mode_then_it_is_watched_and_changes_nothing():
+def test_given_a_field_that_is_always_wrong_in_vertical_gyro_mode_then_it_is_monitored_and_changes_nothing():
     turned = (FIELD[1], -FIELD[0], FIELD[2])
     without = drive(simulation(EIGHT), 35.0)
     beside = drive(simulation(EIGHT, imu_model=replace(IMU, magnetometer=MagnetometerModel(turned))), 35.0)
 
-    watched = beside.decisions("magnetometer", Verdict.MONITORED, "vertical_gyro")
-    assert watched
+    monitored = beside.decisions("magnetometer", Verdict.MONITORED, "vertical_gyro")
+    assert monitored
     assert not beside.decisions("magnetometer", Verdict.USED)
-    assert abs(np.mean([word.residual[0] for word in watched if beside.seconds(word) > 20.0])) > 0.5
-    # measuring it takes the state to the same instants by other steps: rounding remains
+    assert abs(np.mean([word.residual[0] for word in monitored if beside.seconds(word) > 20.0])) > 0.5
+    # its samples propagate the state to the same instants by other steps: rounding remains
     assert math.dist(beside.last.estimate.enu.xyz, without.last.estimate.enu.xyz) < 1e-2
 
 
-def test_given_a_unit_with_a_magnetic_yaw_when_it_stands_in_magnetometer_mode_then_heading_is_known():
+def test_given_a_stationary_imu_with_a_magnetic_yaw_in_magnetometer_mode_then_the_heading_is_known():
     model = replace(IMU, yaw_source=YawSource.MAGNETIC, yaw_noise=0.01, magnetometer=MagnetometerModel(FIELD))
 
     found = drive(simulation(stationary(30.0), imu_model=model), 30.0, settings=FilterSettings(use_magnetometer=True))

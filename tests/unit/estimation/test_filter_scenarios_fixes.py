@@ -1,4 +1,4 @@
-"""The filter and its fixes: jumps, outages, lateness, velocities of the past, and what stands in for fixes."""
+"""The filter and its fixes: jumps, outages, latency, delayed velocities, and aiding sources instead of fixes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FOREVER = 1e9
 @pytest.mark.parametrize(
     ("model", "far"), [(PLAIN_GPS, 700.0), (PLAIN_GPS, 20.0), (RTK_LIKE, 5.0)], ids=["700m", "20m", "5m_rtk"]
 )
-def test_given_fixes_that_jump_for_ten_seconds_when_driven_on_then_the_pose_does_not_follow(model, far):
+def test_given_fixes_that_jump_for_ten_seconds_then_the_pose_does_not_follow(model, far):
     gps = replace(model, jumps=((40.0, 50.0, far * 0.8, far * 0.6),))
 
     found = drive(simulation(EIGHT, gps_model=gps), 65.0, every=0.1)
@@ -39,28 +39,32 @@ def test_given_fixes_that_jump_for_ten_seconds_when_driven_on_then_the_pose_does
 
     pairs = list(zip(found.between(40.0), plain.between(40.0), strict=True))
     assert max(math.dist(a.estimate.enu.xyz[:2], b.estimate.enu.xyz[:2]) for a, b in pairs) < 1.0
-    refused = [found.seconds(word) for word in found.decisions("gps_position", Verdict.REJECTED, "gate")]
-    assert len([t for t in refused if 40.0 <= t < 50.0]) >= 38
-    assert not [t for t in refused if t >= 53.0]
+    rejected = [found.seconds(word) for word in found.decisions("gps_position", Verdict.REJECTED, "gate")]
+    assert len([t for t in rejected if 40.0 <= t < 50.0]) >= 38
+    assert not [t for t in rejected if t >= 53.0]
     assert len({row.estimate.pose_epoch for row in found.between(20.0)}) == 1
     assert max(found.odom_steps) < 0.05
 
 
-def test_given_fixes_that_jump_for_good_when_it_stands_then_drives_then_the_pose_is_taken_up_anew_only_by_driving():
-    standing_until = 110.0
+def test_given_a_permanent_jump_of_fixes_while_stationary_then_the_position_is_reset_only_once_it_drives():
+    stationary_until = 110.0
     ahead = figure_eight(speed=3.0, radius=8.0, stationary=4.0)
     driven = sum(phase.duration for phase in ahead)
-    phases = (*ahead, DrivePhase(standing_until - driven), *figure_eight(speed=3.0, radius=8.0, stationary=1.0, laps=2))
+    phases = (
+        *ahead,
+        DrivePhase(stationary_until - driven),
+        *figure_eight(speed=3.0, radius=8.0, stationary=1.0, laps=2),
+    )
     gps = replace(PLAIN_GPS, jumps=((driven + 3.0, FOREVER, 30.0, 0.0),))
 
-    found = drive(simulation(phases, gps_model=gps), standing_until + 60.0, every=0.1)
+    found = drive(simulation(phases, gps_model=gps), stationary_until + 60.0, every=0.1)
 
-    resting = found.between(driven + 3.0, standing_until)
-    anew = [word for word in found.decisions("gps_position", Verdict.RESET) if found.seconds(word) > driven]
+    resting = found.between(driven + 3.0, stationary_until)
+    resets = [word for word in found.decisions("gps_position", Verdict.RESET) if found.seconds(word) > driven]
     assert max(row.off for row in resting) < 1.5
     assert Invalid.GPS_REJECTED in resting[-1].estimate.invalid
-    assert len(anew) == 1
-    assert found.seconds(anew[0]) > standing_until + 5.0
+    assert len(resets) == 1
+    assert found.seconds(resets[0]) > stationary_until + 5.0
     assert found.last.valid
     assert abs(found.last.east - 30.0) < 2.0
     assert abs(found.last.north) < 2.0
@@ -68,7 +72,7 @@ def test_given_fixes_that_jump_for_good_when_it_stands_then_drives_then_the_pose
     assert max(found.odom_steps) < 0.05
 
 
-def test_given_an_outage_of_a_minute_when_driven_on_then_the_bound_grows_covers_the_error_and_shrinks_again():
+def test_given_an_outage_of_a_minute_then_the_protection_level_grows_covers_the_error_and_shrinks_again():
     gps = replace(RTK_LIKE, outages=((40.0, 100.0),))
 
     found = drive(simulation(figure_eight(speed=3.0, radius=8.0, laps=4), gps_model=gps), 120.0)
@@ -76,7 +80,7 @@ def test_given_an_outage_of_a_minute_when_driven_on_then_the_bound_grows_covers_
     silent = found.between(41.0, 100.0)
     bounds = [row.estimate.horizontal_protection_level for row in silent]
     assert bounds[-1] > 3.0 * bounds[0]
-    # not at every step: on the way back a wrong heading takes back what it did
+    # not at every step: on the return path a heading error cancels its own effect
     assert np.mean(bounds[-40:]) > 1.5 * np.mean(bounds[:40])
     assert all(row.off < row.estimate.horizontal_protection_level for row in found.between(30.0))
     assert all(row.valid for row in silent)
@@ -84,7 +88,7 @@ def test_given_an_outage_of_a_minute_when_driven_on_then_the_bound_grows_covers_
     assert found.last.estimate.horizontal_protection_level < 0.5 * bounds[-1]
 
 
-def test_given_fixes_half_a_second_late_and_out_of_order_when_driven_then_the_pose_is_that_of_punctual_ones():
+def test_given_fixes_delayed_by_half_a_second_and_out_of_sequence_then_the_pose_is_that_of_punctual_ones():
     phases = figure_eight(speed=3.0, radius=8.0)
     seconds = sum(phase.duration for phase in phases)
 
@@ -96,34 +100,34 @@ def test_given_fixes_half_a_second_late_and_out_of_order_when_driven_then_the_po
     assert rms(row.off for row in late.between(20.0)) < 1.2 * rms(row.off for row in punctual.between(20.0)) + 0.05
 
 
-def test_given_fixes_later_than_the_horizon_when_they_come_then_they_are_refused_as_late():
+def test_given_fixes_older_than_the_horizon_then_they_are_rejected_as_too_old():
     found = drive(simulation(EIGHT), 40.0, transform=lambda events: faults.delay(events, 2, "gps", 1.8, min_delay=1.5))
 
     assert found.decisions("gps_position", Verdict.REJECTED, "too_old")
     assert not found.decisions("gps_position", Verdict.USED)
 
 
-def test_given_velocities_of_the_past_when_their_age_is_told_then_they_fit_the_drive():
+def test_given_delayed_velocities_with_their_latency_then_they_fit_the_drive():
     phases = stop_and_go(speed=4.0, go=2.0, ramp=1.5, times=6, curvature=0.1)
     gps = GpsModel(GPS_TIMING, correlated_sigma=0.3, white_sigma=0.05, velocity_latency=0.3)
     seconds = sum(phase.duration for phase in phases)
 
-    told = drive(simulation(phases, gps_model=gps), seconds)
-    untold = drive(simulation(phases, gps_model=gps), seconds, transform=_of_now)
+    stated = drive(simulation(phases, gps_model=gps), seconds)
+    unstated = drive(simulation(phases, gps_model=gps), seconds, transform=_drop_latency)
 
-    fits = [word.statistic / word.dof for word in told.decisions("gps_velocity") if word.dof]
-    misfits = [word.statistic / word.dof for word in untold.decisions("gps_velocity") if word.dof]
+    fits = [word.statistic / word.dof for word in stated.decisions("gps_velocity") if word.dof]
+    misfits = [word.statistic / word.dof for word in unstated.decisions("gps_velocity") if word.dof]
     assert np.mean(fits) < 2.0
     assert np.mean(misfits) > 5.0 * np.mean(fits)
-    assert len(told.decisions("gps_velocity", Verdict.REJECTED)) < 0.02 * len(fits)
+    assert len(stated.decisions("gps_velocity", Verdict.REJECTED)) < 0.02 * len(fits)
 
 
-def _of_now(events):
+def _drop_latency(events):
     for event in events:
         yield replace(event, velocity_latency=0.0) if event.header.source == "gps" else event
 
 
-def test_given_no_fixes_when_a_pose_is_told_then_it_is_taken_and_ranges_to_beacons_hold_it():
+def test_given_no_fixes_but_a_pose_then_it_is_used_and_ranges_to_beacons_maintain_it():
     phases = figure_eight(speed=2.0, radius=8.0, laps=2)
     once = AbsolutePoseModel(outages=((6.0, 200.0),))
     without_fixes = {"gps_frame": None, "pose_frame": "Car:Camera", "pose_model": once}
@@ -140,7 +144,7 @@ def test_given_no_fixes_when_a_pose_is_told_then_it_is_taken_and_ranges_to_beaco
     assert held.last.estimate.horizontal_protection_level < 0.3 * alone.last.estimate.horizontal_protection_level
 
 
-def test_given_an_outage_without_wheels_when_a_camera_tells_the_way_then_the_error_is_far_smaller():
+def test_given_an_outage_without_wheels_but_with_visual_odometry_then_the_error_is_far_smaller():
     gps = replace(RTK_LIKE, outages=((40.0, 70.0),))
     phases = figure_eight(speed=2.0, radius=8.0, laps=2)
     bare = {"gps_model": gps, "wheel_frames": None}

@@ -1,4 +1,4 @@
-"""Every mode, every switch between two of them while driving, and a filter that has diverged."""
+"""Every mode, every switch between two of them on the move, and a filter that has diverged."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from tests.support_filter import ORIGIN, RIG, SharedDrive, drive, simulation
 
 pytestmark = pytest.mark.slow
 
-WORLDLY = (Mode.FULL, Mode.RAW, Mode.NO_IMU, Mode.NO_WHEELS)
-EYELESS = (Mode.NO_GPS, Mode.DEAD_RECKONING)
+WITH_FIXES = (Mode.FULL, Mode.RAW, Mode.NO_IMU, Mode.NO_WHEELS)
+WITHOUT_FIXES = (Mode.NO_GPS, Mode.DEAD_RECKONING)
 
 
 @cache
-def town() -> SharedDrive:
+def simulate_town() -> SharedDrive:
     """Drive through a town for 80 s."""
     return SharedDrive(simulation(city(5, 80.0, speed=5.0)), 80.0)
 
 
-def _localizer(mode: Mode = Mode.FULL) -> ModeLocalizer:
+def _start_localizer(mode: Mode = Mode.FULL) -> ModeLocalizer:
     mounts = Mounts.from_model(RIG.model, "Car:Base", "Car:Antenna", "Car:Imu")
     return ModeLocalizer.start(LocalizerConfig(Setup(RIG), RawSettings(), mounts), mode, ORIGIN)
 
 
-def _switch(t: float, number: int, mode: Mode) -> tuple[float, SwitchMode]:
+def _create_switch(t: float, number: int, mode: Mode) -> tuple[float, SwitchMode]:
     return t, SwitchMode(SensorHeader(START_UTIME + round(t * 1e6), "operator", number), mode)
 
 
-@pytest.mark.parametrize("mode", WORLDLY, ids=lambda mode: mode.name.lower())
+@pytest.mark.parametrize("mode", WITH_FIXES, ids=lambda mode: mode.name.lower())
 def test_given_a_mode_with_fixes_when_driven_through_a_town_then_the_pose_is_valid_and_right(mode):
-    found = drive(town(), 80.0, localizer=_localizer(mode), every=0.02)
+    found = drive(simulate_town(), 80.0, localizer=_start_localizer(mode), every=0.02)
 
     known = found.between(30.0)
     assert np.mean([row.valid for row in known]) > 0.95
@@ -53,21 +53,21 @@ def test_given_a_mode_with_fixes_when_driven_through_a_town_then_the_pose_is_val
     assert max(found.odom_steps) < 0.05
 
 
-@pytest.mark.parametrize("mode", EYELESS, ids=lambda mode: mode.name.lower())
+@pytest.mark.parametrize("mode", WITHOUT_FIXES, ids=lambda mode: mode.name.lower())
 def test_given_a_mode_without_fixes_when_driven_through_a_town_then_odom_alone_is_good(mode):
-    found = drive(town(), 80.0, localizer=_localizer(mode), every=0.02)
+    found = drive(simulate_town(), 80.0, localizer=_start_localizer(mode), every=0.02)
 
     first, last = found.at(8.0), found.last
     true = [found.simulation.truth(row.estimate.utime).enu for row in (first, last)]
     moved = (first.estimate.odom.inverse() @ last.estimate.odom).xyz
-    way = sum(math.dist(a.estimate.odom.xyz, b.estimate.odom.xyz) for a, b in pairwise(found.between(8.0)))
+    distance = sum(math.dist(a.estimate.odom.xyz, b.estimate.odom.xyz) for a, b in pairwise(found.between(8.0)))
     assert all(Invalid.NOT_MOVED_YET in row.estimate.invalid for row in found.rows)
-    assert math.dist(moved, (true[0].inverse() @ true[1]).xyz) < 0.03 * way
+    assert math.dist(moved, (true[0].inverse() @ true[1]).xyz) < 0.03 * distance
     assert max(found.odom_steps) < 0.05
 
 
-def _every_switch() -> list[Mode]:
-    """Modes in a row so that each is followed once by each other one, the first being FULL (Hierholzer)."""
+def _list_switches() -> list[Mode]:
+    """Return modes in a row, FULL first, so that each is followed once by each other one (Hierholzer)."""
     left = {mode: [to for frm, to in permutations(Mode, 2) if frm is mode] for mode in Mode}
     stack, found = [Mode.FULL], []
     while stack:
@@ -78,15 +78,15 @@ def _every_switch() -> list[Mode]:
     return found[::-1]
 
 
-def test_given_every_switch_of_modes_when_driven_through_a_town_then_odom_and_pose_go_on():
-    modes = _every_switch()
+def test_given_every_switch_of_modes_when_driven_through_a_town_then_odom_and_pose_continue():
+    modes = _list_switches()
     assert len(set(pairwise(modes))) == 30
     begin, stay = 30.0, 4.0
-    switches = [_switch(begin + stay * number, number, mode) for number, mode in enumerate(modes[1:])]
+    switches = [_create_switch(begin + stay * number, number, mode) for number, mode in enumerate(modes[1:])]
     seconds = begin + stay * len(modes)
 
     found = drive(
-        simulation(city(7, seconds, speed=5.0)), seconds, localizer=_localizer(), every=0.02, switches=switches
+        simulation(city(7, seconds, speed=5.0)), seconds, localizer=_start_localizer(), every=0.02, switches=switches
     )
 
     assert max(found.odom_steps) < 0.05
@@ -101,7 +101,7 @@ def test_given_every_switch_of_modes_when_driven_through_a_town_then_odom_and_po
     assert {word.verdict for word in words} == {Verdict.RESET}
 
 
-def _absurd(localizer: FilterLocalizer, **changes) -> FilterLocalizer:
+def _corrupt(localizer: FilterLocalizer, **changes) -> FilterLocalizer:
     bad = localizer.head._replace(nav=localizer.head.nav._replace(**changes))
     return replace(localizer, timeline=Timeline(bad), head=bad)
 
@@ -116,30 +116,30 @@ def _absurd(localizer: FilterLocalizer, **changes) -> FilterLocalizer:
     ],
     ids=["speed", "nan", "bias", "covariance"],
 )
-def test_given_a_filter_that_diverged_when_driven_on_then_it_begins_anew_with_the_biases_it_had(changes):
+def test_given_a_filter_that_diverged_then_it_restarts_with_its_biases(changes):
     run = simulation(figure_eight(speed=2.5, radius=8.0, stationary=8.0, laps=2))
     before = drive(run, 30.0)
     good = before.localizer.head
     if "covariance" in changes:
         changes = {"covariance": np.full_like(good.nav.covariance, math.nan)}
-    resume = drive(run, 30.0, localizer=_absurd(before.localizer, **changes), every=0.1)
+    restarted = drive(run, 30.0, localizer=_corrupt(before.localizer, **changes), every=0.1)
 
-    anew = [word for word in resume.ledger if word.reason == "the filter had diverged"]
-    assert len(anew) == 1
-    assert anew[0].verdict is Verdict.RESET
-    assert any(not row.valid for row in resume.rows)
-    assert resume.last.valid
-    assert resume.last.off < 1.5
-    assert abs(resume.last.heading) < math.radians(6.0)
-    assert resume.last.estimate.pose_epoch > before.last.estimate.pose_epoch
-    bias, sigma = good.biases
-    assert math.dist(resume.localizer.head.nav.gyro_bias, bias) < 5.0 * sigma
-    assert max(resume.odom_steps) < 0.05
+    resets = [word for word in restarted.ledger if word.reason == "the filter had diverged"]
+    assert len(resets) == 1
+    assert resets[0].verdict is Verdict.RESET
+    assert any(not row.valid for row in restarted.rows)
+    assert restarted.last.valid
+    assert restarted.last.off < 1.5
+    assert abs(restarted.last.heading) < math.radians(6.0)
+    assert restarted.last.estimate.pose_epoch > before.last.estimate.pose_epoch
+    bias, sigma = good.common.gyro_biases
+    assert math.dist(restarted.localizer.head.nav.gyro_bias, bias) < 5.0 * sigma
+    assert max(restarted.odom_steps) < 0.05
 
 
-def test_given_a_pose_in_the_outer_space_when_told_once_heading_is_known_then_it_is_refused():
+def test_given_a_pose_in_outer_space_once_the_heading_is_known_then_it_is_rejected():
     found = drive(simulation(figure_eight(speed=2.5, radius=8.0)), 30.0)
-    told = AbsolutePoseSample(
+    pose = AbsolutePoseSample(
         SensorHeader(found.localizer.utime, "operator", 1),
         "Car:Base",
         "World:ENU",
@@ -147,7 +147,7 @@ def test_given_a_pose_in_the_outer_space_when_told_once_heading_is_known_then_it
         orientation=(1.0, 0.0, 0.0, 0.0),
     )
 
-    localizer, _ = found.localizer.process(told)
+    localizer, _ = found.localizer.process(pose)
 
     estimate = localizer.estimate(localizer.utime)
     assert not estimate.invalid

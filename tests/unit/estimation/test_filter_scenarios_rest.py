@@ -1,4 +1,4 @@
-"""The filter on drives as users make them: standing for long, in reverse, on slopes, with the body turned."""
+"""The filter on ordinary drives: stationary for long, in reverse, on slopes, with the body turned."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ pytestmark = pytest.mark.slow
 
 SLOW_IMU = replace(IMU, timing=Timing(12.5))
 SLOW_WHEELS = WheelsModel(Timing(2.5))
-WANDERING = GpsModel(Timing(1.0), correlated_sigma=1.0, white_sigma=0.15, time_constant=60.0)
+DRIFTING = GpsModel(Timing(1.0), correlated_sigma=1.0, white_sigma=0.15, time_constant=60.0)
 TEN_MINUTES = 600.0
 
 
-def test_given_fixes_that_wander_when_it_stands_ten_minutes_after_a_drive_then_the_pose_stays():
+def test_given_drifting_fixes_when_stationary_for_ten_minutes_after_a_drive_then_the_pose_stays():
     eight = figure_eight(speed=2.5, radius=8.0, stationary=4.0, ramp=3.0)
     driven = sum(phase.duration for phase in eight)
     run = simulation(
-        (*eight, *stationary(TEN_MINUTES)), gps_model=WANDERING, imu_model=SLOW_IMU, wheels_model=SLOW_WHEELS, seed=4
+        (*eight, *stationary(TEN_MINUTES)), gps_model=DRIFTING, imu_model=SLOW_IMU, wheels_model=SLOW_WHEELS, seed=4
     )
 
     found = drive(run, driven + TEN_MINUTES, every=2.0)
@@ -48,10 +48,10 @@ def test_given_fixes_that_wander_when_it_stands_ten_minutes_after_a_drive_then_t
     assert math.dist(rest[0].estimate.odom.xyz, rest[-1].estimate.odom.xyz) < 0.01
 
 
-def test_given_two_antennas_when_it_stands_ten_minutes_from_the_start_then_pose_and_heading_are_known_and_stay():
+def test_given_two_antennas_when_stationary_for_ten_minutes_from_the_start_then_pose_and_heading_are_known_and_stay():
     run = simulation(
         stationary(TEN_MINUTES),
-        gps_model=WANDERING,
+        gps_model=DRIFTING,
         imu_model=SLOW_IMU,
         wheels_model=SLOW_WHEELS,
         second_gps_frame="Car:Second",
@@ -66,7 +66,7 @@ def test_given_two_antennas_when_it_stands_ten_minutes_from_the_start_then_pose_
     assert np.ptp(places, axis=0).max() < 0.3
 
 
-def test_given_one_antenna_when_it_stands_from_the_start_then_the_pose_is_not_valid_for_want_of_heading():
+def test_given_one_antenna_when_stationary_from_the_start_then_the_pose_is_not_valid_without_a_heading():
     found = drive(simulation(stationary(30.0)), 30.0)
 
     assert all(Invalid.NOT_MOVED_YET in row.estimate.invalid for row in found.rows)
@@ -91,7 +91,7 @@ def test_given_a_drive_in_reverse_from_the_start_when_an_eight_is_driven_then_he
     assert any(Quality.REVERSING in row.estimate.quality for row in known)
 
 
-def test_given_the_body_mounted_the_other_way_round_when_the_same_is_driven_then_the_answers_are_the_same():
+def test_given_the_body_turned_by_half_a_turn_on_the_same_drive_then_the_poses_are_the_same():
     phases = figure_eight(speed=2.0, radius=6.0)
     seconds = sum(phase.duration for phase in phases)
     exact = {"gps_model": GpsModel.noise_free(), "wheels_model": WheelsModel.noise_free(Timing(10.0))}
@@ -126,7 +126,7 @@ def test_given_a_course_and_a_speed_only_when_driven_then_heading_is_found():
     phases = figure_eight(speed=2.5, radius=8.0)
     run = simulation(phases, gps_model=PLAIN_GPS)
 
-    found = drive(run, 45.0, transform=lambda events: (_without_velocity(event) for event in events))
+    found = drive(run, 45.0, transform=lambda events: (_drop_velocity(event) for event in events))
 
     assert all(row.valid for row in found.between(20.0))
     assert max(abs(row.heading) for row in found.between(20.0)) < math.radians(4.0)
@@ -134,5 +134,5 @@ def test_given_a_course_and_a_speed_only_when_driven_then_heading_is_found():
     assert found.decisions("gps_velocity", Verdict.USED)
 
 
-def _without_velocity(event):
+def _drop_velocity(event):
     return replace(event, velocity=None, velocity_covariance=None) if event.header.source == "gps" else event
