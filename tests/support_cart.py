@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
+from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
-from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.sensor_rig import Kinematics, Mounts, SensorRig

@@ -88,7 +88,7 @@ def test_given_a_daemon_that_ends_while_the_vehicle_is_stationary_then_its_succe
     assert after.origin == before.origin
     assert after.transformation.pose.is_close(before.transformation.pose, 1.0, 0.02)
     assert after.transformation.pose_epoch == before.transformation.pose_epoch + 1
-    assert "warm start: the pose kept" in second.log
+    assert "warm start: the pose stored" in second.log
     # a state that is torn is a cold start
     second.end(signal.SIGKILL)
     state_file.write_bytes(state_file.read_bytes()[:-40])

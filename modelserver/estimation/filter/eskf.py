@@ -1,6 +1,6 @@
 """Error-state Kalman filter: state, propagation, update, reset.
 
-Nominal state (`NavState`), in a frame N that is fixed to the earth and level at its origin, with east, north and up
+Nominal state (`NavState`), in the local level frame N of its origin, fixed to the earth, with axes east, north and up
 once the filter is aligned: position p and velocity v of the IMU, attitude R of the body axes (rolling frame: x forward,
 y left, z up), gyro bias b_g, accelerometer bias b_a, and the additional states of `ErrorLayout`.
 

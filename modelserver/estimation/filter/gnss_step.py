@@ -1,7 +1,7 @@
 """GNSS position and height: heading alignment before the heading is known, then the logic around the update.
 
 The quality of a fix is checked, the origin captured from the first good ones, and the fix compared with the path of
-dead reckoning. What becomes of a fix at its gate (use, drift, rejection, reset of the position) is decided here, on the
+dead reckoning. What becomes of a fix at its gate (use, drift, rejection, position reset) is decided here, on the
 values of the GNSS monitor.
 """
 

@@ -1,4 +1,4 @@
-"""Stationary detector: IMU and wheels together.
+"""Stationary detector: stationary detection by IMU and wheels together.
 
 Each alone can be wrong: a stuck encoder reports 0, and a smooth ride looks stationary to the IMU. The IMU is quiet
 while the variance of rate and force, about a running mean with time constant AVERAGING_TIME, and the mean rate beyond

@@ -1,4 +1,4 @@
-"""Timeline: delayed (out-of-sequence) measurements.
+"""Timeline: delayed measurements (out-of-sequence).
 
 Each item is inserted at its instant, and what follows is fused again from the state before it, a bounded number of
 items at a time. Whatever the order of arrival, the final state is that of one order: instant, source, sequence number.

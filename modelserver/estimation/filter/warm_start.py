@@ -1,11 +1,11 @@
 """Warm start: restore persisted biases at leveling, and the pose if the vehicle cannot have moved.
 
-Nobody observed the vehicle between the two runs. Biases change slowly whatever happens, so they are restored with the
-variance of their drift (`age_biases`). The pose is not: a heading cannot be observed while stationary. It is used only
-if the vehicle was stationary when it was stored and is now, the time between is short, the wheels' counters continue
-and have not moved, gravity points the same way, and fixes agree if there are any. Until all of this is known there is
-no pose, and if any of it is missing the start is as cold as without a stored pose. A restored heading is then checked
-against the first meters driven (`heading_check`).
+Nobody observed the vehicle between the two runs. Biases change slowly whatever happens, so they are restored, after
+covariance inflation by their age (`age_biases`). The pose is not: a heading cannot be observed while stationary. It is
+used only if the vehicle was stationary when it was stored and is now, the time between is short, the wheels' counters
+continue and have not moved, gravity points the same way, and fixes agree if there are any. Until all of this is known
+there is no pose, and if any of it is missing the start is as cold as without a stored pose. A restored heading is then
+checked against the first meters driven (`heading_check`).
 """
 
 from __future__ import annotations

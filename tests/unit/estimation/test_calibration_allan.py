@@ -1,4 +1,4 @@
-"""Noise figures from standing units: against simulated noise of known strength."""
+"""Noise parameters from stationary IMUs, against simulated noise of known strength."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Series = npt.NDArray[np.float64]
 WHITE, WALK, RATE = 1e-3, 3.5e-5, 20.0
 
 
-def simulated(seconds: float, seed: int, white: float = WHITE, walk: float = WALK, ramp: float = 0.0) -> Series:
+def simulate_series(seconds: float, seed: int, white: float = WHITE, walk: float = WALK, ramp: float = 0.0) -> Series:
     """Return white noise N, a random walk K and a ramp, about a bias of 0.01, sampled at RATE."""
     chance = np.random.default_rng(seed)
     count = round(seconds * RATE)
@@ -34,8 +34,8 @@ def simulated(seconds: float, seed: int, white: float = WHITE, walk: float = WAL
     return series
 
 
-def figures(seconds: float, seed: int, **noise: float) -> NoiseParameters:
-    return fit_noise_parameters(allan_deviation(simulated(seconds, seed, **noise), RATE))
+def fit_simulated_series(seconds: float, seed: int, **noise: float) -> NoiseParameters:
+    return fit_noise_parameters(allan_deviation(simulate_series(seconds, seed, **noise), RATE))
 
 
 # --- the deviation itself -----------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def test_given_ten_samples_when_worked_out_by_hand_then_the_same() -> None:
 
 
 def test_given_a_large_bias_when_worked_out_then_it_counts_for_nothing() -> None:
-    series = simulated(60.0, 1)
+    series = simulate_series(60.0, 1)
     assert allan_deviation(series + 1e6, RATE).deviations == pytest.approx(
         allan_deviation(series, RATE).deviations, rel=1e-5
     )
@@ -82,7 +82,7 @@ def test_given_too_little_or_no_numbers_when_worked_out_then_refused(values: lis
 def test_given_simulated_noise_when_read_then_white_noise_and_walk_are_found_within_their_errors() -> None:
     pulls: dict[str, list[float]] = {"white": [], "walk": []}
     for seed in range(20):
-        found = figures(3600.0, seed)
+        found = fit_simulated_series(3600.0, seed)
         assert found.white is not None
         pulls["white"].append((found.white.value - WHITE) / found.white.sigma)
         if found.random_walk is not None:
@@ -96,7 +96,7 @@ def test_given_simulated_noise_when_read_then_white_noise_and_walk_are_found_wit
 
 def test_given_a_minute_when_read_then_white_noise_alone_and_the_rest_is_bounded() -> None:
     for seed in range(10):
-        found = figures(60.0, seed)
+        found = fit_simulated_series(60.0, seed)
         assert found.white is not None
         assert found.white.value == pytest.approx(WHITE, rel=0.1)
         assert (found.random_walk, found.instability) == (None, None)
@@ -107,7 +107,7 @@ def test_given_a_minute_when_read_then_white_noise_alone_and_the_rest_is_bounded
 
 @pytest.mark.slow
 def test_given_twenty_minutes_when_read_then_the_limit_of_the_walk_holds() -> None:
-    limits = [figures(1200.0, seed).random_walk_limit for seed in range(20)]
+    limits = [fit_simulated_series(1200.0, seed).random_walk_limit for seed in range(20)]
     assert min(limits) > WALK
     assert sorted(limits)[10] < 4.0 * WALK
 
@@ -115,9 +115,9 @@ def test_given_twenty_minutes_when_read_then_the_limit_of_the_walk_holds() -> No
 @pytest.mark.slow
 def test_given_flicker_when_read_then_the_floor_gives_the_instability() -> None:
     # flicker, 1/f: walks that forget, one for each factor of 4 in time, all equally strong
-    told = []
+    instabilities = []
     for seed in range(10):
-        series = simulated(3600.0, seed, walk=0.0)
+        series = simulate_series(3600.0, seed, walk=0.0)
         chance = np.random.default_rng(100 + seed)
         for exponent in range(10):
             memory = math.exp(-1.0 / (4.0**exponent * RATE / 4.0))
@@ -126,23 +126,23 @@ def test_given_flicker_when_read_then_the_floor_gives_the_instability() -> None:
         found = fit_noise_parameters(allan_deviation(series, RATE))
         assert found.instability_limit > 4e-4 / INSTABILITY_FLOOR * 0.8
         if found.instability is not None:
-            told.append(found.instability.value * INSTABILITY_FLOOR / 4e-4)
+            instabilities.append(found.instability.value * INSTABILITY_FLOOR / 4e-4)
             assert found.instability.value < found.instability_limit
     # the sum of these walks has a floor of their strength, within a tenth; a minimum is somewhat below it
-    assert len(told) >= 6
-    assert float(np.mean(told)) == pytest.approx(0.9, abs=0.2)
+    assert len(instabilities) >= 6
+    assert float(np.mean(instabilities)) == pytest.approx(0.9, abs=0.2)
 
 
 @pytest.mark.slow
 def test_given_a_warming_unit_when_read_then_a_ramp_is_not_called_a_walk() -> None:
     for seed in range(5):
-        found = figures(3600.0, seed, walk=0.0, ramp=3e-6)
+        found = fit_simulated_series(3600.0, seed, walk=0.0, ramp=3e-6)
         assert found.random_walk is None
         assert "ramps" in found.missing[-1]
         assert "warm up" in found.missing[-1]
 
 
-def test_given_a_frozen_unit_when_read_then_nothing_is_told() -> None:
+def test_given_a_frozen_imu_then_no_parameter_is_found() -> None:
     found = fit_noise_parameters(allan_deviation([0.25] * 1000, RATE))
     assert (found.white, found.instability, found.random_walk) == (None, None, None)
     assert "frozen" in found.missing[0]
@@ -183,13 +183,13 @@ def test_given_gaps_and_a_clock_set_back_when_split_then_the_stretches_between()
     assert len(find_gap_free_ranges(np.delete(stamps_of((0.0, 10.0)), 100))) == 1
 
 
-def test_given_stamps_that_stand_still_when_split_then_refused() -> None:
+def test_given_stamps_that_do_not_advance_then_they_are_rejected() -> None:
     for stamps in ([5, 5, 5], [1], []):
         with pytest.raises(CalibrationError, match="clock"):
             median_period(stamps)
 
 
-def test_given_a_drive_between_two_stands_when_looked_for_then_both_stands_and_nothing_else() -> None:
+def test_given_a_drive_between_two_stops_then_both_stops_are_found_and_nothing_else() -> None:
     chance = np.random.default_rng(2)
     stamps = stamps_of((0.0, 120.0))
     rates = chance.normal(0.003, 5e-3, (6000, 3))
@@ -201,7 +201,7 @@ def test_given_a_drive_between_two_stands_when_looked_for_then_both_stands_and_n
     assert (second.start, second.stop) == (71 * 50, 6000)
 
 
-def test_given_a_steady_turn_when_looked_for_then_the_vehicle_does_not_stand() -> None:
+def test_given_a_steady_turn_then_the_vehicle_is_not_stationary() -> None:
     chance = np.random.default_rng(2)
     stamps = stamps_of((0.0, 60.0))
     rates, forces = chance.normal(0.0, 5e-3, (3000, 3)), chance.normal(0.0, 0.02, (3000, 3))
@@ -212,5 +212,5 @@ def test_given_a_steady_turn_when_looked_for_then_the_vehicle_does_not_stand() -
     assert [each.stop for each in find_stationary_ranges(stamps, rates, forces)] == [1500]
 
 
-def test_given_half_a_second_when_looked_for_then_there_is_no_block_to_stand_in() -> None:
+def test_given_half_a_second_then_no_stationary_range_is_found() -> None:
     assert find_stationary_ranges(stamps_of((0.0, 0.5)), np.zeros((25, 3)), np.zeros((25, 3))) == ()

@@ -54,7 +54,7 @@ def soft(found: MagnetometerFit) -> Fields:
 # --- a vehicle that turns on the level ----------------------------------------------------------------------
 
 
-def test_given_two_circles_when_fitted_then_hard_and_soft_iron_are_found() -> None:
+def test_given_two_full_turns_when_fitted_then_hard_and_soft_iron_are_found() -> None:
     felt, true = on_circle(2.0)
     found = fit_level(felt, UP, HORIZONTAL, VERTICAL)
     assert found.hard_iron == pytest.approx(HARD, abs=1.5e-8)
@@ -109,17 +109,19 @@ def test_given_a_truck_that_passes_and_missing_samples_when_fitted_then_they_cou
     assert found.samples == 2000 - 21
 
 
-def test_given_a_long_stand_before_the_turn_when_fitted_then_it_does_not_outweigh_the_turn() -> None:
+def test_given_a_long_stop_before_the_turn_when_fitted_then_it_does_not_outweigh_the_turn() -> None:
     felt, true = on_circle(2.0, seed=4)
-    # while it stands, a generator nearby shifts the field a little
-    stood = np.tile(felt[0] + (0.4e-6, 0.0, 0.0), (20_000, 1)) + np.random.default_rng(9).normal(0, 2e-8, (20_000, 3))
-    found = fit_level(np.concatenate((stood, felt)), UP, HORIZONTAL, VERTICAL)
+    # while it is stationary, a generator nearby shifts the field a little
+    stationary = np.tile(felt[0] + (0.4e-6, 0.0, 0.0), (20_000, 1)) + np.random.default_rng(9).normal(
+        0, 2e-8, (20_000, 3)
+    )
+    found = fit_level(np.concatenate((stationary, felt)), UP, HORIZONTAL, VERTICAL)
     assert float(np.abs(heading_error(found, felt, true)).mean()) < 0.02
     assert found.outliers < 200
 
 
 @pytest.mark.parametrize("turns", [0.25, 0.5, 0.7])
-def test_given_part_of_a_circle_when_fitted_then_it_says_what_was_covered_and_what_to_do(turns: float) -> None:
+def test_given_part_of_a_circle_when_fitted_then_the_error_has_what_was_covered_and_what_to_do(turns: float) -> None:
     felt, _ = on_circle(turns, seed=5)
     with pytest.raises(CalibrationError, match=r"\d of 12 sectors of 30 degrees") as error:
         fit_level(felt, UP, HORIZONTAL, VERTICAL)
@@ -135,7 +137,9 @@ def test_given_most_of_a_circle_when_fitted_then_it_is_enough() -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("known", [True, False])
-def test_given_a_standing_vehicle_when_fitted_then_its_noise_is_not_taken_for_a_circle(seed: int, known: bool) -> None:
+def test_given_a_stationary_vehicle_when_fitted_then_its_noise_is_not_taken_for_a_circle(
+    seed: int, known: bool
+) -> None:
     felt, _ = on_circle(0.0, seed=seed)
     with pytest.raises(CalibrationError, match="turn"):
         fit_level(felt, UP, HORIZONTAL if known else math.nan, VERTICAL)
@@ -151,18 +155,20 @@ def test_given_a_standing_vehicle_when_fitted_then_its_noise_is_not_taken_for_a_
         (np.outer(np.linspace(-1e-5, 1e-5, 500), (1.0, 1.0, 1.0)), "no ellipse"),
     ],
 )
-def test_given_what_is_no_turn_when_fitted_then_one_clear_refusal(felt: Fields, words: str) -> None:
+def test_given_samples_of_no_turn_when_fitted_then_they_are_rejected_with_one_clear_reason(
+    felt: Fields, words: str
+) -> None:
     with pytest.raises(CalibrationError, match=words):
         fit_level(felt, UP, HORIZONTAL, VERTICAL)
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (math.nan, 0.0, 9.8)])
-def test_given_no_gravity_when_fitted_then_up_is_asked_for(up: tuple[float, float, float]) -> None:
+def test_given_no_gravity_when_fitted_then_a_direction_of_up_is_required(up: tuple[float, float, float]) -> None:
     with pytest.raises(CalibrationError, match="up must be a direction"):
         fit_level(on_circle(2.0)[0], up)
 
 
-# --- a unit that is turned about all of its axes ------------------------------------------------------------
+# --- a sensor that is turned about all of its axes ------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -195,11 +201,11 @@ def test_given_strays_when_fitted_on_all_axes_then_they_count_for_nothing() -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reach", [0.25, 0.1])
-def test_given_little_roll_and_pitch_when_fitted_on_all_axes_then_it_says_how_little(reach: float) -> None:
+def test_given_little_roll_and_pitch_when_fitted_on_all_axes_then_the_error_has_how_little(reach: float) -> None:
     with pytest.raises(CalibrationError, match=r"reach over \d+% of the sphere's height.*level mode"):
         fit_all_axes(on_sphere(reach), STRENGTH)
 
 
-def test_given_a_level_turn_when_fitted_on_all_axes_then_refused() -> None:
+def test_given_a_level_turn_when_fitted_on_all_axes_then_it_is_rejected() -> None:
     with pytest.raises(CalibrationError, match="level"):
         fit_all_axes(on_circle(2.0)[0], STRENGTH)

@@ -1,4 +1,4 @@
-"""What gravity says of a mount."""
+"""Check of a mount by the direction of gravity."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
 
-def stated(*rpy_deg: float) -> Quaternion:
+def create_mount(*rpy_deg: float) -> Quaternion:
     return so3.from_rpy(*(math.radians(each) for each in rpy_deg))
 
 
-def felt_by(q_base_sensor: Quaternion, up: Vector3 = (0.0, 0.0, 9.81)) -> Vector3:
+def compute_force(q_base_sensor: Quaternion, up: Vector3 = (0.0, 0.0, 9.81)) -> Vector3:
     return so3.rotate(so3.conjugate(q_base_sensor), up)
 
 
-def test_given_the_huskys_mount_when_gravity_is_on_y_then_it_agrees() -> None:
-    advice = check_mount((0.1, 9.7, -0.2), stated(90, 0, -90))
+def test_given_the_mount_of_the_husky_when_gravity_is_on_y_then_it_is_consistent() -> None:
+    advice = check_mount((0.1, 9.7, -0.2), create_mount(90, 0, -90))
     assert advice.is_consistent
     assert advice.candidates == ()
     assert advice.angle == pytest.approx(math.hypot(0.1, 0.2) / 9.7, rel=1e-2)
@@ -29,8 +29,8 @@ def test_given_the_huskys_mount_when_gravity_is_on_y_then_it_agrees() -> None:
     assert "+y axis" in advice.text
 
 
-def test_given_an_upright_mount_when_gravity_is_on_y_then_the_fitting_ones_nearest_first() -> None:
-    advice = check_mount((0.0, 9.7, 0.0), stated(0, 0, 0))
+def test_given_an_upright_mount_when_gravity_is_on_y_then_the_candidates_are_the_nearest_first() -> None:
+    advice = check_mount((0.0, 9.7, 0.0), create_mount(0, 0, 0))
     assert not advice.is_consistent
     assert advice.angle == pytest.approx(math.pi / 2)
     assert [each.rpy_deg for each in advice.candidates[:1]] == [(90.0, 0.0, 0.0)]
@@ -49,14 +49,14 @@ def test_given_an_upright_mount_when_gravity_is_on_y_then_the_fitting_ones_neare
     assert "[90, 0, -90]" in advice.text
 
 
-def test_given_a_unit_upside_down_then_the_sign_of_the_driver_is_asked_about() -> None:
-    advice = check_mount((0.0, 0.1, -9.8), stated(0, 0, 0))
+def test_given_a_sensor_upside_down_then_the_sign_of_the_driver_is_questioned() -> None:
+    advice = check_mount((0.0, 0.1, -9.8), create_mount(0, 0, 0))
     assert {each.rpy_deg[0] for each in advice.candidates} == {180.0}
     assert "driver publishes gravity instead of specific force" in advice.text
 
 
-def test_given_a_bracket_with_a_tilt_of_its_own_then_the_offers_keep_it() -> None:
-    advice = check_mount((0.2, 9.7, 0.1), stated(0, 0, 3))
+def test_given_a_bracket_with_a_tilt_of_its_own_then_the_candidates_have_it() -> None:
+    advice = check_mount((0.2, 9.7, 0.1), create_mount(0, 0, 3))
     assert {each.rpy_deg for each in advice.candidates} == {
         (90.0, 0.0, 3.0),
         (90.0, 0.0, 93.0),
@@ -66,17 +66,17 @@ def test_given_a_bracket_with_a_tilt_of_its_own_then_the_offers_keep_it() -> Non
 
 
 @pytest.mark.parametrize("true", aligned_rotations())
-@pytest.mark.parametrize("told", [stated(0, 0, 0), stated(90, 0, -90), stated(0, -90, 0)])
-def test_given_any_mount_along_the_axes_then_the_true_one_is_among_the_offers_or_agrees(
-    true: Quaternion, told: Quaternion
+@pytest.mark.parametrize("configured", [create_mount(0, 0, 0), create_mount(90, 0, -90), create_mount(0, -90, 0)])
+def test_given_any_mount_along_the_axes_then_the_true_one_is_among_the_candidates_or_is_consistent(
+    true: Quaternion, configured: Quaternion
 ) -> None:
-    advice = check_mount(felt_by(true), told)
+    advice = check_mount(compute_force(true), configured)
     if advice.is_consistent:
         assert advice.angle < 1e-9
     else:
         assert len(advice.candidates) == 4
         off = [
-            math.hypot(*so3.logarithm(so3.normalize(so3.multiply(so3.conjugate(true), stated(*each.rpy_deg)))))
+            math.hypot(*so3.logarithm(so3.normalize(so3.multiply(so3.conjugate(true), create_mount(*each.rpy_deg)))))
             for each in advice.candidates
         ]
         assert min(off) < 1e-6
@@ -87,9 +87,9 @@ def test_given_the_rotations_of_a_cube_then_there_are_24() -> None:
     assert len(rotations) == 24
 
 
-def test_given_a_unit_that_stands_askew_then_the_tilt_that_levels_it() -> None:
-    true = stated(0, -45, 0)
-    advice = check_mount(felt_by(true), stated(0, 0, 0))
+def test_given_a_sensor_that_is_mounted_askew_then_the_tilt_that_levels_it_is_found() -> None:
+    true = create_mount(0, -45, 0)
+    advice = check_mount(compute_force(true), create_mount(0, 0, 0))
     assert not advice.is_consistent
     assert advice.candidates == ()
     assert advice.corrected_rpy_deg == pytest.approx((0.0, -45.0, 0.0))
@@ -99,17 +99,17 @@ def test_given_a_unit_that_stands_askew_then_the_tilt_that_levels_it() -> None:
 def test_given_a_slope_then_the_limit_decides() -> None:
     for slope, agrees in ((MAX_TILT - 0.01, True), (MAX_TILT + 0.01, False)):
         up = (9.81 * math.sin(slope), 0.0, 9.81 * math.cos(slope))
-        assert check_mount(up, stated(0, 0, 0)).is_consistent is agrees
+        assert check_mount(up, create_mount(0, 0, 0)).is_consistent is agrees
 
 
 @pytest.mark.parametrize(
     "force", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 12.0), (math.nan, 0.0, 9.8), (math.inf, 0.0, 0.0)]
 )
-def test_given_no_gravity_then_refused(force: Vector3) -> None:
+def test_given_no_gravity_then_it_is_rejected(force: Vector3) -> None:
     with pytest.raises(CalibrationError, match=r"gravity is 9\.81"):
-        check_mount(force, stated(0, 0, 0))
+        check_mount(force, create_mount(0, 0, 0))
 
 
-def test_given_directions_then_their_axes_names() -> None:
+def test_given_directions_then_the_names_of_their_axes_are_returned() -> None:
     assert axis_name((0.1, -0.9, 0.2)) == "-y"
     assert axis_name((0.0, 0.0, 1.0)) == "+z"

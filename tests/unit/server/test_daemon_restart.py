@@ -12,7 +12,7 @@ from support_samples import GEOMETRY, START, VEHICLE, ScriptedLocalizer, instant
 from modelserver import core
 from modelserver.config.vehicle_file import load_config
 from modelserver.core.samples import report_start
-from modelserver.estimation.filter.persistence import ago, judged, named
+from modelserver.estimation.filter.persistence import check_restored, format_age, get_setup_hash
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import (
     Decision,
@@ -55,12 +55,16 @@ def of(loaded: Vehicle) -> PersistedState:
     n = layout.size
     identity = tuple(1e-4 if k % (n + 1) == 0 else 0.0 for k in range(n * n))
     return PERSISTED._replace(
-        setup=named(makings.setup), names=layout.names, extras=(0.0,) * (n - 15), covariance=identity, pose=None
+        setup=get_setup_hash(makings.setup),
+        names=layout.names,
+        extras=(0.0,) * (n - 15),
+        covariance=identity,
+        pose=None,
     )
 
 
 @pytest.mark.parametrize(
-    ("change", "age", "why"),
+    ("change", "age", "reason"),
     [
         ({}, 7.0, ""),
         ({"vehicle": "van"}, 7.0, "it is of vehicle 'van', not of 'cart'"),
@@ -71,26 +75,26 @@ def of(loaded: Vehicle) -> PersistedState:
     ],
 )
 def test_given_a_persisted_state_then_it_is_used_only_if_it_is_of_this_vehicle_and_not_too_old(
-    change, age, why
+    change, age, reason
 ) -> None:
-    found = judged(RestoredState(PERSISTED._replace(**change), age), "cart", SETUP)
-    assert (found.state is None) == bool(why)
-    assert why in found.reason
+    found = check_restored(RestoredState(PERSISTED._replace(**change), age), "cart", SETUP)
+    assert (found.state is None) == bool(reason)
+    assert reason in found.reason
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.4, "0 s ago"), (119.0, "119 s ago"), (7200.0, "2 h ago"), (3e5, "3 days ago")]
 )
 def test_given_an_age_then_it_is_formatted_in_words(seconds: float, text: str) -> None:
-    assert ago(seconds) == text
+    assert format_age(seconds) == text
 
 
 def test_given_a_persisted_state_then_the_start_is_warm_and_reported(tmp_path: Path) -> None:
     loaded = vehicle(tmp_path)
     state = loaded.start_core(instant_at(START), None, RestoredState(of(loaded), 4.0))
-    assert state.warnings == {"start": "warm start: what was kept 4 s ago waits for the sensors"}
+    assert state.warnings == {"start": "warm start: the state stored 4 s ago waits for the sensors"}
     assert isinstance(state.localizer, ModeLocalizer)
-    assert state.localizer.active.head.warm_start is not None
+    assert state.localizer.active.head.common.warm_start is not None
     assert state.settings.persist_period_ns == EVERY_S * 10**9
 
 
@@ -103,7 +107,7 @@ def test_given_a_persisted_state_then_the_start_is_warm_and_reported(tmp_path: P
         (
             VEHICLE + "localization: {mode: raw}\n",
             RestoredState(PERSISTED, 4.0),
-            "raw mode goes on from nothing but the origin",
+            "raw mode restores only the origin",
         ),
     ],
 )
@@ -117,7 +121,8 @@ def test_given_no_usable_persisted_state_then_the_start_is_cold_and_the_reason_i
     else:
         assert state.warnings == {}
     assert isinstance(state.localizer, ModeLocalizer)
-    assert getattr(getattr(state.localizer.active, "head", None), "warm_start", None) is None
+    head = getattr(state.localizer.active, "head", None)
+    assert getattr(getattr(head, "common", None), "warm_start", None) is None
 
 
 def test_given_a_vehicle_file_without_persistence_then_nothing_is_persisted(tmp_path: Path) -> None:

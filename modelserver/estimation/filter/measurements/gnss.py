@@ -1,4 +1,4 @@
-"""Measurement models of GNSS: position, height, velocity, dual-antenna heading.
+"""Measurement models of GNSS: position, height, velocity, dual antenna heading.
 
 A fix measures the antenna at p + R l, l its lever arm, with two errors that are states: the time-correlated GNSS error
 c (Gauss-Markov of standard deviation 1, in units of the sigma of the fix) and the latency t by which the fix is older

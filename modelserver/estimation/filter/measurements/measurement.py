@@ -1,4 +1,4 @@
-"""Measurement model: residual, Jacobian H and noise R of a sample, for the update of the error-state Kalman filter.
+"""Measurement model: residual, Jacobian H and measurement noise R of a sample, for the update of the filter.
 
 A kind of measurement is a class with `@register`; `GpsPosition` in gnss.py is an example, and
 examples/python/own_measurement.py adds one from outside. Jacobians of points of the body for R_true = exp([theta]x) R:
