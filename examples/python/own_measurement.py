@@ -16,9 +16,9 @@ import numpy as np
 from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.error_layout import ErrorState
-from modelserver.estimation.filter.eskf import body_velocity_jacobian
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements import REGISTRY, Innovation, register
+from modelserver.estimation.filter.measurements.measurement import body_velocity_jacobian
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import ImuSample, SensorHeader
 from modelserver.server.vehicle import load_vehicle
@@ -44,20 +44,20 @@ class Radar:
     states = (ErrorState(("radar_scale",), sigma=0.1, walk=1e-4),)
 
     @classmethod
-    def of(cls, rig, settings):
+    def create(cls, rig, settings):
         """Return the measurement for a vehicle; every vehicle can have a radar."""
         return cls()
 
-    def instant(self, sample):
+    def get_utime(self, sample):
         """Return the time of measurement."""
         return sample.header.utime
 
-    def compare(self, scene, sample):
+    def evaluate(self, context, sample):
         """Return residual, Jacobian and noise covariance."""
-        scale, base = 1.0 + scene.extra("radar_scale"), scene.rig.base
-        forward = scene.nav.body_velocity(base)[0]
-        H = scale * body_velocity_jacobian(scene.nav, base, scene.layout.size)[:1]
-        H[0, scene.layout.index("radar_scale")] = forward
+        scale, base = 1.0 + context.extra("radar_scale"), context.rig.base
+        forward = context.nav.body_velocity(base)[0]
+        H = scale * body_velocity_jacobian(context.nav, base, context.layout.size)[:1]
+        H[0, context.layout.index("radar_scale")] = forward
         return Innovation(np.array([sample.speed - scale * forward]), H, np.array([[sample.sigma**2]]))
 
 
