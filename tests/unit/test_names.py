@@ -24,10 +24,4 @@ def public_classes() -> dict[str, list[str]]:
 def test_no_two_public_classes_share_a_name() -> None:
     classes = public_classes()
     assert len(classes) > 500
-    # the two localizers are still to get names of their own
-    shared = {
-        name: places
-        for name, places in classes.items()
-        if len(places) > 1 and not any("/estimation/" in place for place in places)
-    }
-    assert shared == {}
+    assert {name: places for name, places in classes.items() if len(places) > 1} == {}

@@ -342,7 +342,7 @@ def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | No
     rotation = fit.rotation if abs(fit.rotation.angle) > 3.0 * sigma else Rotation(0.0, 0.0)
     state = heading_step.initialize(setup, state, nav, rotation, state.gnss.rejected[-1])
     decision = Decision(
-        nav.utime, "filter", 0, "gps_position", Verdict.RESET, "fixes agree with the way driven, the state does not"
+        nav.utime, "filter", 0, "gps_position", Verdict.RESET, "fixes agree with the path driven, the state does not"
     )
     return start_epoch(state), decision
 

@@ -163,7 +163,7 @@ class FilterSettings(FixSettings):
     # --- heading ---
 
     align_sigma: float = 0.12
-    """Heading's sigma, rad, at which fixes that have been compared with the way driven are believed."""
+    """Largest sigma of a heading, rad, that is accepted from fixes along the path driven."""
     align_window: float = 60.0
     """Longest stretch of fixes that heading is found from, seconds."""
     align_speed: float = 1.0

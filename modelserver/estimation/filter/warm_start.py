@@ -89,7 +89,7 @@ def advance(setup: Setup, state: FilterState, utime: int) -> Fused:
     assert pose is not None
     motion = _find_motion(setup, state, pose, utime)
     if motion is None:
-        text = f"wheels ({pose.wheels_source}) and inertial unit are not stationary together"
+        text = f"wheels ({pose.wheels_source}) and IMU are not stationary together"
         return _wait(state, waiting, utime, age, text)
     if motion:
         return _drop_pose(state, age, motion)
