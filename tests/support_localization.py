@@ -1,6 +1,6 @@
-"""A vehicle on paper for the localization tests: truth by fine integration, sensors by numerical differences.
+"""Simulated vehicle for the localization tests: truth by fine integration, sensors by numerical differences.
 
-Nothing of the localizer is used here but its messages, so it is an oracle of its own.
+It uses only the messages and the mounts of the localizer, so that its truth is independent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def constant(value: float) -> Callable[[float], float]:
 
 
 def stepwise(*pieces: tuple[float, float]) -> Callable[[float], float]:
-    """The value of the last piece (time, value) begun."""
+    """Return a function of time with the value of the last piece (start, value) that has started."""
 
     def value(t: float) -> float:
         found = 0.0
@@ -47,7 +47,7 @@ def stepwise(*pieces: tuple[float, float]) -> Callable[[float], float]:
 
 @dataclass
 class Drive:
-    """Where the base frame is, in the tangent plane at ORIGIN: speed along heading, yaw rate, roll and pitch."""
+    """True motion of the base frame in the tangent plane at ORIGIN: speed along heading, yaw rate, roll and pitch."""
 
     seconds: float
     speed: Callable[[float], float] = field(default_factory=lambda: constant(0.0))
@@ -68,8 +68,8 @@ class Drive:
         self.y = np.concatenate([[0.0], np.cumsum((vy[1:] + vy[:-1]) / 2 * dt)])
 
     def pose(self, t: float) -> Pose:
-        """The true pose in the tangent plane, `t` seconds after START."""
-        # a sample needs the poses around it too, which are those of its neighbors
+        """Return the true pose in the tangent plane, `t` seconds after START."""
+        # a sample also needs the poses around it, which are those of its neighbors
         nanoseconds = round(t * 1e9)
         found = self._poses.get(nanoseconds)
         if found is None:
@@ -86,7 +86,7 @@ class Drive:
 
 @dataclass
 class Sensors:
-    """Noise and rates of the sensors; sigma in meters, m/s, rad/s, m/s2."""
+    """Rates, noise and biases of the sensors; sigmas in meters, m/s, rad/s, m/s2."""
 
     gps_hz: float = 5.0
     gps_sigma: float = 0.5
@@ -100,7 +100,7 @@ class Sensors:
     seed: int = 1
 
     def events(self, drive: Drive, mounts: Mounts = MOUNTS) -> list[GpsSample | ImuSample]:
-        """All samples, by the instant of measurement."""
+        """Return all samples in the order of their instants."""
         rng = random.Random(self.seed)
         n_imu, n_gps = int(drive.seconds * self.imu_hz), int(drive.seconds * self.gps_hz)
         samples: list[GpsSample | ImuSample] = [self.imu(drive, i / self.imu_hz, i, rng, mounts) for i in range(n_imu)]
@@ -117,7 +117,7 @@ class Sensors:
         force = so3.rotate(so3.conjugate(now.wxyz), (a[0], a[1], a[2] + GRAVITY))
         orientation = None
         if self.orientation != OrientationReference.NONE:
-            # a vertical gyro: yaw of no meaning
+            # a vertical gyro: its yaw is arbitrary
             in_enu = so3.multiply((math.cos(1.1), 0.0, 0.0, math.sin(1.1)), now.wxyz)
             flip = (0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0)  # NED from ENU
             orientation = in_enu if self.orientation == OrientationReference.ENU else so3.multiply(flip, in_enu)
@@ -157,10 +157,10 @@ class Sensors:
 
 
 def run(localizer: RawLocalizer, samples):
-    """Yield (sample, localizer after it, notes) for each sample."""
+    """Yield (sample, localizer after it, events) for each sample."""
     for sample in samples:
-        localizer, notes = localizer.process(sample)
-        yield sample, localizer, notes
+        localizer, events = localizer.process(sample)
+        yield sample, localizer, events
 
 
 def final(localizer: RawLocalizer, samples) -> RawLocalizer:

@@ -219,4 +219,4 @@ def _start_raw(fresh: RawLocalizer, last: Estimate) -> RawLocalizer:
         variance=last.covariance[35],
         bias_variance=fresh.heading.bias_variance,
     )
-    return replace(fresh, heading=heading)
+    return fresh._replace(heading=heading)

@@ -72,11 +72,6 @@ class SourceClock(NamedTuple):
     replays: float = REPLAY_BURST
     replays_utime: int = 0
 
-    def has_covered(self, utime: int) -> bool:
-        """Return whether good stamps lie between the last odd one and `utime`, as far back as they are stored."""
-        recent = self.recent
-        return not recent or utime <= recent[0] or any(self.odd_utime < each <= utime for each in recent)
-
 
 class ClockMonitor(NamedTuple):
     """The stamps of all sources. `newest` is the newest good stamp, `rank` and `lead_utime` those of the lead."""
@@ -176,6 +171,11 @@ def _count_odd(source: SourceClock, utime: int, lead: int, is_back: bool = False
     """
     follows = source.num_odd > 0 and 0 < utime - source.odd_utime <= 10_000_000 and source.odd_since == lead
     count = source.num_odd + 1 if follows else 1
-    if follows and is_back and not source.has_covered(utime):
+    if follows and is_back and not has_covered(source.recent, source.odd_utime, utime):
         count -= 1
     return source._replace(num_odd=count, odd_utime=utime, odd_since=lead)
+
+
+def has_covered(recent: tuple[int, ...], odd_utime: int, utime: int) -> bool:
+    """Return whether good stamps lie between the last odd one and `utime`, as far back as they are stored."""
+    return not recent or utime <= recent[0] or any(odd_utime < each <= utime for each in recent)

@@ -22,14 +22,23 @@ HEADING_FLOOR: Final = 0.01
 @lru_cache(maxsize=16)
 def get_factors(risk_per_hour: float, correlation_time: float) -> tuple[float, float]:
     """Return the standard deviations to the horizontal and to the heading protection level."""
-    risk = min(risk_per_hour * correlation_time / 3600.0, 0.5)
+    return compute_factors(min(risk_per_hour * correlation_time / 3600.0, 0.5))
+
+
+@lru_cache(maxsize=16)
+def compute_factors(risk: float) -> tuple[float, float]:
+    """Return the standard deviations to the levels that an error exceeds with a probability of `risk`."""
     return math.sqrt(-2.0 * math.log(risk)), NormalDist().inv_cdf(1.0 - 0.5 * risk)
 
 
 def compute_longest_variance(P: Array) -> float:
     """Return the variance along the longest axis of the horizontal error ellipse of a covariance, m2."""
-    e, n, c = float(P[0, 0]), float(P[1, 1]), float(P[0, 1])
-    return 0.5 * (e + n) + math.hypot(0.5 * (e - n), c)
+    return compute_longest_axis(float(P[0, 0]), float(P[1, 1]), float(P[0, 1]))
+
+
+def compute_longest_axis(east: float, north: float, cross: float) -> float:
+    """Return the variance along the longest axis of an error ellipse, from variances and covariance, m2."""
+    return 0.5 * (east + north) + math.hypot(0.5 * (east - north), cross)
 
 
 def compute_horizontal(P: Array, outlier_allowance: float, settings: FilterSettings) -> float:

@@ -1,1 +1,1 @@
-"""Raw mode: the pose straight from GPS and IMU, ignoring odometry. Pure."""
+"""Raw mode: the pose directly from GPS and IMU, without odometry. Pure."""

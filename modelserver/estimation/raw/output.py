@@ -1,15 +1,20 @@
-"""Uncertainty of raw mode: covariance, protection levels, and how long they hold.
+"""Output of raw mode: pose in Odom, ENU and UTM, its validity, covariance and protection levels.
 
-From the state of raw mode to an estimate: pose in Odom, ENU and UTM, validity, bounds.
+Position: the last fix propagated to the instant (track.py, equation 2). Its covariance is that of the fix plus the
+growth by its age, `compute_growth`, plus the yaw error on the arm a from the antenna at the fix to the base frame:
+yaw variance times (-a_n, a_e)(-a_n, a_e)', which also correlates position with yaw. Protection levels are those of
+`filter.protection_levels`, at probability `risk`.
+
+World:UTM and World:ENU are each computed from the earth-centered position.
 """
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-from statistics import NormalDist
+from typing import Final
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
+from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
 from modelserver.estimation.fix_quality import AcceptedFix
 from modelserver.estimation.origin import OriginProjection
 from modelserver.estimation.raw.heading import UNKNOWN_VARIANCE
@@ -22,85 +27,19 @@ from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion
 
-
-@lru_cache(maxsize=16)
-def get_factors(risk: float) -> tuple[float, float]:
-    """Return sigmas to a horizontal and to a heading bound that are passed with probability `risk`.
-
-    Horizontal: the radius of a circular normal error is Rayleigh, P(r > k s) = exp(-k^2/2), so
-    k = sqrt(-2 ln risk); with the longer axis for s this is on the safe side for an ellipse. Heading: two
-    sides of a normal, k = quantile(1 - risk/2).
-    """
-    return math.sqrt(-2.0 * math.log(risk)), NormalDist().inv_cdf(1.0 - 0.5 * risk)
+CONVERGENCE_RANGE: Final = 100.0
+"""Meters from the last fix within which its meridian convergence is used: it changes by 1.6e-5 rad tan(latitude)."""
 
 
-def compute_longest_variance(east: float, north: float, cross: float) -> float:
-    """Return the variance along the longest axis of a horizontal error ellipse, m2."""
-    half = 0.5 * (east + north)
-    return half + math.hypot(0.5 * (east - north), cross)
-
-
-def compute_covariance(
-    fix: AcceptedFix, growth: float, arm: complex, yaw_variance: float, settings: RawSettings
-) -> tuple[float, ...]:
-    """Return the 36 numbers of the base frame's covariance along east, north, up.
-
-    `arm` leads from the antenna at the fix to the base frame; an error of yaw turns it, so it adds yaw
-    variance times (-n, e)(-n, e)' to the position and ties position to yaw.
-    """
-    ae, an = -arm.imag, arm.real
-    tilt = settings.tilt_sigma**2
-    ee = fix.east_variance + growth + yaw_variance * ae * ae
-    nn = fix.north_variance + growth + yaw_variance * an * an
-    en = fix.cross + yaw_variance * ae * an
-    uu = fix.up_variance + growth
-    ye, yn = yaw_variance * ae, yaw_variance * an
-    return (
-        *(ee, en, 0.0, 0.0, 0.0, ye),
-        *(en, nn, 0.0, 0.0, 0.0, yn),
-        *(0.0, 0.0, uu, 0.0, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
-        *(ye, yn, 0.0, 0.0, 0.0, yaw_variance),
-    )
-
-
-def compute_odom_covariance(position: float, yaw: float, settings: RawSettings) -> tuple[float, ...]:
-    """Return the 36 numbers of the pose in Odom, from the variances grown since it began."""
-    tilt = settings.tilt_sigma**2
-    return (
-        *(position, 0.0, 0.0, 0.0, 0.0, 0.0),
-        *(0.0, position, 0.0, 0.0, 0.0, 0.0),
-        *(0.0, 0.0, position, 0.0, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
-        *(0.0, 0.0, 0.0, 0.0, 0.0, yaw),
-    )
-
-
-def compute_seconds_to_limit(variance: float, age: float, speed_sigma: float, settings: RawSettings) -> float:
-    """Return after how many seconds without fixes the horizontal bound passes its limit; 0 where it has.
-
-    `variance` is that of the longest axis without growth. With x = t^2 the growth is a quadratic of x.
-    """
-    room = (settings.horizontal_limit / get_factors(settings.risk)[0]) ** 2 - variance
-    if room <= 0.0:
-        return 0.0
-    a, b = (0.5 * settings.usual_acceleration) ** 2, speed_sigma**2
-    x = 2.0 * room / (b + math.sqrt(b * b + 4.0 * a * room))
-    return max(math.sqrt(x) - age, 0.0)
-
-
-_CONVERGENCE_RANGE = 100.0
-"""Metres from the last fix within which its convergence serves: it changes by 1.6e-5 rad times tan(latitude)."""
+# --- estimate -----------------------------------------------------------------------------------------------
 
 
 def estimate(state: RawState, utime: int) -> Estimate:
-    """Return the pose of the base frame at `utime`, from nothing but the state."""
-    settings, newest, anchor = state.settings, state.motion, state.fixes.anchor
+    """Return the pose of the base frame at an instant, by the state alone."""
+    settings, newest, anchor, origin = state.settings, state.motion, state.fixes.anchor, state.origin
     invalid = _find_invalid(state, utime)
     if newest is None:
-        return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=state.pose_epoch, origin=state.origin)
+        return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=state.pose_epoch, origin=origin)
     motion = state.get_motion_at(utime, newest)
     quality = _find_quality(state, utime, motion)
     odom = motion.pose
@@ -113,36 +52,37 @@ def estimate(state: RawState, utime: int) -> Estimate:
             invalid=invalid,
             quality=quality,
             pose_epoch=state.pose_epoch,
-            origin=state.origin,
+            origin=origin,
             is_odom_random_walk=True,
         )
-
     heading = state.heading
     heading_variance = UNKNOWN_VARIANCE
     if heading.is_known:
         heading_variance = heading.propagate((utime - newest.utime) * 1e-6, settings).variance
     age = max((utime - anchor.utime) * 1e-6, 0.0)
-    sigma_v = newest.speed_sigma
-    growth = compute_growth(age, sigma_v, settings)
-    place, up, arm = anchor.propagate_base(motion, state.direction)
+    growth = compute_growth(age, newest.speed_sigma, settings)
+    position, up, arm = anchor.propagate_base(motion, state.direction)
     covariance = compute_covariance(anchor.fix, growth, arm, heading_variance, settings)
-    variance = compute_longest_variance(covariance[0], covariance[7], covariance[1])
-    k_horizontal, k_heading = get_factors(settings.risk)
-    horizontal_protection_level = k_horizontal * math.sqrt(variance)
-    heading_protection_level = min(k_heading * math.sqrt(heading_variance), math.pi)
-    if heading.is_known and heading_protection_level > settings.heading_limit:
-        standing = state.quiet.is_stationary(utime, settings)
-        invalid |= Invalid.STATIONARY_HEADING if standing else Invalid.PROTECTION_LEVEL_EXCEEDED
-    if horizontal_protection_level > settings.horizontal_limit:
+    variance = compute_longest_axis(covariance[0], covariance[7], covariance[1])
+    k_horizontal, k_heading = compute_factors(settings.risk)
+    horizontal = k_horizontal * math.sqrt(variance)
+    heading_level = min(k_heading * math.sqrt(heading_variance), math.pi)
+    if heading.is_known and heading_level > settings.heading_limit:
+        is_stationary = state.quiet.is_stationary(utime, settings)
+        invalid |= Invalid.STATIONARY_HEADING if is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
+    if horizontal > settings.horizontal_limit:
         invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
-
     enu = utm = None
     if state.projection is not None and state.fixes.work is not None:
-        enu, utm = _compute_world_poses(state, state.projection, state.fixes.work, odom.wxyz, place, up)
+        is_far = abs(position - anchor.position) > CONVERGENCE_RANGE
+        q = odom.wxyz
+        if heading.is_known:
+            q = so3.multiply(rotation_about_up(heading.offset), q)
+        enu, utm = _compute_world_poses(state.projection, state.fixes.work, q, position, up, is_far)
     remaining = min(
         settings.gps_timeout - age,
         settings.imu_timeout - (utime - (state.imu_utime or utime)) * 1e-6,
-        compute_seconds_to_limit(variance - growth, age, sigma_v, settings),
+        compute_seconds_to_limit(variance - growth, age, newest.speed_sigma, settings),
     )
     return Estimate(
         utime,
@@ -154,39 +94,86 @@ def estimate(state: RawState, utime: int) -> Estimate:
         invalid,
         quality,
         state.pose_epoch,
-        state.origin,
-        horizontal_protection_level,
-        heading_protection_level,
+        origin,
+        horizontal,
+        heading_level,
         NAN if invalid else max(remaining, 0.0),
         is_odom_random_walk=True,
     )
 
 
 def _compute_world_poses(
-    state: RawState, projected: OriginProjection, work: LocalFrame, q_odom: Quaternion, place: complex, up: float
+    projection: OriginProjection, work: LocalFrame, q: Quaternion, position: complex, up: float, is_far: bool
 ) -> tuple[Pose, Pose] | tuple[None, None]:
-    """Return the pose in World:ENU and in World:UTM, each from the earth-centred position; None out of reach."""
-    geodesy = projected.geodesy
-    ecef = work.to_ecef((place.real, place.imag, up))
-    convergence = projected.convergence
-    q = q_odom
-    if state.heading.is_known:
-        q = so3.multiply(rotation_about_up(state.heading.offset), q)
+    """Return the pose in World:ENU and in World:UTM; `q` is along the working frame. None out of range."""
+    geodesy, convergence = projection.geodesy, projection.convergence
+    ecef = work.to_ecef((position.real, position.imag, up))
     try:
-        position = geodesy.to_relative_utm(geodesy.utm_from_ecef(ecef))
-        anchor = state.fixes.anchor
-        if anchor is not None and abs(place - anchor.position) > _CONVERGENCE_RANGE:
+        utm = geodesy.to_relative_utm(geodesy.utm_from_ecef(ecef))
+        if is_far:
             latitude, longitude, _ = geodetic_from_ecef(ecef)
             convergence = geodesy.convergence(latitude, longitude)
     except GeodesyError:
         return None, None
     return (
-        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(projected.tangent_from_work, q)),
-        Pose(position, so3.multiply(rotation_about_up(convergence), q)),
+        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(projection.tangent_from_work, q)),
+        Pose(utm, so3.multiply(rotation_about_up(convergence), q)),
     )
 
 
+# --- covariance ---------------------------------------------------------------------------------------------
+
+
+def compute_covariance(
+    fix: AcceptedFix, growth: float, arm: complex, yaw_variance: float, settings: RawSettings
+) -> tuple[float, ...]:
+    """Return the 36 numbers of the covariance of the base frame along east, north, up; `arm`: see the theory."""
+    ae, an = -arm.imag, arm.real
+    ee = fix.east_variance + growth + yaw_variance * ae * ae
+    nn = fix.north_variance + growth + yaw_variance * an * an
+    en = fix.cross + yaw_variance * ae * an
+    ye, yn = yaw_variance * ae, yaw_variance * an
+    return _fill_covariance(ee, en, nn, fix.up_variance + growth, ye, yn, yaw_variance, settings)
+
+
+def compute_odom_covariance(position: float, yaw: float, settings: RawSettings) -> tuple[float, ...]:
+    """Return the 36 numbers of the covariance of the pose in Odom, from its variances of position and yaw."""
+    return _fill_covariance(position, 0.0, position, position, 0.0, 0.0, yaw, settings)
+
+
+def _fill_covariance(
+    ee: float, en: float, nn: float, uu: float, ye: float, yn: float, yy: float, settings: RawSettings
+) -> tuple[float, ...]:
+    tilt = settings.tilt_sigma**2
+    return (
+        *(ee, en, 0.0, 0.0, 0.0, ye),
+        *(en, nn, 0.0, 0.0, 0.0, yn),
+        *(0.0, 0.0, uu, 0.0, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
+        *(ye, yn, 0.0, 0.0, 0.0, yy),
+    )
+
+
+def compute_seconds_to_limit(variance: float, age: float, speed_sigma: float, settings: RawSettings) -> float:
+    """Return the seconds without fixes until the horizontal protection level exceeds its limit; 0 if it does.
+
+    `variance` is that of the longest axis without growth, which is a quadratic of x = t^2.
+    """
+    room = (settings.horizontal_limit / compute_factors(settings.risk)[0]) ** 2 - variance
+    if room <= 0.0:
+        return 0.0
+    a, b = (0.5 * settings.usual_acceleration) ** 2, speed_sigma**2
+    x = 2.0 * room / (b + math.sqrt(b * b + 4.0 * a * room))
+    return max(math.sqrt(x) - age, 0.0)
+
+
+# --- validity -----------------------------------------------------------------------------------------------
+
+
 def _find_invalid(state: RawState, utime: int) -> Invalid:
+    """Return the reasons against an estimate, except for its protection levels."""
+    # numbers, not members: combining flags costs more than all else here
     settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
     invalid = 0
     if anchor is None:
@@ -211,16 +198,13 @@ def _find_invalid(state: RawState, utime: int) -> Invalid:
 
 
 def _is_too_early(state: RawState, utime: int) -> bool:
-    """Return whether `utime` is so far before the newest samples that its clock and theirs cannot be one.
-
-    Before the oldest motion kept there is nothing to look up either.
-    """
+    """Return whether an instant is before the history, or so far before the newest samples that the clocks differ."""
     settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
-    if imu is not None and (imu - utime) * 1e-6 > settings.imu_timeout:
-        return True
-    if anchor is not None and (anchor.utime - utime) * 1e-6 > settings.gps_timeout:
-        return True
-    return bool(state.history) and utime < state.history[0].utime
+    return (
+        (imu is not None and (imu - utime) * 1e-6 > settings.imu_timeout)
+        or (anchor is not None and (anchor.utime - utime) * 1e-6 > settings.gps_timeout)
+        or (bool(state.history) and utime < state.history[0].utime)
+    )
 
 
 def _find_quality(state: RawState, utime: int, motion: RawMotion) -> Quality:

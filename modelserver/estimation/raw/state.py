@@ -1,9 +1,9 @@
-"""What raw mode knows: all that has been concluded from the samples so far."""
+"""State of raw mode at the newest sample."""
 
 from __future__ import annotations
 
 import cmath
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from modelserver.estimation.origin import OriginCapture, OriginProjection
 from modelserver.estimation.raw.fixes import FixMonitor
@@ -16,22 +16,31 @@ from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import Origin
 
 
-@dataclass(frozen=True, slots=True)
-class RawState:
-    """The state of raw mode, immutable; `RawLocalizer` leads from one to the next."""
+class RawState(NamedTuple):
+    """State of raw mode. A NamedTuple, because a new one is made for every sample.
+
+    Attributes
+    ----------
+    projection, capture: of the origin; None until it is set, and the fixes collected for it.
+    motion, history: newest motion, and those of the last seconds for delayed fixes.
+    tilt_bias: biases of the roll and pitch gyros, rad/s.
+    imu_utime: of the last IMU sample.
+    is_clock_stepped: whether the clock was set back and the heading has not been found since.
+    newest: instant of the newest sample, 0 before the first.
+    """
 
     mounts: Mounts
     settings: RawSettings
     projection: OriginProjection | None = None
     motion: RawMotion | None = None
-    history: tuple[RawMotion, ...] = field(default=(), repr=False)
-    heading: Heading = field(default_factory=Heading)
-    quiet: QuietDetector = field(default_factory=QuietDetector)
+    history: tuple[RawMotion, ...] = ()
+    heading: Heading = Heading()
+    quiet: QuietDetector = QuietDetector()
     tilt_bias: tuple[float, float] = (0.0, 0.0)
-    fixes: FixMonitor = field(default_factory=FixMonitor)
-    capture: OriginCapture = field(default_factory=OriginCapture)
-    imu_stamps: StampMonitor = field(default_factory=StampMonitor)
-    gps_stamps: StampMonitor = field(default_factory=StampMonitor)
+    fixes: FixMonitor = FixMonitor()
+    capture: OriginCapture = OriginCapture()
+    imu_stamps: StampMonitor = StampMonitor()
+    gps_stamps: StampMonitor = StampMonitor()
     imu_utime: int | None = None
     pose_epoch: int = 0
     is_clock_stepped: bool = False
@@ -42,18 +51,18 @@ class RawState:
         """The origin of World:UTM, None before it is set."""
         return None if self.projection is None else self.projection.geodesy.origin
 
+    @property
+    def direction(self) -> complex:
+        """exp(i offset), from Odom's horizontal axes to east and north; 1 before the heading is known."""
+        return cmath.rect(1.0, self.heading.offset) if self.heading.is_known else 1.0 + 0j
+
     def get_motion_at(self, utime: int, newest: RawMotion) -> RawMotion:
-        """Return the motion at `utime`: predicted from `newest`, or looked up in what is kept."""
+        """Return the motion at an instant: predicted from the newest, or from the history."""
         if utime >= newest.utime or not self.history:
-            return newest.advance(utime, newest.rate, self.settings)
+            return newest.propagate(utime, newest.rate, self.settings)
         after = newest
         for motion in reversed(self.history):
             if motion.utime <= utime:
                 return interpolate_motion(motion, after, utime)
             after = motion
         return after
-
-    @property
-    def direction(self) -> complex:
-        """exp(i offset): turns Odom's horizontal axes to east and north; 1 before heading is known."""
-        return cmath.rect(1.0, self.heading.offset) if self.heading.is_known else 1.0 + 0j

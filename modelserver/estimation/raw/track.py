@@ -1,13 +1,23 @@
-"""Recent fixes beside the path that rate alone draws: speed and course from positions.
+"""Track: speed and course from recent fixes, the last good fix as anchor of the position, and the jump gate.
 
-Let u(t) be the integral of the unit vector along Odom's heading (`Motion.path`), as a complex number. A
-vehicle of constant speed v, whose heading in the world is Odom's plus b, is at p(t) = p0 + v exp(ib) u(t).
-So c = v exp(ib) is a straight-line fit of fixes p_i against u_i, in turns as on straights:
-c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2, with variance s^2 / sum |u_i - mean u|^2 of
-each component, s the fixes' noise. It compares the fixes with the mean heading over the stretch by itself.
-The antenna's lever arm turned by heading, exp(ib) w_i, is taken off first.
+Let u be the integral of the unit vector along Odom's heading (`RawMotion.path`), as a complex number. A vehicle of
+constant speed v, whose heading is Odom's plus b, is at p = p_0 + v exp(ib) u. So c = v exp(ib) is the straight-line fit
 
-The last good fix as an anchor for the pose, and the test whether the next one is a jump.
+    c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2,   variance s^2 / sum |u_i - mean u|^2     (1)
+
+of fixes p_i with noise s, on curves as on straights. The lever arm of the antenna, exp(ib) w_i, is subtracted first.
+`filter.heading_alignment` fits the same line once per fix; here running sums give the fits of all segments that end
+at the newest fix, of which the best is used.
+
+Speed: noise falls with the length T of the segment. But a fit gives the speed T/2 ago, which has changed by about
+`usual_acceleration` T/2 since: the segment with the smallest sum of both is used.
+Course: beside the noise of the fit, sigma includes the time-correlated part of the error of a fix, which changes by
+sigma sqrt(2 (1 - exp(-T / tau))) over the segment, and the turn, in which speed is not constant.
+
+Anchor: p_base = p_antenna + exp(ib) (travel in Odom since the fix - lever arm at the fix)                      (2)
+
+Jump gate: a fix is off its prediction by no more than noise and what the vehicle can do, `compute_jump_limit`.
+`jump_fixes` that agree for `jump_time` confirm a jump: multipath on a moving vehicle changes within a few seconds.
 """
 
 from __future__ import annotations
@@ -15,22 +25,29 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from modelserver.estimation.fix_quality import AcceptedFix
 from modelserver.estimation.raw.motion import RawMotion, to_level_axes
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.transforms.so3 import Vector3
 
-MAX_TRACK_FIXES = 32
-"""Fixes kept for one stretch; beyond it every second is dropped, so a longer stretch is seen more coarsely."""
+MAX_TRACK_FIXES: Final = 32
+"""Fixes stored: of a longer segment every second one is dropped."""
+
+MAX_AGE: Final = 1e4
+"""Seconds of the age of a fix that count: a stamp may be wrong by years."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackFix:
-    """A fix of the antenna at `utime`: `place` is east + i north, metres; `sigma` of each axis.
+class TrackFix(NamedTuple):
+    """A fix of the antenna, all horizontal and complex (east + i north of the working frame), meters.
 
-    `path` is Motion.path then, `lever` the antenna's level lever arm along Odom's axes, `yaw` Odom's yaw.
+    Attributes
+    ----------
+    position, sigma: of the fix, and of each of its axes.
+    path: `RawMotion.path` at its instant, seconds.
+    lever: lever arm of the antenna along Odom's axes.
+    yaw: in Odom, rad.
     """
 
     utime: int
@@ -41,11 +58,13 @@ class TrackFix:
     yaw: float
 
 
-@dataclass(frozen=True, slots=True)
-class SpeedFit:
-    """A fit: `velocity` is v exp(ib), m/s; `sigma` of each of its components; `seconds` the stretch's length.
+class SpeedFit(NamedTuple):
+    """A fit of equation (1).
 
-    `length` is how far the vehicle came, metres; `turned` how far it turned, rad.
+    Attributes
+    ----------
+    velocity, sigma: c and the sigma of each of its components, m/s.
+    seconds, length, turned: duration of the segment, distance travelled (m) and angle turned (rad).
     """
 
     velocity: complex
@@ -55,17 +74,27 @@ class SpeedFit:
     turned: float
 
 
+# --- fits ---------------------------------------------------------------------------------------------------
+
+
+def append_fix(fixes: tuple[TrackFix, ...], fix: TrackFix, window: float) -> tuple[TrackFix, ...]:
+    """Return a segment with one fix more, no longer than `window` seconds, and thinned if it has too many."""
+    oldest = fix.utime - int(window * 1e6)
+    segment = tuple(each for each in fixes if each.utime >= oldest)
+    return (*(segment[::2] if len(segment) >= MAX_TRACK_FIXES else segment), fix)
+
+
 def fit_speeds(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> Iterator[SpeedFit]:
-    """Yield the fits of the last 2, 3, ... fixes; `direction` is exp(ib), 0 leaves the lever arm in."""
+    """Yield the fits of the last 2, 3, ... fixes; `direction` is exp(ib), or 0 to leave the lever arm in."""
     if len(fixes) < 2:
         return
     newest = fixes[-1]
     n, su, sp, suu, sup, ss = 0, 0j, 0j, 0.0, 0j, 0.0
     turned, yaw = 0.0, newest.yaw
-    last_place = newest.position - direction * newest.lever
+    last_position = newest.position - direction * newest.lever
     for fix in reversed(fixes):
         u = fix.path - newest.path
-        p = fix.position - direction * fix.lever - last_place
+        p = fix.position - direction * fix.lever - last_position
         n += 1
         su += u
         sp += p
@@ -74,103 +103,78 @@ def fit_speeds(fixes: Sequence[TrackFix], direction: complex, settings: RawSetti
         ss += fix.sigma
         turned += abs(fix.yaw - yaw)
         yaw = fix.yaw
-        if n < 2:
-            continue
         spread = suu - (su.real * su.real + su.imag * su.imag) / n
-        if spread < 1e-6:
+        if n < 2 or spread < 1e-6:
             continue
         velocity = (sup - su.conjugate() * sp / n) / spread
         noise = settings.fix_noise_share * ss / n
-        yield SpeedFit(
-            velocity,
-            noise / math.sqrt(spread),
-            (newest.utime - fix.utime) * 1e-6,
-            abs(velocity) * abs(u),
-            turned,
-        )
+        seconds = (newest.utime - fix.utime) * 1e-6
+        yield SpeedFit(velocity, noise / math.sqrt(spread), seconds, abs(velocity) * abs(u), turned)
 
 
 def fit_best_speed(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
-    """Return the fit whose error is least: noise falls with the stretch's length, lag grows with it.
-
-    A stretch of T seconds tells the speed of its middle, T/2 ago; the speed has changed by about
-    `usual_acceleration` T/2 since. The sigma returned holds both.
-    """
+    """Return the fit with the smallest error of the present speed; its sigma includes the change of speed since."""
     best: SpeedFit | None = None
-    for slope in fit_speeds(fixes, direction, settings):
-        if slope.seconds > settings.speed_window:
+    for fit in fit_speeds(fixes, direction, settings):
+        if fit.seconds > settings.speed_window:
             break
-        sigma = math.hypot(slope.sigma, 0.5 * settings.usual_acceleration * slope.seconds)
+        sigma = math.hypot(fit.sigma, 0.5 * settings.usual_acceleration * fit.seconds)
         if best is None or sigma < best.sigma:
-            best = SpeedFit(slope.velocity, sigma, slope.seconds, slope.length, slope.turned)
+            best = fit._replace(sigma=sigma)
     return best
 
 
 def fit_course(
     fixes: Sequence[TrackFix], direction: complex | None, settings: RawSettings
 ) -> tuple[float, float] | None:
-    """Return the heading offset b that the whole stretch says, rad, and its sigma; None where it says nothing.
-
-    Beside the fit's noise the sigma holds the slow part of the fixes' error, that has wandered by
-    sigma sqrt(2 (1 - exp(-T/tau))) since the stretch began, and the turn.
-    """
-    found = _fit_whole(fixes, 0j if direction is None else direction, settings)
+    """Return the heading offset b of the whole segment and its sigma, rad; None if it does not show one."""
+    fit = _fit_whole(fixes, direction or 0j, settings)
     if direction is None:
-        # the lever arm turns with the heading that is sought: two rounds settle it
+        # the lever arm turns with the heading to be found: two iterations converge
         for _ in range(2):
-            if found is None or abs(found.velocity) < 1e-9:
+            if fit is None or abs(fit.velocity) < 1e-9:
                 return None
-            found = _fit_whole(fixes, found.velocity / abs(found.velocity), settings)
-    if found is None or found.length < 1e-9:
+            fit = _fit_whole(fixes, fit.velocity / abs(fit.velocity), settings)
+    if fit is None or fit.length < 1e-9:
         return None
-    slow = math.sqrt(max(1.0 - settings.fix_noise_share**2, 0.0)) * fixes[-1].sigma
-    wander = slow * math.sqrt(-2.0 * math.expm1(-found.seconds / settings.fix_correlation_time))
-    sigma = math.hypot(
-        found.sigma / abs(found.velocity), wander / found.length, settings.course_turn_share * found.turned
-    )
-    return cmath.phase(found.velocity), sigma
+    correlated = math.sqrt(max(1.0 - settings.fix_noise_share**2, 0.0)) * fixes[-1].sigma
+    changed = correlated * math.sqrt(-2.0 * math.expm1(-fit.seconds / settings.fix_correlation_time))
+    turn = settings.course_turn_share * fit.turned
+    return cmath.phase(fit.velocity), math.hypot(fit.sigma / abs(fit.velocity), changed / fit.length, turn)
 
 
 def _fit_whole(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
-    found = None
-    for slope in fit_speeds(fixes, direction, settings):
-        found = slope
-    return found
+    fit = None
+    for fit in fit_speeds(fixes, direction, settings):  # noqa: B007
+        pass
+    return fit
 
 
 def is_slow(fixes: Sequence[TrackFix], settings: RawSettings) -> bool:
-    """Return whether the fixes say that the vehicle may be standing.
+    """Return whether by its fixes the vehicle may be stationary.
 
-    The stretch is the shortest that resolves a third of the standing speed, or all there is where that resolves
-    the standing speed.
+    The segment is the shortest that resolves a third of `stationary_speed`, or else all fixes if they resolve that.
     """
-    seen: SpeedFit | None = None
-    for slope in fit_speeds(fixes, 0j, settings):
-        # at rest the path of rate alone goes straight on at 1 m/s, so it is time, and the fit a velocity
-        if slope.seconds >= settings.stationary_time and slope.sigma <= settings.stationary_speed:
-            seen = slope
-            if slope.sigma <= settings.stationary_speed / 3.0:
+    found: SpeedFit | None = None
+    for fit in fit_speeds(fixes, 0j, settings):
+        # the path of a stationary vehicle is straight at 1 m/s, thus time: the fit is its velocity
+        if fit.seconds >= settings.stationary_time and fit.sigma <= settings.stationary_speed:
+            found = fit
+            if fit.sigma <= settings.stationary_speed / 3.0:
                 break
-    return seen is not None and abs(seen.velocity) <= 2.0 * settings.stationary_speed
+    return found is not None and abs(found.velocity) <= 2.0 * settings.stationary_speed
 
 
-def append_fix(fixes: tuple[TrackFix, ...], fix: TrackFix, window: float) -> tuple[TrackFix, ...]:
-    """Return the fixes with one more, none older than `window` seconds, every second dropped when too many."""
-    oldest = fix.utime - int(window * 1e6)
-    first = 0
-    while first < len(fixes) and fixes[first].utime < oldest:
-        first += 1
-    rest = fixes[first:]
-    if len(rest) >= MAX_TRACK_FIXES:
-        rest = rest[::2]
-    return (*rest, fix)
+# --- anchor -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class FixAnchor:
-    """The antenna at the last good fix, in the working frame, and the base frame's motion then.
+class FixAnchor(NamedTuple):
+    """The last good fix, and the motion of the base frame at its instant.
 
-    `lever` is the antenna's lever arm along Odom's axes at that instant: horizontal part and height.
+    Attributes
+    ----------
+    position, up: of the antenna in the working frame, east + i north and height, m.
+    lever, lever_up: lever arm of the antenna along Odom's axes, horizontal and up, m.
     """
 
     utime: int
@@ -182,10 +186,9 @@ class FixAnchor:
     lever_up: float
 
     def propagate_base(self, motion: RawMotion, direction: complex) -> tuple[complex, float, complex]:
-        """Return the base frame's place and height in the working frame as carried to `motion`.
+        """Propagate the base frame to `motion` by equation (2): position and height in the working frame.
 
-        p_base = p_antenna + exp(ib) (Odom's way since the fix - lever arm at the fix); the third value is that
-        arm, which an error of heading turns.
+        The third value is the arm from the antenna at the fix to the base frame, which an error of heading turns.
         """
         then = self.motion
         arm = direction * (complex(motion.x - then.x, motion.y - then.y) - self.lever)
@@ -193,52 +196,51 @@ class FixAnchor:
 
 
 def compute_lever_arm(motion: RawMotion, lever: Vector3) -> tuple[complex, float]:
-    """Return a lever arm of the base frame along Odom's axes: horizontal, and up."""
+    """Return a vector of the base axes along Odom's axes: horizontal, and up."""
     x, y, z = to_level_axes(motion.up, lever)
     return complex(x, y) * complex(math.cos(motion.yaw), math.sin(motion.yaw)), z
 
 
-@dataclass(frozen=True, slots=True)
-class JumpMonitor:
-    """A run of refused fixes that agree: `count` of them, the first at `since`, the last at `utime` and `place`."""
+def compute_growth(age: float, speed_sigma: float, settings: RawSettings) -> float:
+    """Return the variance of each axis that a prediction over `age` seconds adds, m2: (s_v t)^2 + (a t^2 / 2)^2."""
+    t = min(age, MAX_AGE)
+    return (speed_sigma * t) ** 2 + (0.5 * settings.usual_acceleration * t * t) ** 2
 
-    count: int = 0
+
+# --- jump gate ----------------------------------------------------------------------------------------------
+
+
+class JumpMonitor(NamedTuple):
+    """A run of `num_fixes` rejected fixes that agree, the first at `since`, the last at `utime` and `position`."""
+
+    num_fixes: int = 0
     utime: int = 0
     position: complex = 0j
     since: int = 0
 
-    def reject(self, utime: int, place: complex, sigma: float, settings: RawSettings) -> JumpMonitor:
-        """Return the run with one more refused fix: longer where it agrees with the last, else begun anew."""
-        dt = abs(utime - self.utime) * 1e-6
-        reach = settings.maximum_speed * dt + settings.jump_sigmas * math.sqrt(2.0) * sigma
-        agrees = self.count > 0 and abs(place - self.position) <= reach
-        return JumpMonitor(self.count + 1, utime, place, self.since) if agrees else JumpMonitor(1, utime, place, utime)
+    def reject(self, fix: FixAnchor, settings: RawSettings) -> JumpMonitor:
+        """Return the monitor after a rejected fix: a longer run if it agrees with the last one, else a new run."""
+        dt = abs(fix.utime - self.utime) * 1e-6
+        reach = settings.maximum_speed * dt + settings.jump_sigmas * math.sqrt(2.0) * fix.fix.sigma
+        agrees = self.num_fixes > 0 and abs(fix.position - self.position) <= reach
+        return JumpMonitor(
+            self.num_fixes + 1 if agrees else 1, fix.utime, fix.position, self.since if agrees else fix.utime
+        )
 
     def is_confirmed(self, settings: RawSettings) -> bool:
         """Return whether the run is long enough, in fixes and in time, to be right against the prediction."""
-        return self.count >= settings.jump_fixes and (self.utime - self.since) * 1e-6 >= settings.jump_time
+        return self.num_fixes >= settings.jump_fixes and (self.utime - self.since) * 1e-6 >= settings.jump_time
 
 
 def compute_jump_limit(
     dt: float, sigma_before: float, sigma: float, speed_sigma: float | None, settings: RawSettings
 ) -> float:
-    """Return how far a fix may be off its prediction, metres, `dt` seconds after the last good one.
+    """Return how far a fix may be off its prediction `dt` seconds after the last good one, m.
 
-    `speed_sigma` is that of the speed the prediction was made with, None where there was none: then the
-    vehicle may have gone anywhere at its maximum speed.
+    `speed_sigma` is that of the predicted speed; None: the speed is unknown, up to the maximum.
     """
     noise = settings.jump_sigmas * math.hypot(sigma_before, sigma)
-    anywhere = settings.maximum_speed * dt
+    reach = settings.maximum_speed * dt
     if speed_sigma is None:
-        return noise + anywhere
-    carried = 0.5 * settings.maximum_acceleration * dt * dt + settings.jump_sigmas * speed_sigma * dt
-    return noise + min(anywhere, carried)
-
-
-def compute_growth(age: float, speed_sigma: float, settings: RawSettings) -> float:
-    """Return the variance of each horizontal axis that carrying a fix on for `age` seconds adds, m2.
-
-    The speed is uncertain by its sigma and changes unforeseen: (s_v t)^2 + (a t^2 / 2)^2.
-    """
-    t = min(age, 1e4)
-    return (speed_sigma * t) ** 2 + (0.5 * settings.usual_acceleration * t * t) ** 2
+        return noise + reach
+    return noise + min(reach, 0.5 * settings.maximum_acceleration * dt * dt + settings.jump_sigmas * speed_sigma * dt)

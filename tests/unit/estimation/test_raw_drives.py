@@ -1,4 +1,4 @@
-"""Whole drives through raw mode, against a truth that knows nothing of it."""
+"""Whole drives through raw mode, compared with a truth that is computed independently."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def figure_eight(seconds=60.0, speed=2.0, radius=8.0):
 
 
 def errors(drive, samples, settings=None, after=10.0, origin=ORIGIN, ahead=20_000):
-    """Run and collect (time, position error, yaw error, tilt error, estimate) of every prediction past `after`."""
+    """Return (time, position error, yaw error, tilt error, estimate) of each prediction after `after` seconds."""
     found = []
     for sample, localizer, _ in run(start(settings, origin), samples):
         utime = sample.header.utime + ahead
@@ -86,7 +86,7 @@ def test_figure_eight_is_followed_within_the_noise(velocity_sigma, reference):
 
 
 @pytest.mark.slow
-def test_position_is_exact_with_exact_sensors_whatever_the_lever_arms():
+def test_position_is_exact_with_exact_sensors_and_lever_arms():
     drive = figure_eight()
     sensors = Sensors(
         gps_sigma=0.02,
@@ -119,7 +119,7 @@ def test_pose_is_invalid_until_the_vehicle_moves_and_valid_after():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
-def test_standing_ten_minutes_keeps_heading_and_captures_the_bias(velocity_sigma):
+def test_ten_minutes_stationary_hold_the_heading_and_measure_the_bias(velocity_sigma):
     drive = Drive(680.0, speed=stepwise((0.0, 1.5), (60.0, 0.0)), yaw_rate=stepwise((10.0, 0.1), (50.0, 0.0)))
     sensors = Sensors(imu_hz=25.0, gps_hz=2.0, velocity_sigma=velocity_sigma, gyro_bias=(0.01, -0.01, 0.012))
     localizer = final(start(), sensors.events(drive))
@@ -138,7 +138,7 @@ def test_standing_ten_minutes_keeps_heading_and_captures_the_bias(velocity_sigma
 
 
 @pytest.mark.slow
-def test_standing_longer_than_the_gyro_holds_is_said():
+def test_heading_of_a_vehicle_stationary_for_too_long_is_invalid():
     settings = RawSettings(gyro_noise=0.02)
     drive = Drive(200.0, speed=stepwise((0.0, 1.5), (30.0, 0.0)))
     seen = {
@@ -151,7 +151,7 @@ def test_standing_longer_than_the_gyro_holds_is_said():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
-def test_driving_backwards_is_no_heading_jump(velocity_sigma):
+def test_reverse_does_not_reset_the_heading(velocity_sigma):
     drive = Drive(
         60.0,
         speed=stepwise((0.0, 1.5), (20.0, 0.0), (24.0, -1.5), (44.0, 0.0), (46.0, 1.5)),
@@ -162,13 +162,13 @@ def test_driving_backwards_is_no_heading_jump(velocity_sigma):
     assert max(each[2] for each in found) < 0.35
     assert {each[4].pose_epoch for each in found} == {0}
     backwards = [each for each in found if 30.0 < each[0] < 43.0]
-    said = [Quality.REVERSING in each[4].quality for each in backwards]
-    assert sum(said) > (0.99 if velocity_sigma else 0.9) * len(said)
+    are_reversing = [Quality.REVERSING in each[4].quality for each in backwards]
+    assert sum(are_reversing) > (0.99 if velocity_sigma else 0.9) * len(are_reversing)
     assert not any(Quality.REVERSING in each[4].quality for each in found if not 24.0 < each[0] < 50.0)
     assert rms([each[1] for each in backwards]) < 0.8
 
 
-def test_gps_dropout_is_bridged_by_gyro_and_speed_and_said():
+def test_gps_outage_is_bridged_by_gyro_and_speed_and_reported():
     drive = figure_eight()
     samples = [
         s
@@ -182,25 +182,25 @@ def test_gps_dropout_is_bridged_by_gyro_and_speed_and_said():
     assert all(each[4].invalid == Invalid.STALE_GPS for each in stale)
     assert max(each[1] for each in stale) < 2.0
     assert all(each[1] < each[4].horizontal_protection_level for each in found)
-    bounds = [each[4].horizontal_protection_level for each in stale]
-    assert bounds == sorted(bounds)
+    levels = [each[4].horizontal_protection_level for each in stale]
+    assert levels == sorted(levels)
     assert all(each[4].invalid == 0 for each in found if each[0] > 34.5)
 
 
-def shifted(sample, metres):
-    return replace(sample, latitude_deg=sample.latitude_deg + metres / 111_200.0)
+def shift_north(sample, meters):
+    return replace(sample, latitude_deg=sample.latitude_deg + meters / 111_200.0)
 
 
-def test_a_single_wild_fix_is_refused_and_the_pose_stays():
+def test_a_single_outlier_is_rejected_and_the_pose_continues():
     drive = figure_eight(40.0)
     samples = Sensors(gps_sigma=0.3).events(drive)
-    wild = [i for i, s in enumerate(samples) if s.header.source == "gps"][150]
-    samples[wild] = shifted(samples[wild], 40.0)
+    outlier = [i for i, s in enumerate(samples) if s.header.source == "gps"][150]
+    samples[outlier] = shift_north(samples[outlier], 40.0)
     localizer = start()
     for i, sample in enumerate(samples):
-        localizer, notes = localizer.process(sample)
-        if i == wild:
-            assert notes == (Rejected("sensor:gps", "jump"),)
+        localizer, events = localizer.process(sample)
+        if i == outlier:
+            assert events == (Rejected("sensor:gps", "jump"),)
         if sample.header.utime > START + 20_000_000:
             estimate = localizer.estimate(sample.header.utime)
             assert math.dist(estimate.enu.xyz[:2], drive.at(sample.header.utime).xyz[:2]) < 2.5
@@ -208,10 +208,10 @@ def test_a_single_wild_fix_is_refused_and_the_pose_stays():
     assert localizer.pose_epoch == 0
 
 
-def test_a_lasting_jump_is_refused_then_believed_with_a_new_epoch():
+def test_a_lasting_jump_is_rejected_then_resets_the_position_with_a_new_epoch():
     drive = figure_eight(40.0)
     samples = [
-        shifted(s, 60.0) if s.header.source == "gps" and s.header.utime > START + 25_000_000 else s
+        shift_north(s, 60.0) if s.header.source == "gps" and s.header.utime > START + 25_000_000 else s
         for s in Sensors(gps_sigma=0.3).events(drive)
     ]
     epochs, rejected_seen = [], False
@@ -226,29 +226,29 @@ def test_a_lasting_jump_is_refused_then_believed_with_a_new_epoch():
     assert offset == pytest.approx(60.0, abs=2.0)
 
 
-def test_a_stopped_imu_is_said_and_taken_up_again():
+def test_an_imu_outage_is_reported_and_ends():
     drive = figure_eight(60.0)
     samples = [
         s
         for s in Sensors().events(drive)
         if s.header.source == "gps" or not 30.0 < (s.header.utime - START) * 1e-6 < 33.0
     ]
-    notes = []
+    events = []
     for sample, localizer, new in run(start(), samples):
-        notes += new
+        events += new
         t = (sample.header.utime - START) * 1e-6
         if 30.6 < t < 32.9:
             assert Invalid.STALE_IMU in localizer.estimate(sample.header.utime).invalid
-    assert Rejected("sensor:imu", "gap") in notes
+    assert Rejected("sensor:imu", "gap") in events
     estimate = localizer.estimate(sample.header.utime)
     assert estimate.invalid == 0
     assert angle_error(estimate.enu.rpy[2], drive.at(sample.header.utime).rpy[2]) < 0.1
 
 
-def test_odom_never_jumps_at_fixes_jumps_or_the_origin():
+def test_odom_is_continuous_over_fixes_jumps_and_the_origin():
     drive = Drive(50.0, speed=constant(2.0), yaw_rate=constant(0.15))
     samples = [
-        shifted(s, 60.0) if s.header.source == "gps" and s.header.utime > START + 25_000_000 else s
+        shift_north(s, 60.0) if s.header.source == "gps" and s.header.utime > START + 25_000_000 else s
         for s in Sensors(gps_sigma=0.5).events(drive)
     ]
     last = None
@@ -264,7 +264,7 @@ def test_odom_never_jumps_at_fixes_jumps_or_the_origin():
     assert localizer.origin is not None
 
 
-def test_a_fix_that_arrives_late_is_placed_at_its_own_instant():
+def test_a_delayed_fix_is_used_at_its_own_instant():
     drive = figure_eight(40.0)
     sensors = Sensors(gps_sigma=0.05, orientation=OrientationReference.ENU)
     samples = sorted(
@@ -276,7 +276,7 @@ def test_a_fix_that_arrives_late_is_placed_at_its_own_instant():
     assert rms([each[1] for each in newest]) < 0.25
 
 
-def test_utm_and_enu_are_each_from_the_vehicles_place():
+def test_utm_and_enu_agree_at_the_vehicle():
     drive = figure_eight(20.0)
     localizer = final(start(), Sensors(gps_sigma=0.1).events(drive))
     estimate = localizer.estimate(localizer.utime)

@@ -1,4 +1,4 @@
-"""Raw mode under faults: while a pose is valid its bounds hold."""
+"""Raw mode under faults: while a pose is valid, its protection levels hold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def seconds(sample):
     return (sample.header.utime - START) * 1e-6
 
 
-def shifted(sample, by):
+def delay_stamp(sample, by):
     return replace(sample, header=replace(sample.header, utime=sample.header.utime + round(by * 1e6)))
 
 
@@ -26,14 +26,15 @@ def is_gps(sample):
 
 
 def follow(drive, arrivals, offset=lambda t: 0.0, origin=ORIGIN):
-    """Run samples by (arrival, sample); return (t, estimate, position ratio, yaw ratio) at each arrival.
+    """Process samples by (arrival, sample); return (t, estimate, position ratio, yaw ratio) at each arrival.
 
-    `offset` is what the sensors' clock is ahead of the truth's.
+    `offset` is by how much the clock of the sensors is ahead of the truth's. A ratio is of an error to its
+    protection level.
     """
     localizer, rows, reasons = RawLocalizer.start(MOUNTS, None, origin), [], []
     for t, sample in arrivals:
-        localizer, notes = localizer.process(sample)
-        reasons += [(sample.header.source, note.reason) for note in notes if isinstance(note, Rejected)]
+        localizer, events = localizer.process(sample)
+        reasons += [(sample.header.source, event.reason) for event in events if isinstance(event, Rejected)]
         estimate = localizer.estimate(START + round((t + offset(t)) * 1e6))
         if estimate.enu is None:
             continue
@@ -55,22 +56,22 @@ def worst(rows, which, after=0.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [-0.6, -0.95, -3.0])
-def test_a_clock_step_of_any_size_in_a_turn_loses_no_turn(step):
+def test_a_clock_step_of_any_size_in_a_turn_loses_no_heading(step):
     drive = Drive(50.0, speed=stepwise((3.0, 2.0)), yaw_rate=stepwise((15.0, 0.6)))
 
     def offset(t):
         return step if t > 25.0 else 0.0
 
-    arrivals = [(seconds(s), shifted(s, offset(seconds(s)))) for s in Sensors().events(drive)]
+    arrivals = [(seconds(s), delay_stamp(s, offset(seconds(s)))) for s in Sensors().events(drive)]
     rows, _, localizer = follow(drive, arrivals, offset)
-    # the two samples until the step is certain are within one fix
+    # the two samples until the step is confirmed are within one fix
     assert worst(rows, 3, after=25.05) < 1.1
     assert worst(rows, 2, after=25.05) < 1.3
     assert localizer.pose_epoch >= 1
     assert rows[-1][1].invalid == 0
 
 
-def test_samples_that_come_late_are_no_clock_step():
+def test_delayed_samples_are_not_a_clock_step():
     drive = Drive(30.0, speed=stepwise((3.0, 2.0)), yaw_rate=lambda t: 0.3 * math.sin(t / 3))
     arrivals = sorted(
         ((seconds(s) + (0.05 * (i * 7 % 10) / 10), s) for i, s in enumerate(Sensors().events(drive))),
@@ -82,7 +83,7 @@ def test_samples_that_come_late_are_no_clock_step():
     assert worst(rows, 3, after=10.0) < 1.3
 
 
-def test_a_pose_asked_from_a_clock_that_is_behind_is_not_valid():
+def test_a_pose_requested_by_a_clock_that_is_behind_is_invalid():
     drive = Drive(20.0, speed=constant(2.0))
     localizer = final(RawLocalizer.start(MOUNTS, None, ORIGIN), Sensors().events(drive))
     assert localizer.estimate(localizer.utime).invalid == 0
@@ -94,7 +95,7 @@ def test_a_pose_asked_from_a_clock_that_is_behind_is_not_valid():
 @pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.03, 0.1, None])
 @pytest.mark.parametrize(("speed", "rate"), [(0.1, 0.008), (0.1, 0.013), (0.25, 0.013)])
-def test_creeping_in_a_curve_is_not_standing(velocity_sigma, speed, rate):
+def test_creeping_along_a_curve_is_not_stationary(velocity_sigma, speed, rate):
     drive = Drive(
         120.0,
         speed=stepwise((5.0, 2.0), (30.0, speed)),
@@ -107,21 +108,21 @@ def test_creeping_in_a_curve_is_not_standing(velocity_sigma, speed, rate):
 
 
 @pytest.mark.parametrize("degrees", [5.0, 14.0])
-def test_a_refused_fix_moves_nothing(degrees):
+def test_a_rejected_fix_changes_no_pose(degrees):
     drive = Drive(20.0, speed=constant(2.0))
     samples = Sensors().events(drive)
     localizer = final(RawLocalizer.start(MOUNTS), samples)
     fix = next(s for s in reversed(samples) if is_gps(s))
     before = localizer.estimate(localizer.utime)
-    for wild in ({"longitude_deg": fix.longitude_deg + 0.9}, {"latitude_deg": fix.latitude_deg - degrees}):
-        after, notes = localizer.process(shifted(replace(fix, **wild), 0.2))
-        assert notes == (Rejected("sensor:gps", "jump"),)
+    for outlier in ({"longitude_deg": fix.longitude_deg + 0.9}, {"latitude_deg": fix.latitude_deg - degrees}):
+        after, events = localizer.process(delay_stamp(replace(fix, **outlier), 0.2))
+        assert events == (Rejected("sensor:gps", "jump"),)
         estimate = after.estimate(localizer.utime)
         assert (estimate.enu, estimate.utm, estimate.invalid) == (before.enu, before.utm, 0)
 
 
 @pytest.mark.parametrize("gps_hz", [1.0, 20.0])
-def test_a_jump_is_believed_only_after_a_time(gps_hz):
+def test_a_jump_is_confirmed_only_after_a_time(gps_hz):
     drive = Drive(40.0, speed=constant(2.0), yaw_rate=constant(0.05))
     samples = [
         replace(s, latitude_deg=s.latitude_deg + 50 / 111e3) if is_gps(s) and seconds(s) > 25.0 else s
@@ -136,7 +137,7 @@ def test_a_jump_is_believed_only_after_a_time(gps_hz):
     assert rows[-1][1].invalid == 0
 
 
-def test_height_above_the_sea_alone_is_used_with_its_doubt():
+def test_height_above_mean_sea_level_alone_is_used_with_its_uncertainty():
     drive = Drive(15.0, speed=constant(2.0))
     samples = [
         replace(s, height_msl=s.height_ellipsoidal + 20.0, height_ellipsoidal=math.nan) if is_gps(s) else s
@@ -147,7 +148,7 @@ def test_height_above_the_sea_alone_is_used_with_its_doubt():
     assert localizer.estimate(localizer.utime).covariance[14] == pytest.approx(100.0**2, rel=0.01)
 
 
-def test_no_height_at_all_is_said_by_the_sigma():
+def test_unknown_height_has_a_large_sigma():
     drive = Drive(15.0, speed=constant(2.0))
     samples = [replace(s, height_ellipsoidal=math.nan) if is_gps(s) else s for s in Sensors().events(drive)]
     localizer = final(RawLocalizer.start(MOUNTS), samples)
@@ -156,20 +157,20 @@ def test_no_height_at_all_is_said_by_the_sigma():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.3, 0.45])
-def test_inertial_samples_behind_the_fixes_still_turn_the_vehicle(lag):
+def test_imu_samples_that_lag_behind_the_fixes_turn_the_heading(lag):
     drive = Drive(40.0, speed=stepwise((3.0, 2.0)), yaw_rate=lambda t: 0.4 * math.sin(t / 2))
     arrivals = [(seconds(s) + (0.0 if is_gps(s) else lag), s) for s in Sensors(gps_hz=2.0).events(drive)]
     arrivals = sorted((each for each in arrivals if each[0] < 40.0), key=lambda each: each[0])
     rows, _, _ = follow(drive, arrivals)
-    late = [row for row in rows if row[0] > 10.0]
-    assert sum(row[1].invalid == 0 for row in late) > 0.95 * len(late)
+    settled = [row for row in rows if row[0] > 10.0]
+    assert sum(row[1].invalid == 0 for row in settled) > 0.95 * len(settled)
     assert worst(rows, 3) < 1.1
     assert worst(rows, 2) < 1.1
 
 
 @pytest.mark.parametrize(("roll", "tilted"), [(0.0, False), (0.6, False), (1.5, True), (math.pi, True)])
-def test_a_vehicle_on_its_side_is_not_valid(roll, tilted):
-    # a level vehicle whose geometry has the inertial unit turned about the forward axis by `roll`
+def test_a_vehicle_on_its_side_is_invalid(roll, tilted):
+    # a level vehicle whose geometry has the IMU rotated about the forward axis by `roll`
     level = RawLocalizer.start(replace(MOUNTS, X_base_imu=Pose.from_rpy((0.0, 0.0, 0.0), roll)), None, ORIGIN)
     for n in range(200):
         header = SensorHeader(START + n * 10_000, "imu")

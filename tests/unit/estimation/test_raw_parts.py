@@ -1,4 +1,4 @@
-"""The parts of raw mode, each by itself."""
+"""Units of raw mode: settings, clock monitor, fix quality, motion, heading, track, origin, protection levels."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from support_localization import GEODESY, MOUNTS, START
 
 from modelserver.errors import UnknownFrameError
-from modelserver.estimation import fix_quality as gate
+from modelserver.estimation.filter.clock_monitor import StampVerdict
+from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
+from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.origin import OriginCapture
-from modelserver.estimation.raw import output as bounds
-from modelserver.estimation.raw import track
+from modelserver.estimation.raw import output, track
 from modelserver.estimation.raw.heading import CourseResult, Heading
 from modelserver.estimation.raw.motion import (
     RawMotion,
@@ -28,7 +29,7 @@ from modelserver.estimation.raw.motion import (
     to_level_axes,
 )
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.stamps import StampMonitor, StampVerdict
+from modelserver.estimation.raw.stamps import StampMonitor
 from modelserver.estimation.raw.track import TrackFix, compute_growth
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.estimation.settings import FixSettings
@@ -57,12 +58,12 @@ SECOND = 1_000_000
         {"origin_fixes": 5000},
     ],
 )
-def test_a_wrong_setting_is_named(wrong):
+def test_the_error_of_an_invalid_setting_has_its_name(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         RawSettings(**wrong)
 
 
-def test_every_setting_is_a_plain_number_with_its_words():
+def test_every_setting_is_a_number_with_a_docstring():
     source = dataclasses.fields(RawSettings)
     text = inspect.getsource(FixSettings) + inspect.getsource(RawSettings)
     for field in source:
@@ -90,22 +91,22 @@ def model():
     return Model((car, imu), (Constraint("bolted", "Car:Bolt", "Imu:Base", Pose.identity()),))
 
 
-def test_mounts_come_from_the_model():
+def test_mounts_are_those_of_the_model():
     mounts = Mounts.from_model(model(), "Car:CG", "Car:Antenna", "Imu:Sensor")
     assert mounts.X_base_antenna.xyz == pytest.approx((-0.8, 0.1, 1.0))
     assert mounts.X_base_imu.xyz == pytest.approx((0.5, 0.0, 0.12))
     assert mounts.X_base_imu.is_close(Pose.from_rpy((0.5, 0.0, 0.12), math.pi, 0.0, 0.3))
 
 
-def test_a_mount_that_the_model_lacks_is_an_error():
+def test_a_mount_that_is_not_in_the_model_raises():
     with pytest.raises(UnknownFrameError):
         Mounts.from_model(model(), "Car:CG", "Car:Antena", "Imu:Sensor")
 
 
-# --- stamps -------------------------------------------------------------------------------------------------
+# --- clock monitor ------------------------------------------------------------------------------------------
 
 
-def verdicts(*seconds):
+def judge_stamps(*seconds):
     stamps, found = StampMonitor(), []
     for t in seconds:
         stamps, verdict = stamps.update(round(t * SECOND), S)
@@ -113,21 +114,21 @@ def verdicts(*seconds):
     return found
 
 
-def test_stamps_in_order_repeated_and_late():
-    good, duplicate, order = StampVerdict.GOOD, StampVerdict.DUPLICATE, StampVerdict.OUT_OF_SEQUENCE
-    assert verdicts(5.0, 5.1, 5.1, 5.05, 5.2, 14.9) == [good, good, duplicate, order, good, good]
+def test_stamps_in_order_duplicate_and_out_of_sequence():
+    good, duplicate, past = StampVerdict.GOOD, StampVerdict.DUPLICATE, StampVerdict.OUT_OF_SEQUENCE
+    assert judge_stamps(5.0, 5.1, 5.1, 5.05, 5.2, 14.9) == [good, good, duplicate, past, good, good]
 
 
-def test_one_odd_stamp_is_the_samples_fault_three_in_a_row_the_clocks():
-    good, order, future = StampVerdict.GOOD, StampVerdict.OUT_OF_SEQUENCE, StampVerdict.FUTURE
-    assert verdicts(100.0, 50.0, 100.1) == [good, order, good]
-    assert verdicts(100.0, 50.0, 50.1, 50.2, 50.3) == [good, order, order, StampVerdict.STEPPED_BACK, good]
-    assert verdicts(100.0, 50.0, 40.0, 30.0) == [good, order, order, order]
-    assert verdicts(100.0, 500.0, 100.1, 100.2) == [good, future, good, good]
-    assert verdicts(100.0, 500.0, 500.1, 500.2, 500.3) == [good, future, future, good, good]
+def test_one_odd_stamp_is_an_outlier_three_in_a_row_a_clock_step():
+    good, past, future = StampVerdict.GOOD, StampVerdict.OUT_OF_SEQUENCE, StampVerdict.FUTURE
+    assert judge_stamps(100.0, 50.0, 100.1) == [good, past, good]
+    assert judge_stamps(100.0, 50.0, 50.1, 50.2, 50.3) == [good, past, past, StampVerdict.STEPPED_BACK, good]
+    assert judge_stamps(100.0, 50.0, 40.0, 30.0) == [good, past, past, past]
+    assert judge_stamps(100.0, 500.0, 100.1, 100.2) == [good, future, good, good]
+    assert judge_stamps(100.0, 500.0, 500.1, 500.2, 500.3) == [good, future, future, good, good]
 
 
-# --- gate ---------------------------------------------------------------------------------------------------
+# --- fix quality --------------------------------------------------------------------------------------------
 
 
 def fix(**changes):
@@ -138,7 +139,7 @@ def fix(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "word"),
+    ("changes", "reason"),
     [
         ({"fix_type": FixType.NONE}, "no_fix"),
         ({"fix_type": FixType.DEAD_RECKONING}, "no_fix"),
@@ -154,26 +155,26 @@ def fix(**changes):
         ({"position_covariance": (900.0, 0, 0, 0, 900.0, 0, 0, 0, 900.0)}, "sigma"),
     ],
 )
-def test_a_bad_fix_is_refused_in_a_word(changes, word):
-    assert gate.evaluate_fix(fix(**changes), S) == word
+def test_a_bad_fix_is_rejected_with_a_reason(changes, reason):
+    assert evaluate_fix(fix(**changes), S) == reason
 
 
-def test_sigma_is_the_receivers_or_that_of_the_kind_of_fix():
-    stated = gate.evaluate_fix(fix(position_covariance=(0.81, 0.1, 0, 0.1, 1.21, 0, 0, 0, 3.24)), S)
+def test_sigma_is_stated_by_the_receiver_or_follows_from_the_fix_type():
+    stated = evaluate_fix(fix(position_covariance=(0.81, 0.1, 0, 0.1, 1.21, 0, 0, 0, 3.24)), S)
     assert (stated.east_variance, stated.north_variance, stated.cross, stated.up_variance) == (0.81, 1.21, 0.1, 3.24)
     # HDOP 1: horizontal radius is the range error
-    assert gate.evaluate_fix(fix(), S).sigma * math.sqrt(2) == pytest.approx(S.uere)
-    assert gate.evaluate_fix(fix(fix_type=FixType.RTK_FIXED, hdop=2.0), S).sigma == pytest.approx(0.04 / math.sqrt(2))
-    unknown = gate.evaluate_fix(fix(hdop=math.nan, satellites=-1, position_covariance=(0.0,) * 9), S)
+    assert evaluate_fix(fix(), S).sigma * math.sqrt(2) == pytest.approx(S.uere)
+    assert evaluate_fix(fix(fix_type=FixType.RTK_FIXED, hdop=2.0), S).sigma == pytest.approx(0.04 / math.sqrt(2))
+    unknown = evaluate_fix(fix(hdop=math.nan, satellites=-1, position_covariance=(0.0,) * 9), S)
     assert unknown.sigma == pytest.approx(S.uere * S.assumed_hdop / math.sqrt(2))
 
 
-def test_height_may_be_told_above_the_sea_or_not_at_all():
-    assert gate.evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0, undulation=-18.0), S).height == 702.0
-    over_sea = gate.evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0), S)
-    assert over_sea.height == 720.0
-    assert over_sea.up_variance == S.assumed_height_sigma**2
-    assert math.isnan(gate.evaluate_fix(fix(height_ellipsoidal=math.nan), S).height)
+def test_height_is_ellipsoidal_above_mean_sea_level_or_unknown():
+    assert evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0, undulation=-18.0), S).height == 702.0
+    above_sea = evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0), S)
+    assert above_sea.height == 720.0
+    assert above_sea.up_variance == S.assumed_height_sigma**2
+    assert math.isnan(evaluate_fix(fix(height_ellipsoidal=math.nan), S).height)
 
 
 # --- attitude and motion ------------------------------------------------------------------------------------
@@ -182,7 +183,7 @@ angles = st.floats(-1.4, 1.4)
 
 
 @given(angles, angles, st.floats(-3, 3))
-def test_up_holds_roll_and_pitch(roll, pitch, yaw):
+def test_the_vertical_gives_roll_and_pitch(roll, pitch, yaw):
     R = Rotation.from_euler("xyz", [roll, pitch, yaw])
     up = tuple(R.inv().apply([0.0, 0.0, 1.0]))
     assert compute_roll_pitch(up) == pytest.approx((roll, pitch), abs=1e-9)
@@ -192,35 +193,35 @@ def test_up_holds_roll_and_pitch(roll, pitch, yaw):
 
 
 @given(angles, angles, st.tuples(*[st.floats(-1, 1)] * 3))
-def test_motion_turns_as_a_rotation_does(roll, pitch, rate):
+def test_motion_rotates_as_a_rotation_vector_does(roll, pitch, rate):
     R = Rotation.from_euler("xyz", [roll, pitch, 0.4])
     motion = RawMotion(0, yaw=0.4, up=tuple(R.inv().apply([0.0, 0.0, 1.0])))
     for i in range(1, 21):
-        motion = motion.advance(i * 1000, rate, S)
+        motion = motion.propagate(i * 1000, rate, S)
     expected = R * Rotation.from_rotvec([each * 0.02 for each in rate])
     got = Rotation.from_quat(motion.pose.wxyz, scalar_first=True)
     assert (expected.inv() * got).magnitude() < 2e-3  # 1 ms Euler steps of yaw
 
 
 @given(st.floats(-5, 5), st.floats(-0.5, 0.5), st.floats(0.3, 8.0), st.integers(1, 50))
-def test_one_long_step_ends_where_many_short_ones_do(speed, turn, seconds, n):
+def test_one_long_propagation_ends_where_many_short_ones_do(speed, turn, seconds, n):
     motion = RawMotion(START, rate=(0.0, 0.0, turn), speed=speed, speed_utime=START)
-    whole = motion.advance(START + round(seconds * 1e6), motion.rate, S)
-    parts = motion.advance(START + round(S.rate_hold * 1e6), motion.rate, S)
+    whole = motion.propagate(START + round(seconds * 1e6), motion.rate, S)
+    parts = motion.propagate(START + round(S.rate_hold * 1e6), motion.rate, S)
     for i in range(1, n + 1):
         t = START + round((S.rate_hold + (seconds - S.rate_hold) * i / n) * 1e6)
-        parts = parts.advance(t, (0.0, 0.0, 0.0), S)
+        parts = parts.propagate(t, (0.0, 0.0, 0.0), S)
     assert (parts.x, parts.y, parts.yaw) == pytest.approx((whole.x, whole.y, whole.yaw), abs=1e-6)
     assert math.hypot(whole.x, whole.y) <= abs(speed) * 2.0 * S.gps_timeout + 1e-9
 
 
-def inertial(**changes):
+def imu_sample(**changes):
     base = ImuSample(SensorHeader(START, "imu"), angular_velocity=(0.1, 0.2, 0.3), specific_force=(0.0, 0.0, 9.8))
     return replace(base, **changes)
 
 
 @pytest.mark.parametrize(
-    ("changes", "word"),
+    ("changes", "reason"),
     [
         ({"angular_velocity": None}, "nan"),
         ({"angular_velocity": (0.0, math.nan, 0.0)}, "nan"),
@@ -229,19 +230,19 @@ def inertial(**changes):
         ({"specific_force": (0.0, 0.0, 1e9)}, "range"),
     ],
 )
-def test_a_bad_inertial_sample_is_refused_in_a_word(changes, word):
-    assert read_raw_imu(inertial(**changes), MOUNTS.X_base_imu) == word
+def test_a_bad_imu_sample_is_rejected_with_a_reason(changes, reason):
+    assert read_raw_imu(imu_sample(**changes), MOUNTS.X_base_imu) == reason
 
 
 @given(angles, angles, st.floats(-3, 3), st.sampled_from((OrientationReference.ENU, OrientationReference.NED)))
-def test_gravity_is_read_from_the_device_whatever_its_reference_and_mount(roll, pitch, yaw, reference):
+def test_the_vertical_of_the_unit_is_read_with_any_reference_and_mount(roll, pitch, yaw, reference):
     R_world_base = Rotation.from_euler("xyz", [roll, pitch, yaw])
     R_base_imu = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
     R = R_world_base * R_base_imu
     force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
     if reference == OrientationReference.NED:
         R = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]) * R
-    sample = inertial(
+    sample = imu_sample(
         orientation=tuple(R.as_quat(scalar_first=True)), orientation_reference=reference, specific_force=force
     )
     found = read_raw_imu(sample, MOUNTS.X_base_imu)
@@ -249,16 +250,16 @@ def test_gravity_is_read_from_the_device_whatever_its_reference_and_mount(roll, 
     assert found.rate == pytest.approx(tuple(R_base_imu.apply([0.1, 0.2, 0.3])), abs=1e-12)
 
 
-def test_a_device_whose_vertical_contradicts_its_specific_force_is_refused():
-    # the right orientation of a level vehicle, said to be against the wrong reference: upside down
+def test_a_unit_whose_vertical_contradicts_its_specific_force_is_rejected():
+    # the right orientation of a level vehicle with the wrong reference: upside down
     R = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
     force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
     level = tuple(R.as_quat(scalar_first=True))
-    right = inertial(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
+    right = imu_sample(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
     wrong = replace(right, orientation_reference=OrientationReference.NED)
     assert read_raw_imu(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
     assert read_raw_imu(wrong, MOUNTS.X_base_imu) == "orientation"
-    # hard braking tilts the force, but not that far; a shock is not near g and says nothing of where up is
+    # hard braking tilts the force, but not that far; the force of a shock is not near g and shows no vertical
     braking = tuple(R.inv().apply([-6.0, 0.0, 9.8]))
     assert read_raw_imu(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
     shock = tuple(R.inv().apply([0.0, 0.0, -30.0]))
@@ -266,8 +267,8 @@ def test_a_device_whose_vertical_contradicts_its_specific_force_is_refused():
 
 
 @pytest.mark.parametrize("q", [(0.0,) * 4, (math.nan,) * 4, (2.0, 0.0, 0.0, 0.0)])
-def test_an_orientation_that_is_no_rotation_is_left_out(q):
-    sample = inertial(orientation=q, orientation_reference=OrientationReference.ENU)
+def test_an_orientation_that_is_not_a_rotation_is_ignored(q):
+    sample = imu_sample(orientation=q, orientation_reference=OrientationReference.ENU)
     assert read_raw_imu(sample, MOUNTS.X_base_imu).up is None
 
 
@@ -277,43 +278,43 @@ KNOWN = Heading(True, 0.5, 0.01, 0.0, 1e-6)
 
 
 def test_the_first_course_sets_the_heading():
-    heading, met = Heading().update_course(2.0, 0.02, S)
-    assert met is CourseResult.RESET
+    heading, result = Heading().update_course(2.0, 0.02, S)
+    assert result is CourseResult.RESET
     assert (heading.is_known, heading.offset, heading.variance) == (True, 2.0, 0.02)
 
 
-def test_courses_draw_heading_by_their_weight_across_the_cut():
-    heading, met = replace(KNOWN, offset=math.pi - 0.05).update_course(-math.pi + 0.05, 0.01, S)
-    assert met is CourseResult.USED
+def test_courses_are_weighted_by_variance_across_the_wrap():
+    heading, result = KNOWN._replace(offset=math.pi - 0.05).update_course(-math.pi + 0.05, 0.01, S)
+    assert result is CourseResult.USED
     assert abs(heading.offset) == pytest.approx(math.pi)
     assert heading.variance == pytest.approx(0.005)
 
 
-def test_a_course_half_a_turn_off_is_driving_backwards():
-    heading, met = KNOWN.update_course(0.5 + math.pi + 0.1, 0.01, S)
-    assert met is CourseResult.BACKWARDS
+def test_a_course_half_a_turn_off_is_reverse():
+    heading, result = KNOWN.update_course(0.5 + math.pi + 0.1, 0.01, S)
+    assert result is CourseResult.BACKWARDS
     assert heading.offset == pytest.approx(0.55)
 
 
-def test_a_course_that_fits_neither_is_refused_until_a_run_of_them_agrees():
+def test_a_course_that_fits_neither_is_rejected_until_a_run_of_them_agrees():
     heading = KNOWN
     for i in range(S.course_rejections - 1):
-        heading, met = heading.update_course(0.5 + math.pi / 2, 0.001, S)
-        assert (met, heading.num_rejected, heading.offset) == (CourseResult.REJECTED, i + 1, 0.5)
-    heading, met = heading.update_course(0.5 + math.pi / 2, 0.001, S)
-    assert met is CourseResult.RESET
+        heading, result = heading.update_course(0.5 + math.pi / 2, 0.001, S)
+        assert (result, heading.num_rejected, heading.offset) == (CourseResult.REJECTED, i + 1, 0.5)
+    heading, result = heading.update_course(0.5 + math.pi / 2, 0.001, S)
+    assert result is CourseResult.RESET
     assert heading.offset == pytest.approx(0.5 + math.pi / 2)
 
 
-def test_refused_courses_that_disagree_are_no_run():
+def test_rejected_courses_that_disagree_are_not_a_run():
     heading = KNOWN
     for i in range(20):
-        heading, met = heading.update_course(0.5 + (1 if i % 2 else -1) * math.pi / 2, 0.001, S)
-        assert met is CourseResult.REJECTED
+        heading, result = heading.update_course(0.5 + (1 if i % 2 else -1) * math.pi / 2, 0.001, S)
+        assert result is CourseResult.REJECTED
 
 
-def test_standing_tells_the_bias_and_the_bias_the_drift():
-    heading = replace(KNOWN, bias_variance=S.gyro_bias_sigma**2)
+def test_a_stationary_vehicle_measures_the_bias_and_so_limits_the_drift():
+    heading = KNOWN._replace(bias_variance=S.gyro_bias_sigma**2)
     true_bias = 0.01
     for _ in range(1000):  # 20 s
         heading = heading.propagate(0.02, S).update_stationary(true_bias - heading.bias, S.gyro_noise**2 / 0.02)
@@ -322,10 +323,10 @@ def test_standing_tells_the_bias_and_the_bias_the_drift():
     grown = settled
     for _ in range(600):
         grown = grown.propagate(0.1, S)
-    assert math.degrees(grown.sigma - settled.sigma) < 2.0  # the report: 1 to 2 deg a minute
+    assert math.degrees(grown.sigma - settled.sigma) < 2.0  # the report: 1 to 2 deg per minute
 
 
-def test_unmeasured_turns_make_heading_unsure_but_never_more_than_unknown():
+def test_unmeasured_turns_inflate_the_heading_up_to_unknown():
     assert KNOWN.propagate(1.0, S, measured=False).sigma > KNOWN.propagate(1.0, S).sigma
     assert KNOWN.propagate(1e12, S, measured=False).variance == pytest.approx(math.pi**2 / 3)
 
@@ -334,7 +335,7 @@ def test_unmeasured_turns_make_heading_unsure_but_never_more_than_unknown():
 
 
 def path_fixes(speed, turn, offset, n=12, dt=0.5, lever=0.4 - 0.3j):
-    """Fixes of an antenna on a vehicle at constant speed and turn: the closed form of an arc."""
+    """Return fixes of an antenna on a vehicle at constant speed and yaw rate: the closed form of an arc."""
     direction = cmath.rect(1.0, offset)
     made = []
     for i in range(n):
@@ -355,17 +356,17 @@ def test_speed_and_course_of_an_arc_are_exact(speed, turn, offset):
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=0.05)  # the arm's phase is iterated
     found = track.fit_course(made, cmath.rect(1.0, offset), S)
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=1e-9)
-    slope = track.fit_best_speed(made, cmath.rect(1.0, offset), S)
-    assert abs(slope.velocity) == pytest.approx(speed, abs=1e-6)
+    fit = track.fit_best_speed(made, cmath.rect(1.0, offset), S)
+    assert abs(fit.velocity) == pytest.approx(speed, abs=1e-6)
 
 
-def test_a_sure_receiver_tells_speed_from_a_short_stretch_and_an_unsure_one_from_a_long():
-    sure = track.fit_best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
-    unsure = track.fit_best_speed(tuple(replace(f, sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
-    assert sure.seconds < unsure.seconds <= S.speed_window
+def test_precise_fixes_give_the_speed_from_a_short_segment_and_noisy_ones_from_a_long_one():
+    precise = track.fit_best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
+    noisy = track.fit_best_speed(tuple(f._replace(sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
+    assert precise.seconds < noisy.seconds <= S.speed_window
 
 
-def test_a_stretch_is_bounded():
+def test_a_segment_is_limited_in_fixes_and_time():
     fixes = ()
     for i in range(500):
         fixes = track.append_fix(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
@@ -376,9 +377,9 @@ def test_a_stretch_is_bounded():
 # --- origin -------------------------------------------------------------------------------------------------
 
 
-def captured(places, sigma=0.5):
+def capture_origin(positions, sigma=0.5):
     capture, origin = OriginCapture(), None
-    for i, (east, north) in enumerate(places):
+    for i, (east, north) in enumerate(positions):
         ecef = GEODESY.tangent.to_ecef((east, north, 0.0))
         capture, origin = capture.add_fix(START + i * SECOND, ecef, sigma, S)
         if origin is not None:
@@ -387,40 +388,40 @@ def captured(places, sigma=0.5):
 
 
 def test_the_origin_is_the_mean_of_the_first_good_fixes():
-    i, origin = captured([(1.0, 0.0), (-1.0, 0.5), (0.0, -0.5), (0.5, 0.5), (-0.5, -0.5)])
+    i, origin = capture_origin([(1.0, 0.0), (-1.0, 0.5), (0.0, -0.5), (0.5, 0.5), (-0.5, -0.5)])
     assert i == S.origin_fixes - 1
     assert math.dist(origin.initial_utm, GEODESY.origin.initial_utm) < 1e-3
 
 
-def test_an_origin_is_found_on_the_move_but_not_in_scattered_fixes():
-    assert captured([(20.0 * i, -10.0 * i) for i in range(5)]) is not None
-    wild = [(30.0 * (i % 2), 0.0) for i in range(20)]
-    assert captured(wild) is None
-    assert captured(wild + [(0.0, 0.0)] * 5)[0] == 24
+def test_an_origin_is_found_while_moving_but_not_from_scattered_fixes():
+    assert capture_origin([(20.0 * i, -10.0 * i) for i in range(5)]) is not None
+    scattered = [(30.0 * (i % 2), 0.0) for i in range(20)]
+    assert capture_origin(scattered) is None
+    assert capture_origin(scattered + [(0.0, 0.0)] * 5)[0] == 24
 
 
-# --- bounds -------------------------------------------------------------------------------------------------
+# --- covariance and protection levels -----------------------------------------------------------------------
 
 
-def test_bounds_are_passed_with_the_stated_probability():
-    horizontal, heading = bounds.get_factors(1e-3)
+def test_protection_levels_are_exceeded_with_the_stated_probability():
+    horizontal, heading = compute_factors(1e-3)
     assert math.exp(-(horizontal**2) / 2) == pytest.approx(1e-3)
     assert math.erfc(heading / math.sqrt(2)) == pytest.approx(1e-3)
 
 
-def test_the_time_to_the_limit_is_where_the_bound_meets_it():
+def test_the_time_to_the_limit_ends_where_the_protection_level_reaches_it():
     variance, sigma_v = 4.0, 0.3
-    t = bounds.compute_seconds_to_limit(variance, 0.0, sigma_v, S)
-    bound = bounds.get_factors(S.risk)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
-    assert bound == pytest.approx(S.horizontal_limit)
-    assert bounds.compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
+    t = output.compute_seconds_to_limit(variance, 0.0, sigma_v, S)
+    level = compute_factors(S.risk)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
+    assert level == pytest.approx(S.horizontal_limit)
+    assert output.compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
 
 
 def test_an_error_of_yaw_moves_the_base_about_the_antenna():
-    good = gate.evaluate_fix(fix(), S)
-    cov = bounds.compute_covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
+    good = evaluate_fix(fix(), S)
+    cov = output.compute_covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
     assert cov[0] == pytest.approx(good.east_variance + 0.16)
     assert cov[7] == pytest.approx(good.north_variance + 0.09)
     assert cov[1] == cov[6] == pytest.approx(0.12)
     assert (cov[5], cov[11]) == pytest.approx((0.04, 0.03))
-    assert bounds.compute_longest_variance(cov[0], cov[7], cov[1]) == pytest.approx(good.east_variance + 0.25)
+    assert compute_longest_axis(cov[0], cov[7], cov[1]) == pytest.approx(good.east_variance + 0.25)

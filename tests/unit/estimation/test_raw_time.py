@@ -1,4 +1,4 @@
-"""Raw mode and time: order, steps of the clock, gaps; and samples it does not use."""
+"""Raw mode and time: out-of-sequence samples, clock steps, gaps; and samples that it ignores."""
 
 from __future__ import annotations
 
@@ -26,59 +26,59 @@ SAMPLES = Sensors().events(DRIVE)
 WARM = final(RawLocalizer.start(MOUNTS, None, ORIGIN), SAMPLES)
 
 
-def moved(sample, seconds):
+def shift_stamp(sample, seconds):
     header = sample.header
     return replace(sample, header=replace(header, utime=header.utime + round(seconds * 1e6)))
 
 
-def test_before_any_sample_everything_is_missing():
+def test_before_any_sample_every_reason_is_set():
     estimate = RawLocalizer.start(MOUNTS).estimate(START)
     assert estimate.invalid == Invalid.NO_FIX | Invalid.NO_IMU | Invalid.NO_ORIGIN | Invalid.NOT_MOVED_YET
     assert (estimate.enu, estimate.utm, estimate.utime) == (None, None, START)
     assert RawLocalizer.start(MOUNTS).utime == 0
 
 
-def test_the_origin_is_captured_once_and_said():
-    notes = [(sample, note) for sample, _, new in run(RawLocalizer.start(MOUNTS), SAMPLES) for note in new]
-    latched = [note for _, note in notes if isinstance(note, PersistOrigin)]
-    assert len(latched) == 1
-    assert math.dist(latched[0].origin.initial_utm[:2], ORIGIN.initial_utm[:2]) < 5.0
+def test_the_origin_is_captured_once_and_published():
+    events = [(sample, event) for sample, _, new in run(RawLocalizer.start(MOUNTS), SAMPLES) for event in new]
+    captured = [event for _, event in events if isinstance(event, PersistOrigin)]
+    assert len(captured) == 1
+    assert math.dist(captured[0].origin.initial_utm[:2], ORIGIN.initial_utm[:2]) < 5.0
 
 
-def test_a_given_origin_is_kept():
+def test_a_configured_origin_is_used():
     localizer = RawLocalizer.start(MOUNTS, None, ORIGIN)
-    assert all(not notes for _, _, notes in run(localizer, SAMPLES))
+    assert all(not events for _, _, events in run(localizer, SAMPLES))
     assert WARM.origin == ORIGIN
     assert WARM.estimate(WARM.utime).origin == ORIGIN
 
 
-def test_late_and_repeated_samples_are_refused_and_change_nothing():
+def test_delayed_and_duplicate_samples_are_rejected_and_change_nothing():
     imu = [s for s in SAMPLES if s.header.source == "imu"]
-    after, notes = WARM.process(imu[-1])
-    assert notes == (Rejected("sensor:imu", "duplicate"),)
-    after, notes = after.process(imu[-3])
-    assert notes == (Rejected("sensor:imu", "out_of_sequence"),)
+    after, events = WARM.process(imu[-1])
+    assert events == (Rejected("sensor:imu", "duplicate"),)
+    after, events = after.process(imu[-3])
+    assert events == (Rejected("sensor:imu", "out_of_sequence"),)
     assert after.estimate(WARM.utime).enu == WARM.estimate(WARM.utime).enu
 
 
-def test_one_stamp_from_the_past_is_no_clock_step():
+def test_one_stamp_from_the_past_is_not_a_clock_step():
     imu = [s for s in SAMPLES if s.header.source == "imu"]
-    after, notes = WARM.process(imu[10])
-    assert notes == (Rejected("sensor:imu", "out_of_sequence"),)
+    after, events = WARM.process(imu[10])
+    assert events == (Rejected("sensor:imu", "out_of_sequence"),)
     assert after.pose_epoch == 0
 
 
-def test_a_clock_set_back_begins_anew_and_odom_stays():
+def test_a_clock_set_back_restarts_raw_mode_and_odom_continues():
     localizer, seen = WARM, []
     before = WARM.estimate(WARM.utime)
     first = True
     for sample in SAMPLES:
-        localizer, _ = localizer.process(moved(sample, -100.0))
+        localizer, _ = localizer.process(shift_stamp(sample, -100.0))
         estimate = localizer.estimate(localizer.utime)
         if localizer.pose_epoch == 1:
             if first:
-                metres, radians = before.odom.distance(estimate.odom)
-                assert metres < 0.2
+                meters, radians = before.odom.distance(estimate.odom)
+                assert meters < 0.2
                 assert radians < 0.1
                 first = False
             seen.append(Invalid.CLOCK_STEPPED in estimate.invalid)
@@ -93,13 +93,13 @@ def test_a_clock_set_back_begins_anew_and_odom_stays():
 def test_a_clock_set_ahead_is_a_gap():
     localizer, reasons = WARM, []
     for sample in SAMPLES:
-        localizer, notes = localizer.process(moved(sample, 3600.0))
-        reasons += [note.reason for note in notes if isinstance(note, Rejected)]
+        localizer, events = localizer.process(shift_stamp(sample, 3600.0))
+        reasons += [event.reason for event in events if isinstance(event, Rejected)]
     assert "future" in reasons
     assert localizer.estimate(localizer.utime).invalid == 0
 
 
-def test_a_pose_asked_long_after_the_last_sample_is_stale_and_held():
+def test_a_pose_requested_long_after_the_last_sample_is_stale():
     estimate = WARM.estimate(WARM.utime + 3_600_000_000)
     assert Invalid.STALE_GPS in estimate.invalid
     assert Invalid.STALE_IMU in estimate.invalid
@@ -114,7 +114,7 @@ def test_seconds_to_limit_count_down():
     assert WARM.estimate(WARM.utime + 100_000).seconds_to_limit == pytest.approx(now - 0.1, abs=1e-6)
 
 
-def test_the_recent_past_is_looked_up():
+def test_the_recent_past_is_from_the_history():
     for back in (50_000, 500_000, 1_500_000):
         utime = WARM.utime - back
         estimate = WARM.estimate(utime)
@@ -130,15 +130,15 @@ def test_wheels_and_joints_are_ignored():
         assert WARM.process(sample) == (WARM, ())
 
 
-def test_a_fix_out_of_the_pinned_zones_reach_is_refused():
+def test_a_fix_beyond_the_range_of_the_pinned_zone_is_rejected():
     gps = next(s for s in reversed(SAMPLES) if s.header.source == "gps")
-    far = moved(replace(gps, longitude_deg=10.0), 0.2)
-    after, notes = WARM.process(far)
-    assert notes == (Rejected("sensor:gps", "range"),)
+    far = shift_stamp(replace(gps, longitude_deg=10.0), 0.2)
+    after, events = WARM.process(far)
+    assert events == (Rejected("sensor:gps", "range"),)
     assert after.estimate(WARM.utime).enu == WARM.estimate(WARM.utime).enu
 
 
-def test_a_fix_without_height_keeps_the_height():
+def test_a_fix_without_height_continues_the_height():
     localizer = RawLocalizer.start(MOUNTS, None, ORIGIN)
     for sample in SAMPLES:
         if sample.header.source == "gps" and sample.header.utime > START + 10_000_000:
@@ -149,7 +149,7 @@ def test_a_fix_without_height_keeps_the_height():
     assert estimate.covariance[14] > WARM.estimate(WARM.utime).covariance[14]
 
 
-def test_fixes_alone_give_a_place_but_no_valid_pose():
+def test_fixes_alone_give_a_position_but_no_valid_pose():
     localizer = final(RawLocalizer.start(MOUNTS), [s for s in SAMPLES if s.header.source == "gps"])
     estimate = localizer.estimate(localizer.utime)
     assert estimate.invalid & Invalid.NO_IMU
