@@ -126,11 +126,13 @@ def update_fixes(fixes: FixMonitor, heading: Heading, given: FixInput, settings:
     recent = track.append_fix(fixes.recent, newest, settings.speed_window + settings.stationary_time)
     segment = track.append_fix(fixes.segment, newest, settings.course_window)
     velocity = _read_velocity(given, settings)
-    measured = None if velocity is None else (velocity.to_base(heading), velocity.sigma)
-    if measured is None:
-        is_slow = track.is_slow(recent, settings)
+    if velocity is None:
+        measured, is_slow = None, track.is_slow(recent, settings)
     else:
-        is_slow = abs(measured[0]) <= _get_slow_limit(measured[1], settings)
+        measured = velocity.to_base(heading), velocity.sigma
+        # the speed up to which one velocity may be a stationary vehicle's; their mean over time shows more
+        limit = min(settings.stationary_speed + 3.0 * velocity.sigma, settings.course_speed)
+        is_slow = abs(measured[0]) <= max(velocity.sigma, limit)
     least_speed = max(abs(motion.speed) - 2.0 * motion.speed_sigma, 0.0)
     place, heading, is_slow = update_stationary(
         fixes.stationary, is_slow, given.is_stationary, newest, measured, least_speed, heading, settings
@@ -187,8 +189,7 @@ def _gate_fix(
     sigmas = before.fix.sigma, newest.fix.sigma
     predicted, speed_sigma = before.position, None
     if heading.is_known and motion.speed_utime:
-        direction = cmath.rect(1.0, heading.offset)
-        predicted = before.propagate_base(motion, direction)[0] + direction * newest.lever
+        predicted = before.propagate_base(motion, heading.direction)[0] + heading.direction * newest.lever
         speed_sigma = motion.speed_sigma
     off = abs(newest.position - predicted)
     # while fixes are rejected, time alone must not let the same ones pass
@@ -255,7 +256,7 @@ class ReceiverVelocity(NamedTuple):
     def to_base(self, heading: Heading) -> complex:
         """Return the velocity of the base frame by equation (1), east + i north, m/s."""
         if heading.is_known:
-            direction = cmath.rect(1.0, heading.offset)
+            direction = heading.direction
         elif abs(self.vector) > 0.0:
             direction = self.vector / abs(self.vector) * cmath.rect(1.0, -self.yaw)
         else:
@@ -297,11 +298,6 @@ def _read_velocity(given: FixInput, settings: RawSettings) -> ReceiverVelocity |
     )
 
 
-def _get_slow_limit(sigma: float, settings: RawSettings) -> float:
-    """Return the speed up to which one velocity may be a stationary vehicle's; their mean over time shows more."""
-    return max(sigma, min(settings.stationary_speed + 3.0 * sigma, settings.course_speed))
-
-
 def _update_course(
     heading: Heading,
     velocity: ReceiverVelocity | None,
@@ -316,7 +312,7 @@ def _update_course(
             return heading, None
         offset = cmath.phase(vector) - velocity.measured_yaw
         return heading.update_course(offset, velocity.course_sigma**2 + turn_variance, settings)
-    found = track.fit_course(segment, cmath.rect(1.0, heading.offset) if heading.is_known else None, settings)
+    found = track.fit_course(segment, heading.direction if heading.is_known else None, settings)
     if found is None or found[1] > settings.course_sigma_limit:
         return heading, None
     # the offset is that of the middle of the segment: an error of the bias has turned it since
@@ -332,7 +328,7 @@ def _estimate_speed(
 
     Before the heading is known, motion is taken as forward, and speed within three sigmas as 0.
     """
-    direction = cmath.rect(1.0, heading.offset) if heading.is_known else 0j
+    direction = heading.direction if heading.is_known else 0j
     if velocity is not None:
         vector, sigma = velocity.to_base(heading), velocity.sigma
         along = (vector * cmath.rect(1.0, -velocity.yaw) * direction.conjugate()).real

@@ -18,6 +18,7 @@ Limits: one course is forward or backward, never sideways; side slip goes into o
 
 from __future__ import annotations
 
+import cmath
 import math
 from enum import Enum
 from typing import Final, NamedTuple
@@ -62,6 +63,11 @@ class Heading(NamedTuple):
     def sigma(self) -> float:
         """Sigma of the heading, rad."""
         return math.sqrt(self.variance)
+
+    @property
+    def direction(self) -> complex:
+        """exp(i offset), from Odom's horizontal axes to east + i north."""
+        return cmath.rect(1.0, self.offset)
 
     def propagate(self, dt: float, settings: RawSettings, measured: bool = True) -> Heading:
         """Propagate by equation (1) over `dt` seconds; `measured`: whether the gyro measured the turn.

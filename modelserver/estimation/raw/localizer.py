@@ -131,10 +131,10 @@ class RawLocalizer(RawState):
         imu = read_raw_imu(sample, self.mounts.X_base_imu)
         if isinstance(imu, str):
             return self, _reject(sample, imu)
-        if before is None or self.imu_utime is None:
-            return self._start_imu(utime, imu), ()
         (wx, wy, wz), (bx, by) = imu.rate, self.tilt_bias
         rate = (wx - bx, wy - by, wz - self.heading.bias)
+        if before is None or self.imu_utime is None:
+            return self._start_imu(utime, imu, rate), ()
         dt = (utime - self.imu_utime) * 1e-6
         is_gap = dt > settings.rate_hold
         a, b, c = before.rate
@@ -163,11 +163,9 @@ class RawLocalizer(RawState):
         motion = motion._replace(up=up, rate=rate, speed=speed, speed_sigma=speed_sigma)
         return localizer._with_imu(utime, motion), _reject(sample, "gap") if is_gap else ()
 
-    def _start_imu(self, utime: int, imu: RawImuSample) -> RawLocalizer:
+    def _start_imu(self, utime: int, imu: RawImuSample, rate: Vector3) -> RawLocalizer:
         """Return the localizer after a first sample: there is nothing to integrate from, but it gives the vertical."""
         before = self.motion or RawMotion(utime)
-        (wx, wy, wz), (bx, by) = imu.rate, self.tilt_bias
-        rate = (wx - bx, wy - by, wz - self.heading.bias)
         motion = before.propagate(utime, ZERO, self.settings)
         heading = self.heading.propagate((utime - before.utime) * 1e-6, self.settings, measured=False)
         localizer = self._replace(heading=heading, fixes=self.fixes.forget_path())

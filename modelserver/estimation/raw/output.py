@@ -11,6 +11,7 @@ World:UTM and World:ENU are each computed from the earth-centered position.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
@@ -41,27 +42,26 @@ def estimate(state: RawState, utime: int) -> Estimate:
     if newest is None:
         return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=state.pose_epoch, origin=origin)
     motion = state.get_motion_at(utime, newest)
-    quality = _find_quality(state, utime, motion)
     odom = motion.pose
-    odom_covariance = compute_odom_covariance(motion.position_variance, motion.yaw_variance, settings)
+    in_odom = Estimate(
+        utime,
+        odom,
+        odom_covariance=compute_odom_covariance(motion.position_variance, motion.yaw_variance, settings),
+        invalid=invalid,
+        quality=_find_quality(state, utime, motion),
+        pose_epoch=state.pose_epoch,
+        origin=origin,
+        is_odom_random_walk=True,
+    )
     if anchor is None:
-        return Estimate(
-            utime,
-            odom,
-            odom_covariance=odom_covariance,
-            invalid=invalid,
-            quality=quality,
-            pose_epoch=state.pose_epoch,
-            origin=origin,
-            is_odom_random_walk=True,
-        )
-    heading = state.heading
-    heading_variance = UNKNOWN_VARIANCE
+        return in_odom
+    heading, q, direction, heading_variance = state.heading, odom.wxyz, 1.0 + 0j, UNKNOWN_VARIANCE
     if heading.is_known:
+        q, direction = so3.multiply(rotation_about_up(heading.offset), q), heading.direction
         heading_variance = heading.propagate((utime - newest.utime) * 1e-6, settings).variance
     age = max((utime - anchor.utime) * 1e-6, 0.0)
     growth = compute_growth(age, newest.speed_sigma, settings)
-    position, up, arm = anchor.propagate_base(motion, state.direction)
+    position, up, arm = anchor.propagate_base(motion, direction)
     covariance = compute_covariance(anchor.fix, growth, arm, heading_variance, settings)
     variance = compute_longest_axis(covariance[0], covariance[7], covariance[1])
     k_horizontal, k_heading = compute_factors(settings.risk)
@@ -75,30 +75,21 @@ def estimate(state: RawState, utime: int) -> Estimate:
     enu = utm = None
     if state.projection is not None and state.fixes.work is not None:
         is_far = abs(position - anchor.position) > CONVERGENCE_RANGE
-        q = odom.wxyz
-        if heading.is_known:
-            q = so3.multiply(rotation_about_up(heading.offset), q)
         enu, utm = _compute_world_poses(state.projection, state.fixes.work, q, position, up, is_far)
     remaining = min(
         settings.gps_timeout - age,
         settings.imu_timeout - (utime - (state.imu_utime or utime)) * 1e-6,
         compute_seconds_to_limit(variance - growth, age, newest.speed_sigma, settings),
     )
-    return Estimate(
-        utime,
-        odom,
-        enu,
-        utm,
-        covariance,
-        odom_covariance,
-        invalid,
-        quality,
-        state.pose_epoch,
-        origin,
-        horizontal,
-        heading_level,
-        NAN if invalid else max(remaining, 0.0),
-        is_odom_random_walk=True,
+    return replace(
+        in_odom,
+        enu=enu,
+        utm=utm,
+        covariance=covariance,
+        invalid=invalid,
+        horizontal_protection_level=horizontal,
+        heading_protection_level=heading_level,
+        seconds_to_limit=NAN if invalid else max(remaining, 0.0),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 from typing import NamedTuple
 
 from modelserver.estimation.origin import OriginCapture, OriginProjection
@@ -50,11 +49,6 @@ class RawState(NamedTuple):
     def origin(self) -> Origin | None:
         """The origin of World:UTM, None before it is set."""
         return None if self.projection is None else self.projection.geodesy.origin
-
-    @property
-    def direction(self) -> complex:
-        """exp(i offset), from Odom's horizontal axes to east and north; 1 before the heading is known."""
-        return cmath.rect(1.0, self.heading.offset) if self.heading.is_known else 1.0 + 0j
 
     def get_motion_at(self, utime: int, newest: RawMotion) -> RawMotion:
         """Return the motion at an instant: predicted from the newest, or from the history."""
