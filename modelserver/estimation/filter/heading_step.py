@@ -129,8 +129,13 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
         gnss = state.gnss
     nav = heading_alignment.rotate(nav, rotation, setup.layout)
     nav = heading_alignment.place(nav, newest, displacement, lever, setup.layout)
-    site = state.site
-    assert site is not None
+    assert state.site is not None
+    check = state.heading_check if isinstance(state, Aligned) else None
+    return _align(state, nav, state.site, gnss)._replace(heading_check=check)
+
+
+def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor) -> Aligned:
+    """Return the aligned state at a pose that was just found, in the tangent plane `site`."""
     latitude, _, height = geodetic_from_ecef(site.ecef)
     return Aligned(
         nav,
@@ -141,7 +146,6 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
         Earth.at(latitude, height),
         site,
         gnss.restart(nav.utime),
-        state.heading_check if isinstance(state, Aligned) else None,
     )
 
 
@@ -293,15 +297,6 @@ def _set_pose(
     P[0:3, :] = 0.0
     P[:, 0:3] = 0.0
     P[0:3, 0:3] = again.noise[:3, :3]
-    latitude, _, height = geodetic_from_ecef(site.ecef)
-    aligned = Aligned(
-        nav._replace(position=(x + a, y + b, z + c), covariance=P),
-        state.imu,
-        state.stationary,
-        state.constraints,
-        state.common._replace(is_clock_stepped=False),
-        Earth.at(latitude, height),
-        site,
-        GnssMonitor(last_fix=state.alignment.last_fix, used_utime=nav.utime),
-    )
+    nav = nav._replace(position=(x + a, y + b, z + c), covariance=P)
+    aligned = _align(state, nav, site, GnssMonitor(last_fix=state.alignment.last_fix))
     return aligned, (report_reset(item, "position and heading were set"),)
