@@ -16,6 +16,7 @@ Work is bounded: a count by the remaining tokens, objects by the tokens (one eac
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
@@ -41,7 +42,7 @@ MAX_INT_BYTES: Final = 4096
 """Bytes of an integer."""
 
 
-class TypeNode:
+class TypeNode(ABC):
     """Encoder and decoder of one declared type.
 
     `text` is its canonical description, part of the schema; `types` are those whose values are tokens unchanged.
@@ -50,17 +51,17 @@ class TypeNode:
     text: str
     types: frozenset[type] = frozenset()
 
+    @abstractmethod
     def encode(self, value: Any, out: TokenWriter) -> None:
         """Write a value. Raises TypeError for a value of another type."""
-        raise NotImplementedError
 
+    @abstractmethod
     def decode(self, head: Any, source: TokenReader) -> Any:
         """Read a value after its first token, `head`.
 
         Raises ValueError or TypeError for invalid tokens, RecordingError where the field is known, StopIteration at the
         end of the stream.
         """
-        raise NotImplementedError
 
     def describe_mismatch(self, value: object) -> str:
         """Describe a value of another type."""
@@ -332,13 +333,13 @@ class _Shared(TypeNode):
         known.append((value, source.weight - before))
         return value
 
+    @abstractmethod
     def encode_content(self, value: Any, out: TokenWriter) -> None:
         """Write a new value; the first token is not negative."""
-        raise NotImplementedError
 
+    @abstractmethod
     def decode_content(self, head: int, source: TokenReader) -> Any:
         """Read a value after its first token."""
-        raise NotImplementedError
 
 
 class TupleNode(_Shared):
