@@ -52,14 +52,15 @@ class ImuMonitor(NamedTuple):
     is_interpolated: bool = False
 
     def update(self, utime: int, rate: Vector3, force: Vector3) -> ImuMonitor:
-        """Return the monitor after a sample."""
+        """Return the monitor after a used sample; the caller sets `used_utime` back if it rejects the sample."""
         if not self.utime:
-            return ImuMonitor(utime, rate, force, utime, (), 0, self.used_utime, self.is_interpolated)
+            return ImuMonitor(utime, rate, force, utime, (), 0, utime, self.is_interpolated)
         dt = (utime - self.utime) * 1e-6
         if dt <= 0.0:
-            return self
+            return self._replace(used_utime=utime)
         if rate == self.rate and force == self.force:
-            return self._replace(utime=utime, slope=(), num_collinear=self.num_collinear + 1 if not self.slope else 1)
+            count = self.num_collinear + 1 if not self.slope else 1
+            return self._replace(utime=utime, slope=(), num_collinear=count, used_utime=utime)
         (a, b, c), (d, e, f) = self.rate, self.force
         (g, h, i), (j, k, m) = rate, force
         slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
@@ -70,7 +71,7 @@ class ImuMonitor(NamedTuple):
                     is_collinear = False
                     break
         count = self.num_collinear + 1 if is_collinear else 0
-        return ImuMonitor(utime, rate, force, utime, slope, count, self.used_utime, self.is_interpolated)
+        return ImuMonitor(utime, rate, force, utime, slope, count, utime, self.is_interpolated)
 
     @property
     def seems_interpolated(self) -> bool:

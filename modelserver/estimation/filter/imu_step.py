@@ -53,6 +53,7 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
     utime, settings = item.utime, setup.settings
     imu = state.imu.update(utime, rate, force)
     if imu.get_frozen_time(utime) > settings.frozen_time:
+        imu = imu._replace(used_utime=state.imu.used_utime)
         return state._replace(imu=imu), (reject(item, "frozen"),)
     decisions = NOTHING
     if imu.seems_interpolated != imu.is_interpolated:

@@ -94,7 +94,7 @@ def _update_mean(state: Leveling, utime: int, rate: Vector3, force: Vector3) -> 
         n, is_stationary = 0, False
     return Leveling(
         state.common,
-        state.imu._replace(used_utime=utime),
+        state.imu,
         state.stationary,
         state.first_utime or utime,
         mean_since or utime,

@@ -192,7 +192,8 @@ class FilterLocalizer:
         if item.kind == IMU and isinstance(sample, ImuSample) and not isinstance(head, Leveling):
             values = imu_monitor.read_imu(sample, self.setup.mount)
             if not isinstance(values, str) and item.utime > head.nav.utime and head.common.mode is not Mode.NO_IMU:
-                return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, head.imu)
+                imu = head.imu._replace(used_utime=item.utime)
+                return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, imu)
         return head
 
     def _advance_odom(self, head: FilterState) -> tuple[Odometry, tuple[Odometry, ...]]:

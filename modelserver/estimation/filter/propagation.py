@@ -54,7 +54,7 @@ def propagate_imu(
             nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= eskf.COVARIANCE_STEP:
             nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)
-    return state.with_imu(nav, imu._replace(used_utime=utime), stationary)
+    return state.with_imu(nav, imu, stationary)
 
 
 def predict(setup: Setup, state: N, utime: int) -> N:

@@ -109,7 +109,7 @@ class FilterSettings(FixSettings):
     stationary_sigma: float = 0.01
     """Sigma of the speed of a standing vehicle, m/s: it rocks."""
     recapture_time: float = 3.0
-    """How long the vehicle must have stood before the gyro biases are calibrated again, seconds (report 5.1)."""
+    """How long the vehicle must be stationary before the gyro biases are calibrated again, seconds (report 5.1)."""
 
     # --- fixes ---
 
