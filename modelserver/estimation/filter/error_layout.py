@@ -82,6 +82,16 @@ class ErrorLayout:
         return np.array(rates)
 
     @cached_property
+    def growth_rates(self) -> Array:
+        """The decay rates with their sign, -1 / time constant, 1/s."""
+        return -self.decay_rates
+
+    @cached_property
+    def densities_and_rates(self) -> tuple[tuple[float, float], ...]:
+        """Noise density and decay rate of each additional state, as plain numbers."""
+        return tuple(zip(self.noise_densities.tolist(), self.decay_rates.tolist(), strict=True))
+
+    @cached_property
     def noise_densities(self) -> Array:
         """Spectral density of the process noise of each additional state, its unit squared per second."""
         found = [

@@ -33,11 +33,12 @@ Read top-down: `NavState` -> `propagate` -> `propagate_covariance` -> `update` -
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
+from functools import lru_cache, partial
+from struct import Struct
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from modelserver.earth import gravity as earth_model
 from modelserver.estimation.filter.error_layout import ATTITUDE, STRAPDOWN, ErrorLayout
@@ -132,6 +133,10 @@ class NavState(NamedTuple):
     def up(self) -> Vector3:
         """N's up along the body axes."""
         return so3.rotate(so3.conjugate(self.attitude), (0.0, 0.0, 1.0))
+
+    def with_covariance(self, covariance: Array, extras: tuple[float, ...]) -> NavState:
+        """Return the state with its covariance at its instant, and the additional states there."""
+        return NavState(*self[:6], extras, covariance, 0.0, ZERO, *self[10:])
 
     def inject(self, error: Array, covariance: Array) -> NavState:
         """Return the state with an error (n) injected, and the covariance (n, n) after the reset (Sola 7.3)."""
@@ -295,73 +300,83 @@ def propagate_covariance(nav: NavState, noise: ProcessNoise, layout: ErrorLayout
     dt = nav.lag
     if dt <= 0.0:
         return nav
-    decays = np.exp(-dt * layout.decay_rates) if layout.extra_names else None
-    extras = nav.extras
+    decays: list[float] = np.exp(dt * layout.growth_rates).tolist()
     workspace, zero = _workspace(layout.size, 1)
     workspace.x, workspace.P = zero, nav.covariance
     workspace.predict(
         F=_transition_matrix(nav, dt, layout, decays, noise.gyros_drive_attitude),
         Q=_process_noise_matrix(noise, dt, layout, decays),
     )
-    P: Array = workspace.P
-    if decays is not None:
-        extras = tuple(value * keep for value, keep in zip(extras, decays.tolist(), strict=True))
-    return nav._replace(covariance=P, lag=0.0, impulse=ZERO, extras=extras)
+    extras = tuple([value * keep for value, keep in zip(nav.extras, decays, strict=True)])
+    return nav.with_covariance(workspace.P, extras)
 
 
 def _transition_matrix(
-    nav: NavState, dt: float, layout: ErrorLayout, decays: Array | None, gyros_drive_attitude: bool = True
+    nav: NavState, dt: float, layout: ErrorLayout, decays: Sequence[float], gyros_drive_attitude: bool = True
 ) -> Array:
-    """Return F (n, n) over the lag: equations (2) to second order in dt."""
-    n = layout.size
-    F = np.zeros((n, n))
+    """Return F (n, n) over the lag: equations (2) to second order in dt. `decays` are those of the additional states.
+
+    The array is valid until the next call.
+    """
     ix, iy, iz = nav.impulse
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
     t, u = -dt, -0.5 * dt * dt
     k = 0.5 * dt
     w = t if gyros_drive_attitude else 0.0
-    F.put(
-        _transition_entries(n),
-        (
-            # position by velocity, attitude and accelerometer bias
-            *(dt, dt, dt),
-            *(k * iz, -k * iy, -k * iz, k * ix, k * iy, -k * ix),
-            *(u * a, u * b, u * c, u * d, u * e, u * f, u * g, u * h, u * i),
-            # velocity by attitude and accelerometer bias
-            *(iz, -iy, -iz, ix, iy, -ix),
-            *(t * a, t * b, t * c, t * d, t * e, t * f, t * g, t * h, t * i),
-            # attitude by gyro bias
-            *(w * a, w * b, w * c, w * d, w * e, w * f, w * g, w * h, w * i),
-        ),
+    return _transition_buffer(layout.size).fill(
+        # position by velocity, attitude and accelerometer bias
+        *(dt, dt, dt),
+        *(k * iz, -k * iy, -k * iz, k * ix, k * iy, -k * ix),
+        *(u * a, u * b, u * c, u * d, u * e, u * f, u * g, u * h, u * i),
+        # velocity by attitude and accelerometer bias
+        *(iz, -iy, -iz, ix, iy, -ix),
+        *(t * a, t * b, t * c, t * d, t * e, t * f, t * g, t * h, t * i),
+        # attitude by gyro bias
+        *(w * a, w * b, w * c, w * d, w * e, w * f, w * g, w * h, w * i),
+        *decays,
     )
-    diagonal = F.reshape(-1)[:: n + 1]
-    diagonal[:STRAPDOWN] = 1.0
-    if decays is not None:
-        diagonal[STRAPDOWN:] = decays
-    return F
 
 
-def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, decays: Array | None) -> Array:
-    """Return Q (n, n) over the lag; the noise is the same along all axes."""
-    n = layout.size
-    Q = np.zeros((n, n))
+def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, decays: Sequence[float]) -> Array:
+    """Return Q (n, n) over the lag; the noise is the same along all axes. The array is valid until the next call."""
     v = noise.accelerometer * dt
     p, pv = v * dt * dt / 3.0, v * dt / 2.0
     w, bg, ba = noise.gyro * dt, noise.gyro_bias * dt, noise.accelerometer_bias * dt
-    diagonal = Q.reshape(-1)[:: n + 1]
-    diagonal[:STRAPDOWN] = (p, p, p, v, v, v, w, w, w, bg, bg, bg, ba, ba, ba)
-    Q[0, 3] = Q[3, 0] = Q[1, 4] = Q[4, 1] = Q[2, 5] = Q[5, 2] = pv
-    if decays is not None:
-        # exact for a Gauss-Markov process; dt, its limit, for a random walk
-        rates = layout.decay_rates
-        share = np.where(rates > 0.0, (1.0 - decays * decays) / np.maximum(2.0 * rates, 1e-300), dt)
-        diagonal[STRAPDOWN:] = layout.noise_densities * share
-    return Q
+    # exact for a Gauss-Markov process; dt, its limit, for a random walk
+    extras = [
+        density * ((1.0 - keep * keep) / (2.0 * rate) if rate > 0.0 else dt)
+        for (density, rate), keep in zip(layout.densities_and_rates, decays, strict=True)
+    ]
+    return _process_noise_buffer(layout.size).fill(
+        *(p, p, p, v, v, v, w, w, w, bg, bg, bg, ba, ba, ba, *extras),
+        *(pv, pv, pv, pv, pv, pv),
+    )
+
+
+class MatrixBuffer:
+    """A square matrix with constant places for changing numbers; the other entries stay.
+
+    It is reused, and filled by way of `struct`: both are faster than a new array of a tuple.
+    """
+
+    def __init__(self, matrix: Array, places: Iterable[tuple[int, int]]):
+        """Reuse a matrix (n, n), with `places` (row, column) in the order of the numbers."""
+        n = len(matrix)
+        self._matrix, self._flat = matrix, matrix.reshape(-1)
+        self._indices = np.array([row * n + column for row, column in places])
+        self._values = np.zeros(len(self._indices))
+        self._pack = partial(Struct(f"{len(self._indices)}d").pack_into, self._values.data, 0)
+
+    def fill(self, *numbers: float) -> Array:
+        """Return the matrix with these numbers at its places; it is valid until the next call."""
+        self._pack(*numbers)
+        self._flat[self._indices] = self._values
+        return self._matrix
 
 
 @lru_cache(maxsize=16)
-def _transition_entries(n: int) -> npt.NDArray[np.intp]:
-    """Return the flat indices in an (n, n) matrix of the entries that `_transition_matrix` writes, in its order."""
+def _transition_buffer(n: int) -> MatrixBuffer:
+    """Return the buffer of an (n, n) F with the entries of `_transition_matrix`, in its order."""
     skew = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
     full = [(r, c) for r in range(3) for c in range(3)]
     places = [(k, 3 + k) for k in range(3)]
@@ -370,7 +385,15 @@ def _transition_entries(n: int) -> npt.NDArray[np.intp]:
     places += [(3 + r, 6 + c) for r, c in skew]
     places += [(3 + r, 12 + c) for r, c in full]
     places += [(6 + r, 9 + c) for r, c in full]
-    return np.array([r * n + c for r, c in places])
+    places += [(k, k) for k in range(STRAPDOWN, n)]
+    return MatrixBuffer(np.eye(n), places)
+
+
+@lru_cache(maxsize=16)
+def _process_noise_buffer(n: int) -> MatrixBuffer:
+    """Return the buffer of an (n, n) Q with the entries of `_process_noise_matrix`, in its order."""
+    places = [(k, k) for k in range(n)] + [(k, k + 3) for k in range(3)] + [(k + 3, k) for k in range(3)]
+    return MatrixBuffer(np.zeros((n, n)), places)
 
 
 # --- update and reset ---------------------------------------------------------------------------------------
