@@ -8,7 +8,7 @@ absolute-pose sample of the source `OPERATOR`, and passes the gates of localizat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -111,7 +111,7 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
     changes = describe_changes(state.model, model)
     outputs: list[messages.Output] = []
     if request is None or not request.dry_run:
-        view = replace(state.view, model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
+        view = state.view._replace(model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
         due = now.monotonic_ns + state.settings.snapshot_period_ns
         state = state._replace(view=view, snapshot_due_ns=due)
         outputs.append(messages.PublishSnapshot(now.utime))

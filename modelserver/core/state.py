@@ -101,23 +101,23 @@ class ExpectedSensor(NamedTuple):
 
 
 class SourceTraffic(NamedTuple):
-    """Statistics of the messages of one source.
+    """Statistics of the messages of one source. The first four change with each message.
 
     Attributes
     ----------
     count, last_received_ns: messages, and arrival of the last one.
-    reported, rate, reported_delay: count, rate (Hz) and greatest delay (s) of the last full health report.
     interval: moving average of the time between two messages, s; 0 = not known yet.
     delay: greatest delay from the host's receipt to handling since the last full report, s.
+    reported, rate, reported_delay: count, rate (Hz) and greatest delay (s) of the last full health report.
     measured, used: measurements with a decision of localization, and those that it used.
     dropped, reason: measurements dropped in a row since the last used one, and the last reason.
     """
 
     count: int = 0  # type: ignore[assignment]  # hides tuple.count
     last_received_ns: int = 0
-    reported: int = 0
     interval: float = 0.0
     delay: float = messages.NAN
+    reported: int = 0
     rate: float = 0.0
     reported_delay: float = messages.NAN
     measured: int = 0
@@ -158,15 +158,17 @@ class HealthInputs(NamedTuple):
 class CoreState(NamedTuple):
     """State of the core. `start` makes the first one.
 
-    A NamedTuple, not a dataclass: it is replaced with every event, at a third of the cost.
+    A NamedTuple, not a dataclass: it is replaced with every event, at a third of the cost. The first three change with
+    each sample.
     """
 
-    settings: CoreSettings
     view: PlatformView
+    host_clock: HostClock
+    traffic: Mapping[str, SourceTraffic]
+    settings: CoreSettings
     started_ns: int
     waiting: tuple[WaitingRequest, ...] = ()
     rejected: Mapping[tuple[str, str], int] = MappingProxyType({})
-    traffic: Mapping[str, SourceTraffic] = MappingProxyType({})
     tick_latencies: tuple[float, ...] = ()
     health_due_ns: int = 0
     health_sent_ns: int = 0
@@ -175,7 +177,6 @@ class CoreState(NamedTuple):
     ticks_missed: int = 0
     handler_errors: int = 0
     run_state: int = STARTING
-    host_clock: HostClock = HostClock()
     snapshot_due_ns: int = 0
     warnings: Mapping[str, str] = MappingProxyType({})
     persist_due_ns: int = 0
@@ -215,7 +216,7 @@ def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now
     due = now.monotonic_ns
     clock = HostClock().update(now, set_back=True)
     return CoreState(
-        settings, view, due, health_due_ns=due, snapshot_due_ns=due, missing_sensors=settings.sensors, host_clock=clock
+        view, clock, {}, settings, due, health_due_ns=due, snapshot_due_ns=due, missing_sensors=settings.sensors
     )
 
 
@@ -256,23 +257,25 @@ def count_rejection(state: CoreState, channel: str, reason: str, count: int = 1)
     return state._replace(rejected=counts, handler_errors=errors)
 
 
-def count_message(state: CoreState, source: str, host_utime: int, now: Instant) -> CoreState:
+def count_message(
+    traffic: Mapping[str, SourceTraffic], source: str, host_utime: int, now: Instant
+) -> Mapping[str, SourceTraffic]:
     """Count a message of a source that the host received at `host_utime` (0 = unknown)."""
-    known = state.traffic.get(source)
-    if known is None and len(state.traffic) >= MAX_COUNTERS:
-        return state
-    known = known or SourceTraffic()
-    interval, delay = known.interval, known.delay
-    if known.count:
-        since = (now.monotonic_ns - known.last_received_ns) * 1e-9
+    known = traffic.get(source)
+    if known is None:
+        if len(traffic) >= MAX_COUNTERS:
+            return traffic
+        known = SourceTraffic()
+    count, last_received_ns, interval, delay = known[:4]
+    if count:
+        since = (now.monotonic_ns - last_received_ns) * 1e-9
         # limited, so that a pause does not hide the next ones
         usual = min(since, get_silence_limit(interval)) if interval else since
-        interval += (usual - interval) * (INTERVAL_GAIN if known.count > 1 else 1.0)
+        interval += (usual - interval) * (INTERVAL_GAIN if count > 1 else 1.0)
     if host_utime:
         latest = (now.utime - host_utime) * 1e-6
         delay = delay if delay >= latest else latest  # also if it is nan
-    updated = known._replace(count=known.count + 1, last_received_ns=now.monotonic_ns, interval=interval, delay=delay)
-    return state._replace(traffic={**state.traffic, source: updated})
+    return {**traffic, source: SourceTraffic(count + 1, now.monotonic_ns, interval, delay, *known[4:])}
 
 
 def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:
@@ -299,7 +302,8 @@ def get_silence_limit(interval: float) -> float:
 def mark_received(state: CoreState, sample: messages.Sample) -> CoreState:
     """Remove the sensors that a sample may be from from the missing ones."""
     kind, source = type(sample), sample.header.source
-    missing = tuple(
-        [each for each in state.missing_sensors if each.kind is not kind or each.source not in ("", source)]
-    )
-    return state if len(missing) == len(state.missing_sensors) else state._replace(missing_sensors=missing)
+    for sensor in state.missing_sensors:
+        if sensor.kind is kind and sensor.source in ("", source):
+            missing = tuple([each for each in state.missing_sensors if each is not sensor])
+            return mark_received(state._replace(missing_sensors=missing), sample)
+    return state

@@ -20,7 +20,7 @@ def handle_tick(state: CoreState, tick: messages.Tick, now: Instant) -> StepResu
     """Do what is due by the clock."""
     outputs: list[messages.Output] = []
     settings, before = state.settings, state.ticks
-    state = check_host_clock(state, now)
+    state = check_host_clock(state, now, state.traffic)
     state = state._replace(
         tick_latencies=(*state.tick_latencies[-MAX_TICK_LATENCIES + 1 :], tick.latency),
         ticks=state.ticks + 1 + tick.missed,

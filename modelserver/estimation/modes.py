@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
@@ -48,8 +49,7 @@ class LocalizerConfig:
     mounts: Mounts | None
 
 
-@dataclass(frozen=True, slots=True)
-class ModeLocalizer:
+class ModeLocalizer(NamedTuple):
     """The localizer for all modes, immutable. Create the first with `start`.
 
     `active` is the filter or raw mode. `X_odom` is the pose of its Odom in the published Odom, `epochs` the number of
@@ -156,12 +156,12 @@ class ModeLocalizer:
         old, active = self.config, self.active
         if old.mounts == config.mounts and old.setup.rig.geometry_key() == config.setup.rig.geometry_key():
             if isinstance(active, FilterLocalizer):
-                active = replace(active, setup=config.setup)
-            return replace(self, config=config, active=active)
+                active = active._replace(setup=config.setup)
+            return self._replace(config=config, active=active)
         if not active.utime:
             mode = active.mode if isinstance(active, FilterLocalizer) else Mode.RAW
             fresh = ModeLocalizer.start(config, mode, self.estimate(0).origin)
-            return replace(fresh, X_odom=self.X_odom, epochs=self.epochs, drift=self.drift)
+            return fresh._replace(X_odom=self.X_odom, epochs=self.epochs, drift=self.drift)
         return self._restart(config, active.mode if isinstance(active, FilterLocalizer) else Mode.RAW)
 
     def _restart(self, config: LocalizerConfig, mode: Mode) -> ModeLocalizer:

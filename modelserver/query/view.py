@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -97,26 +97,25 @@ def get_vehicle_pose(world: str, estimate: Estimate) -> Pose:
     return pose
 
 
-@dataclass(frozen=True, slots=True)
-class PlatformView:
+class PlatformView(NamedTuple):
     """The current state for queries: geometry, joints, and the history of the vehicle's estimates.
 
-    base_frame: the frame whose pose is queried and published. rolling_frame: the frame of the estimates, the point of
-    the vehicle that moves along its own x axis; empty for the base frame. invalid: reasons against every pose, besides
-    those of its own estimate.
+    base_frame: the frame whose pose is queried and published. rolling: the name of the rolling frame; empty for the
+    base frame. invalid: reasons against every pose, besides those of its own estimate.
     """
 
     model: Model
     base_frame: str
     localizer: Localizer | None
     history: History
-    rolling_frame: str = ""
+    rolling: str = ""
     invalid: Invalid = VALID
     joints: JointHistory = NO_JOINTS
 
-    def __post_init__(self) -> None:
-        if not self.rolling_frame:
-            object.__setattr__(self, "rolling_frame", self.base_frame)
+    @property
+    def rolling_frame(self) -> str:
+        """The frame of the estimates: the point of the vehicle that moves along its own x axis."""
+        return self.rolling or self.base_frame
 
     def transformation(
         self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int = 0

@@ -254,7 +254,7 @@ def test_given_another_model_then_common_joints_are_retained() -> None:
 def test_given_a_joint_beyond_its_limits_then_the_answer_is_flagged() -> None:
     platform = view(1.0)
     joints, _ = update(platform.joints, 1.1, JointSample("Nod", 0.61))
-    answer = replace(platform, joints=joints).transformation(SCAN, BASE, TimeQuery(), at(1.1))
+    answer = platform._replace(joints=joints).transformation(SCAN, BASE, TimeQuery(), at(1.1))
     assert Quality.OUT_OF_LIMITS in answer.quality
     assert answer.transformation.is_valid
 
@@ -262,7 +262,7 @@ def test_given_a_joint_beyond_its_limits_then_the_answer_is_flagged() -> None:
 def test_given_a_joint_that_was_silent_then_the_answer_around_it_may_not_be_used() -> None:
     platform = view(1.0)
     joints, _ = update(platform.joints, 1.5 + MAX_GAP_S, JointSample("Nod", 0.1))
-    platform = replace(platform, joints=joints)
+    platform = platform._replace(joints=joints)
     now = at(1.5 + MAX_GAP_S)
     inside = platform.transformation(SCAN, BASE, TimeQuery(at(1.2)), now).transformation
     assert Invalid(inside.invalid_reasons) == Invalid.STALE_JOINT
@@ -279,7 +279,7 @@ def test_given_a_joint_silent_up_to_now_then_the_latest_common_time_is_its_last_
         message = joints_at(n * 0.02)
         some = tuple(each for each in message.joints if each.name != "Nod" or n <= 50)
         joints, _ = joints.update(replace(message, joints=some), at(n * 0.02))
-    platform = replace(platform, joints=joints)
+    platform = platform._replace(joints=joints)
     for pair in ((SCAN, BASE), (SCAN, UTM), (DEEP, SCAN)):
         answer = platform.transformation(*pair, TimeQuery(), at(3.0))
         assert answer.transformation.utime == at(1.0)
@@ -296,11 +296,11 @@ def test_given_a_joint_silent_for_so_long_that_nothing_common_is_held_then_the_e
         some = tuple(each for each in message.joints if each.name != "Nod")
         joints, _ = joints.update(JointsSample(SensorHeader(at(100.0 + n), "arm"), some), at(100.0 + n))
     with pytest.raises(TooOldError, match="joint Nod was received last at"):
-        replace(platform, joints=joints).transformation(DEEP, SCAN, TimeQuery(), at(102.0))
+        platform._replace(joints=joints).transformation(DEEP, SCAN, TimeQuery(), at(102.0))
 
 
 def test_given_joints_never_received_then_they_are_at_defaults_and_only_a_default_makes_that_valid() -> None:
-    platform = replace(view(1.0), joints=JointHistory(constraints(), 60.0))
+    platform = view(1.0)._replace(joints=JointHistory(constraints(), 60.0))
     nod = platform.transformation(SCAN, BASE, TimeQuery(at(0.5)))
     assert Invalid(nod.transformation.invalid_reasons) == Invalid.JOINT_UNKNOWN
     assert Quality.JOINT_DEFAULT in nod.quality
@@ -381,7 +381,7 @@ def test_given_a_ball_with_rates_then_its_angular_velocity_and_its_change_are_in
         some = (JointSample("J.rx", 0.0, NAN, 0.0), JointSample("J.ry", 0.0, NAN, 0.0))
         some += (JointSample("J.rz", math.radians(degrees), NAN, rate),)
         joints, _ = update(joints, seconds, *some)
-    platform = replace(view_of(model_with(Joint(JointType.SPHERICAL))), joints=joints)
+    platform = view_of(model_with(Joint(JointType.SPHERICAL)))._replace(joints=joints)
     moved = compute_motion(platform, "Head:Root", "Rover:Mast", "", TimeQuery(at(0.05)), at(1.0))
     assert moved.angular_velocity == pytest.approx((0.0, 0.0, 1.5))
     assert moved.angular_acceleration == pytest.approx((0.0, 0.0, 10.0))
@@ -390,8 +390,8 @@ def test_given_a_ball_with_rates_then_its_angular_velocity_and_its_change_are_in
 def test_given_a_ball_whose_coordinates_have_different_times_then_each_is_interpolated_by_itself() -> None:
     model = model_with(Joint(JointType.SPHERICAL))
     platform = view_of(model, (0.0, ball(10)), (0.1, {"J.rx": 0.0, "J.ry": 0.0}), (0.2, {"J.rz": math.radians(20)}))
-    platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.rx", 0.0))[0])
-    platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.ry", 0.0))[0])
+    platform = platform._replace(joints=update(platform.joints, 0.2, JointSample("J.rx", 0.0))[0])
+    platform = platform._replace(joints=update(platform.joints, 0.2, JointSample("J.ry", 0.0))[0])
     assert yaw(platform, TimeQuery(at(0.05))) == pytest.approx(12.5)
     column = complete(lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(0.05)]))).vectors[0]
     assert math.degrees(2.0 * math.atan2(column[6], column[3])) == pytest.approx(12.5)

@@ -83,7 +83,7 @@ def test_given_a_mirror_that_starts_late_then_it_has_the_joints_with_their_age()
         name: track.newest for name, track in service.tracks.items()
     }
     mine = view.transformation(SCAN, BASE, TimeQuery(now, Policy.HELD)).transformation
-    truth = replace(view, joints=service).transformation(SCAN, BASE, TimeQuery(now, Policy.HELD)).transformation
+    truth = view._replace(joints=service).transformation(SCAN, BASE, TimeQuery(now, Policy.HELD)).transformation
     assert mine.pose == truth.pose
     assert mine.invalid_reasons == truth.invalid_reasons == int(Invalid.STALE_JOINT)
     # readings from now on are newer, and count

@@ -73,6 +73,10 @@ class SourceClock(NamedTuple):
     replays_utime: int = 0
 
 
+NEW_SOURCE: Final = SourceClock(0, -1)
+"""A source before its first stamp."""
+
+
 class ClockMonitor(NamedTuple):
     """The stamps of all sources. `newest` is the newest good stamp, `rank` and `lead_utime` those of the lead."""
 
@@ -85,9 +89,7 @@ class ClockMonitor(NamedTuple):
         self, name: SourceKey, rank: int, utime: int, seq: int, settings: FilterSettings
     ) -> tuple[ClockMonitor, StampVerdict]:
         """Return the monitor after a stamp, and what the stamp means."""
-        source = self.sources.get(name)
-        if source is None:
-            source = SourceClock(0, -1)
+        source = self.sources.get(name, NEW_SOURCE)
         horizon = round(settings.horizon * 1e6)
         ahead = utime - self.newest
         if self.newest and ahead > settings.clock_jump * 1e6:
@@ -111,23 +113,15 @@ class ClockMonitor(NamedTuple):
             return self._with(name, source), StampVerdict.TOO_OLD
         if utime < source.newest:
             return self, StampVerdict.GOOD
-        source = SourceClock(
-            utime,
-            seq,
-            recent=(*source.recent[1 - RECENT_STAMPS :], utime),
-            replays=source.replays,
-            replays_utime=source.replays_utime,
-        )
-        leads = rank >= self.rank
-        return (
-            ClockMonitor(
-                max(self.newest, utime),
-                max(rank, self.rank),
-                max(utime, self.lead_utime) if leads else self.lead_utime,
-                self.sources if self._is_full(name) else MappingProxyType({**self.sources, name: source}),
-            ),
-            StampVerdict.GOOD,
-        )
+        recent = (*source.recent[1 - RECENT_STAMPS :], utime)
+        newest, leading, lead_utime, sources = self
+        if not self._is_full(name):
+            sources = {**sources, name: SourceClock(utime, seq, 0, 0, 0, recent, source.replays, source.replays_utime)}
+        if rank >= leading:
+            leading = rank
+            if utime > lead_utime:
+                lead_utime = utime
+        return ClockMonitor(utime if utime > newest else newest, leading, lead_utime, sources), StampVerdict.GOOD
 
     def spend_replays(self, name: SourceKey, items: int) -> ClockMonitor | None:
         """Return the monitor after a source has had so many items fused again; None if that is more than it may."""
@@ -156,12 +150,12 @@ class ClockMonitor(NamedTuple):
     def _with(self, name: SourceKey, source: SourceClock) -> ClockMonitor:
         if self._is_full(name):
             return self
-        return self._replace(sources=MappingProxyType({**self.sources, name: source}))
+        return self._replace(sources={**self.sources, name: source})
 
 
 def _set_back(name: SourceKey, rank: int, utime: int, seq: int) -> ClockMonitor:
     """Return the monitor after the lead was set back to `utime`."""
-    return ClockMonitor(utime, rank, utime, MappingProxyType({name: SourceClock(utime, seq, recent=(utime,))}))
+    return ClockMonitor(utime, rank, utime, {name: SourceClock(utime, seq, recent=(utime,))})
 
 
 def _count_odd(source: SourceClock, utime: int, lead: int, is_back: bool = False) -> SourceClock:

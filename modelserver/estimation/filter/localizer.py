@@ -6,7 +6,6 @@ Read top-down: `FilterLocalizer.process` -> `ClockMonitor.update` -> `Timeline.i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from modelserver.earth.geodesy import Geodesy
@@ -62,8 +61,7 @@ class Deferred(NamedTuple):
         return output.estimate(self.setup, self.state, self.odom, self.utime, self.newest)
 
 
-@dataclass(frozen=True, slots=True)
-class FilterLocalizer:
+class FilterLocalizer(NamedTuple):
     """The filter: an immutable value. Create the first with `start`.
 
     Attributes
@@ -79,9 +77,9 @@ class FilterLocalizer:
     setup: Setup
     timeline: Timeline
     head: FilterState
-    clocks: ClockMonitor = field(default_factory=ClockMonitor)
-    odom: Odometry = field(default_factory=Odometry)
-    odoms: tuple[Odometry, ...] = field(default=(), repr=False)
+    clocks: ClockMonitor = ClockMonitor()
+    odom: Odometry = Odometry()
+    odoms: tuple[Odometry, ...] = ()
     is_origin_reported: bool = False
 
     @classmethod
@@ -110,7 +108,7 @@ class FilterLocalizer:
         if state is None:
             return self
         odom = self.odom.advance(state.nav, self.setup.rig.base, is_stationary=False)
-        return replace(self, timeline=Timeline(state), head=state, odom=odom, odoms=(odom,))
+        return self._replace(timeline=Timeline(state), head=state, odom=odom, odoms=(odom,))
 
     @property
     def utime(self) -> int:
@@ -142,32 +140,37 @@ class FilterLocalizer:
         if verdict is StampVerdict.STEPPED_BACK:
             self = self._restart(items[0].utime)
         elif verdict is not StampVerdict.GOOD:
-            return replace(self, clocks=clocks), (reject(items[0], verdict.value),)
+            return self._replace(clocks=clocks), (reject(items[0], verdict.value),)
         oldest = clocks.newest - round(settings.horizon * 1e6)
-        timeline, events = self._insert(items, oldest)
-        if timeline is self.timeline:
-            return replace(self, clocks=clocks), tuple(events)
-        again = self.timeline.num_fused - timeline.num_fused
-        if again > 0 and rank < IMU_RANK:
-            afforded = clocks.spend_replays(name, again)
-            if afforded is None:
-                return replace(self, clocks=clocks), (reject(items[0], "overload"),)
-            clocks = afforded
         # a command takes effect at once; a measurement waits only for IMU samples that will be used
-        waits = setup.uses_imu(self.mode) and not isinstance(sample, SwitchMode)
+        waits = setup.uses_imu(self.head.common.mode) and not isinstance(sample, SwitchMode)
         limit = clocks.get_complete_utime() if waits else clocks.newest
-        timeline = timeline.fuse(setup, settings.replay_budget, limit)
-        head = timeline.newest if timeline.is_fused(limit) else self._propagate_head(sample, items[0])
+        events: tuple[LocalizerEvent, ...] = ()
+        timeline = self.timeline.append(setup, items[0], limit, oldest) if len(items) == 1 else None
+        if timeline is not None:
+            head = timeline.newest
+        else:
+            timeline, events = self._insert(items, oldest)
+            if timeline is self.timeline:
+                return self._replace(clocks=clocks), events
+            again = self.timeline.num_fused - timeline.num_fused
+            if again > 0 and rank < IMU_RANK:
+                afforded = clocks.spend_replays(name, again)
+                if afforded is None:
+                    return self._replace(clocks=clocks), (reject(items[0], "overload"),)
+                clocks = afforded
+            timeline = timeline.fuse(setup, settings.replay_budget, limit)
+            head = timeline.newest if timeline.is_fused(limit) else self._propagate_head(sample, items[0])
         timeline, decisions = timeline.settle(oldest)
         events += decisions
         odom, odoms = self._advance_odom(head)
         is_origin_reported, geodesy = self.is_origin_reported, head.common.geodesy
         if not is_origin_reported and geodesy is not None:
             is_origin_reported = True
-            events.append(PersistOrigin(geodesy.origin))
-        return FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported), tuple(events)
+            events = (*events, PersistOrigin(geodesy.origin))
+        return FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported), events
 
-    def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, list[LocalizerEvent]]:
+    def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, tuple[LocalizerEvent, ...]]:
         """Return the timeline with the items that are neither too old nor duplicates, and the decisions on the rest."""
         timeline, base = self.timeline, self.timeline.base
         # nor before the state that another localizer handed over
@@ -184,7 +187,7 @@ class FilterLocalizer:
             timeline, replaced = inserted
             if replaced is not None:
                 events.append(reject(replaced, "duplicate"))
-        return timeline, events
+        return timeline, tuple(events)
 
     def _propagate_head(self, sample: Sample | SwitchMode, item: Item) -> FilterState:
         """Return the head propagated by an IMU sample alone, while a delayed measurement is being worked in."""
@@ -217,8 +220,8 @@ class FilterLocalizer:
             sigma = float(max(P[9, 9], P[10, 10], P[11, 11])) ** 0.5
             common = common._replace(gyro_biases=GyroBiases(old.nav.gyro_bias, sigma))
         fresh = Leveling(common)
-        return replace(
-            self, timeline=Timeline(fresh), head=fresh, odom=self.odom.stop(utime), odoms=(), clocks=ClockMonitor()
+        return self._replace(
+            timeline=Timeline(fresh), head=fresh, odom=self.odom.stop(utime), odoms=(), clocks=ClockMonitor()
         )
 
     def estimate(self, utime: int) -> Estimate:

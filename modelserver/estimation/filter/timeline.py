@@ -58,6 +58,21 @@ class Timeline(NamedTuple):
         """Return whether everything up to the instant `limit` is fused."""
         return self.num_fused == len(self.entries) or self.entries[self.num_fused].item.utime > limit
 
+    def append(self, setup: Setup, item: Item, limit: int, oldest: int) -> Timeline | None:
+        """Return the timeline with an item more that is fused; None unless it follows all others, which are fused.
+
+        The usual case, at a fraction of the cost of `insert` and `fuse`. It is no later than the instant `limit` and
+        not before `oldest`.
+        """
+        entries = self.entries
+        if self.num_fused != len(entries) or not entries or not oldest <= item.utime <= limit:
+            return None
+        last, before, _ = entries[-1]
+        if before is None or item.utime <= last.utime:
+            return None
+        state, decisions = step(setup, before, item)
+        return Timeline(self.base, (*entries, Entry(item, state, decisions)), self.num_fused + 1)
+
     def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
         """Return the timeline with an item more, and the item that it replaces; or in one word why not.
 
@@ -115,14 +130,13 @@ class Timeline(NamedTuple):
         """Return the timeline without the fused items older than `utime`, and the decisions on them."""
         entries = self.entries
         cut = 0
+        decisions: tuple[Decision, ...] = ()
         # one or two at a time
         while cut < self.num_fused and entries[cut].item.utime < utime:
+            decisions += entries[cut].decisions
             cut += 1
         if not cut:
             return self, ()
-        decisions: tuple[Decision, ...] = ()
-        for entry in entries[:cut]:
-            decisions += entry.decisions
         state = entries[cut - 1].state
         assert state is not None
         return Timeline(state, entries[cut:], self.num_fused - cut), decisions

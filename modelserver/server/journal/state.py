@@ -8,7 +8,6 @@ are copied first, poses only for the last `HISTORY_S` seconds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -58,7 +57,8 @@ def _make_schema(measurements: tuple[type[Measurement], ...]) -> Schema:
 def detach(state: CoreState) -> CoreState:
     """Copy what a state split_variance with its successors, with the history that is written."""
     view = state.view
-    return state._replace(view=replace(view, history=view.history.copy_recent(HISTORY_S), joints=view.joints.detach()))
+    view = view._replace(history=view.history.copy_recent(HISTORY_S), joints=view.joints.detach())
+    return state._replace(view=view)
 
 
 def encode_run(run: RunState, pause: Callable[[], object] = lambda: None) -> bytes:

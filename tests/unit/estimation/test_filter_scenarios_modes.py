@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise, permutations
 
@@ -103,7 +102,7 @@ def test_given_every_switch_of_modes_when_driven_through_a_town_then_odom_and_po
 
 def _corrupt(localizer: FilterLocalizer, **changes) -> FilterLocalizer:
     bad = localizer.head._replace(nav=localizer.head.nav._replace(**changes))
-    return replace(localizer, timeline=Timeline(bad), head=bad)
+    return localizer._replace(timeline=Timeline(bad), head=bad)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from support_between import lookup_between
@@ -34,7 +33,7 @@ def test_given_two_worlds_through_a_frame_of_the_vehicle_then_single_and_many_ag
 def test_given_axes_behind_a_joint_never_received_then_a_motion_along_them_is_not_valid():
     platform = view(2.0)
     joints = JointHistory(platform.model.joints.values(), 60.0)
-    platform = replace(platform, joints=joints)
+    platform = platform._replace(joints=joints)
     along = compute_motion(platform, BASE, UTM, SCAN, TimeQuery(T0 + S)).pose
     assert Invalid.JOINT_UNKNOWN in Invalid(along.transformation.invalid_reasons)
     assert Quality.JOINT_DEFAULT in along.quality
@@ -51,7 +50,7 @@ def test_given_a_joint_without_sigma_then_the_world_behind_it_has_no_covariance(
     for n in range(11):
         sample = JointsSample(SensorHeader(T0 + n * S // 10, "pan"), (JointSample("Pan", 0.1 * n),))
         joints, _ = joints.update(sample, sample.header.utime)
-    platform = replace(view(1.0), model=model, joints=joints)
+    platform = view(1.0)._replace(model=model, joints=joints)
     at = T0 + S // 2
     assert platform.transformation(SCAN, UTM, TimeQuery(at)).transformation.covariance is None
     assert platform.transformation(BASE, UTM, TimeQuery(at)).transformation.covariance is not None

@@ -142,7 +142,7 @@ def changing() -> PlatformView:
         if 1.5 < at < 1.6:
             each = replace(each, invalid=Invalid.STALE_GPS)
         history = history.append(each)
-    return replace(held(), history=history)
+    return held()._replace(history=history)
 
 
 @pytest.mark.parametrize(("interest", "reference"), [(SCAN, UTM), (UTM, SCAN), (SCAN, ODOM), (BASE, ENU), (UTM, ODOM)])
@@ -160,7 +160,7 @@ def test_given_an_origin_that_changes_then_only_rows_of_the_reported_one_have_a_
     for n in range(21):
         each = estimate(n * 0.1)
         history = history.append(each if n < 10 else replace(each, origin=replace(ORIGIN, origin_id=78)))
-    platform = replace(held(), history=history)
+    platform = held()._replace(history=history)
     found = complete(lookup_batch(platform, BASE, UTM, utimes()))
     assert found.origin is not None
     assert found.origin.origin_id == 78
@@ -181,7 +181,7 @@ def test_given_joints_that_were_stale_never_received_or_beyond_their_limits_then
         )
         some = tuple(each for each in beyond if not each.name.startswith(("Ball", "Slide")))
         joints, _ = joints.update(replace(sample, joints=some), T0 + round(seconds * S))
-    platform = replace(held(), joints=joints)
+    platform = held()._replace(joints=joints)
     for pair in ((SCAN, UTM), (DEEP, SCAN), (FINGER, BASE)):
         compare(platform, *pair, utimes(0.0, 1.5, 60))
     found = complete(lookup_batch(platform, DEEP, SCAN, utimes(0.0, 1.5, 60)))
@@ -198,7 +198,7 @@ def test_given_joints_without_sigma_at_times_then_the_covariance_is_unknown_ther
     for n in range(11):
         sample = JointSample("Slide", 0.1 * n, 0.001 if n < 5 else math.nan)
         joints, _ = joints.update(replace(joints_at(n * 0.1), joints=(sample,)), T0 + n * S // 10)
-    found = complete(lookup_batch(replace(held(), joints=joints), "Upper:Root", BASE, utimes(0.0, 1.0, 11)))
+    found = complete(lookup_batch(held()._replace(joints=joints), "Upper:Root", BASE, utimes(0.0, 1.0, 11)))
     assert found.covariances is not None
     assert np.isnan(found.covariances).any(axis=1).tolist() == [False] * 5 + [True] * 6
 
@@ -242,12 +242,12 @@ def test_given_a_misspelt_fixed_frame_then_the_nearest_is_suggested(reference: s
 
 def test_given_no_pose_at_all_then_the_whole_query_fails() -> None:
     with pytest.raises(NoPoseError):
-        complete(lookup_batch(replace(held(), history=History(60.0)), SCAN, UTM, utimes()))
+        complete(lookup_batch(held()._replace(history=History(60.0)), SCAN, UTM, utimes()))
 
 
 def test_given_a_clock_that_stepped_then_what_depends_on_time_is_invalid() -> None:
-    stepped = replace(held(), invalid=Invalid.CLOCK_STEPPED)
+    stepped = held()._replace(invalid=Invalid.CLOCK_STEPPED)
     for pair in PAIRS:
         compare(stepped, *pair, utimes(count=3))
-    alone = replace(stepped, joints=NO_JOINTS)
+    alone = stepped._replace(joints=NO_JOINTS)
     compare(alone, "Rover:Mast", BASE, utimes(count=3))

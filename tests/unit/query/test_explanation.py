@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -81,7 +80,7 @@ def test_given_a_policy_then_joint_and_vehicle_have_its_provenance_and_stamp(
 
 
 def test_given_joints_never_received_then_they_are_at_defaults_with_no_stamp_and_no_source() -> None:
-    platform = replace(held(), joints=JointHistory(held().model.joints.values(), 60.0))
+    platform = held()._replace(joints=JointHistory(held().model.joints.values(), 60.0))
     nod = explain(platform, SCAN, BASE, BETWEEN, NOW).edges[2]
     assert (nod.kind, nod.provenance, nod.stamp, nod.source) == ("joint", "default", 0, "")
 
@@ -103,7 +102,7 @@ NOD = JointSample("Nod", 0.7)
 def test_given_a_joint_that_flags_the_answer_then_its_edge_has_the_warning_and_no_other(
     time, now, frame, warnings
 ) -> None:
-    platform = replace(held(), localizer=None) if time.policy is Policy.HELD else held()
+    platform = held()._replace(localizer=None) if time.policy is Policy.HELD else held()
     found = explain(platform, frame, BASE, time, now)
     assert {each.name: each.warning for each in found.edges if each.kind == "joint"} == warnings
     assert bool(found.answer.transformation.invalid_reasons) == any(warnings.values())
@@ -115,11 +114,11 @@ def test_given_a_joint_beyond_its_limits_or_never_received_then_its_edge_has_a_w
     beyond, _ = bare.update(JointsSample(SensorHeader(T0, "laser head"), (NOD,)), T0)
     (edge,) = (
         each
-        for each in explain(replace(held(), joints=beyond), SCAN, BASE, TimeQuery(T0), T0).edges
+        for each in explain(held()._replace(joints=beyond), SCAN, BASE, TimeQuery(T0), T0).edges
         if each.kind == "joint"
     )
     assert (edge.warning, edge.source) == ("beyond its limits", "laser head")
-    found = explain(replace(held(), joints=bare), DEEP, BASE, BETWEEN, NOW).edges
+    found = explain(held()._replace(joints=bare), DEEP, BASE, BETWEEN, NOW).edges
     assert {each.name: each.warning for each in found if each.kind == "joint"} == {
         "Slide": "not received: at its default",
         "Ball": "not received, and no default is stated",
@@ -131,7 +130,7 @@ def test_given_two_sources_of_a_joint_then_the_last_is_reported() -> None:
     joints, _ = held().joints.update(JointsSample(SensorHeader(T0 + 2 * S + 20_000, "spare"), (NOD,)), NOW + S)
     late, _ = joints.update(JointsSample(SensorHeader(T0 + S + 1, "arm"), (NOD,)), NOW + S)
     for each in (joints, late):
-        found = explain(replace(held(), joints=each), SCAN, BASE, TimeQuery(T0 + S), NOW).edges
+        found = explain(held()._replace(joints=each), SCAN, BASE, TimeQuery(T0 + S), NOW).edges
         assert [edge.source for edge in found if edge.kind == "joint"] == ["spare"]
 
 

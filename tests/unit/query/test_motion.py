@@ -115,7 +115,7 @@ def test_given_velocities_then_their_covariance_is_that_of_samples_of_the_rates(
 
 def test_given_joints_never_received_then_they_are_at_defaults() -> None:
     whole = dense()
-    alone = replace(whole, joints=JointHistory(whole.model.joints.values(), 60.0))
+    alone = whole._replace(joints=JointHistory(whole.model.joints.values(), 60.0))
     found = compute_motion(alone, FINGER, BASE, "", TimeQuery(utime(AT)), utime(1.6))
     assert np.array(found[2:6]).tolist() == [[0.0] * 3] * 4
     assert Quality.JOINT_DEFAULT in found.pose.quality
@@ -174,7 +174,7 @@ def test_given_readings_without_rates_then_the_rate_is_their_slope_and_its_chang
     platform = one(JointType.REVOLUTE, [JointSample("J", 0.2, 0.01)], [T0])
     later = JointsSample(SensorHeader(T0 + S // 10, "j"), (JointSample("J", 0.25, 0.01),))
     joints, _ = platform.joints.update(later, T0 + S // 10)
-    found = compute_motion(replace(platform, joints=joints), "B:O", "A:Tip", "", TimeQuery(T0 + S // 20))
+    found = compute_motion(platform._replace(joints=joints), "B:O", "A:Tip", "", TimeQuery(T0 + S // 20))
     assert found.angular_velocity == pytest.approx((0.0, 0.0, 0.5))
     assert math.isnan(found.angular_acceleration[2])
 
@@ -188,7 +188,7 @@ def test_given_a_held_joint_then_how_its_rate_changes_is_unknown() -> None:
 def test_given_one_estimate_alone_then_the_acceleration_is_unknown_and_the_velocity_known() -> None:
     history = History(60.0).append(estimate(0.0))
     joints, _ = JointHistory(rover().joints.values(), 60.0).update(joints_at(0.0), T0)
-    platform = replace(dense(), history=history, joints=joints)
+    platform = dense()._replace(history=history, joints=joints)
     found = compute_motion(platform, BASE, UTM, "", TimeQuery(T0))
     assert all(map(math.isnan, found.acceleration))
     assert math.hypot(*found.velocity[:2]) == pytest.approx(3.0, abs=1e-3)
@@ -198,7 +198,7 @@ def test_given_estimates_without_motion_then_the_velocity_in_the_world_is_denied
     history = History(60.0)
     for n in range(3):
         history = history.append(replace(estimate(1.0 + 0.1 * n), motion=None))
-    platform = replace(dense(), history=history)
+    platform = dense()._replace(history=history)
     with pytest.raises(NoPoseError, match="velocity is not known"):
         compute_motion(platform, SCAN, UTM, "", TimeQuery(utime(1.1)))
     assert compute_motion(platform, SCAN, BASE, "", TimeQuery(utime(1.1))).covariance is not None

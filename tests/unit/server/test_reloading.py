@@ -366,5 +366,5 @@ def test_given_another_model_then_its_bytes_are_encoded_again() -> None:
     writer, state = SnapshotEncoder(write), start_core()
     writer.encode_parts(state, START)
     # compared by identity, which is cheap: the current model or another one
-    writer.encode_parts(state._replace(view=replace(state.view, model=cart())), START)
+    writer.encode_parts(state._replace(view=state.view._replace(model=cart())), START)
     assert len(calls) == 2

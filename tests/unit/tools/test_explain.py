@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -236,7 +235,7 @@ def test_given_what_nobody_knows_then_it_reports_it_and_is_null() -> None:
 
 def test_given_joints_never_received_then_the_flags_are_reported_in_words() -> None:
     known = view()
-    silent = replace(known, joints=JointHistory(known.model.joints.values(), 60.0))
+    silent = known._replace(joints=JointHistory(known.model.joints.values(), 60.0))
     text = describe(silent.transformation(SCAN, BASE, TimeQuery(), NOW))
     assert "flags           JOINT_DEFAULT: no sample of a joint on the path was received" in text
     assert (
