@@ -119,9 +119,11 @@ class NavState(NamedTuple):
 
     def body_velocity(self, lever: Vector3) -> Vector3:
         """Return the velocity of a point of the body along the body axes."""
-        x, y, z = so3.rotate(so3.conjugate(self.attitude), self.velocity)
-        a, b, c = cross(self.angular_rate, lever)
-        return (x + a, y + b, z + c)
+        q = self.attitude
+        x, y, z = so3.rotate((q[0], -q[1], -q[2], -q[3]), self.velocity)
+        (a, b, c), (d, e, f), (lx, ly, lz) = self.rate, self.gyro_bias, lever
+        wx, wy, wz = a - d, b - e, c - f
+        return (x + (wy * lz - wz * ly), y + (wz * lx - wx * lz), z + (wx * ly - wy * lx))
 
     @property
     def yaw(self) -> float:
@@ -132,7 +134,8 @@ class NavState(NamedTuple):
     @property
     def up(self) -> Vector3:
         """N's up along the body axes."""
-        return so3.rotate(so3.conjugate(self.attitude), (0.0, 0.0, 1.0))
+        q = self.attitude
+        return so3.rotate((q[0], -q[1], -q[2], -q[3]), (0.0, 0.0, 1.0))
 
     def with_covariance(self, covariance: Array, extras: tuple[float, ...]) -> NavState:
         """Return the state with its covariance at its instant, and the additional states there."""
@@ -152,14 +155,16 @@ class NavState(NamedTuple):
         vx, vy, vz = self.velocity
         gx, gy, gz = self.gyro_bias
         ax, ay, az = self.accelerometer_bias
-        return self._replace(
-            position=(px + e[0], py + e[1], pz + e[2]),
-            velocity=(vx + e[3], vy + e[4], vz + e[5]),
-            attitude=attitude,
-            gyro_bias=(gx + e[9], gy + e[10], gz + e[11]),
-            accelerometer_bias=(ax + e[12], ay + e[13], az + e[14]),
-            extras=tuple(value + delta for value, delta in zip(self.extras, e[15:], strict=True)),
-            covariance=covariance,
+        return NavState(
+            self.utime,
+            (px + e[0], py + e[1], pz + e[2]),
+            (vx + e[3], vy + e[4], vz + e[5]),
+            attitude,
+            (gx + e[9], gy + e[10], gz + e[11]),
+            (ax + e[12], ay + e[13], az + e[14]),
+            tuple([value + delta for value, delta in zip(self.extras, e[15:], strict=True)]),
+            covariance,
+            *self[8:],
         )
 
 
@@ -222,8 +227,7 @@ def propagate(nav: NavState, utime: int, rate: Vector3, force: Vector3, earth: E
     mean_force = (0.5 * (s[0] + force[0]) - ax, 0.5 * (s[1] + force[1]) - ay, 0.5 * (s[2] + force[2]) - az)
 
     h = 0.5 * dt
-    tx, ty, tz = wx * h, wy * h, wz * h
-    half = so3.small_angle_exponential((tx, ty, tz))
+    half = so3.small_angle_exponential((wx * h, wy * h, wz * h))
     whole = so3.small_angle_exponential((wx * dt, wy * dt, wz * dt))
     middle = so3.multiply(q, half)
     fx, fy, fz = so3.rotate(middle, mean_force)
@@ -428,13 +432,15 @@ def update(
     `utime`, `source`, `seq` and `kind` identify it in the decision. A rejected one leaves the state as it was.
     """
     y, H, R, monitored, is_separable, inflation_limit = innovation
-    if not (np.isfinite(y).all() and np.isfinite(H).all() and np.isfinite(R).all()):
-        return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
     S = innovation_covariance(nav.covariance, H, R)
+    residual, covariance, noise = y.tolist(), S.ravel().tolist(), R.ravel().tolist()
+    # a number that is not finite makes the sum so, one of H that of S
+    if not math.isfinite(sum(residual) + sum(covariance) + sum(noise)):
+        if not (np.isfinite(y).all() and np.isfinite(H).all() and np.isfinite(R).all()):
+            return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
     nis = normalized_innovation_squared(y, S)
     limit = chi_square_gate(len(y), settings.gate_risk)
     verdict, reason = Verdict.USED, ""
-    keep = np.ones(len(y), dtype=bool)
     if monitored:
         verdict, reason = Verdict.MONITORED, monitored
     elif not nis <= limit:
@@ -443,6 +449,7 @@ def update(
             # S' = S nis / limit: the NIS becomes the limit
             verdict, reason = Verdict.USED, "eased"
             R = R + (nis / limit - 1.0) * S
+            noise = R.ravel().tolist()
             is_separable = False
         if is_separable and len(y) > 1:
             single = chi_square_gate(1, settings.gate_risk)
@@ -451,7 +458,7 @@ def update(
                 y_, S_ = y[fits], S[np.ix_(fits, fits)]
                 if normalized_innovation_squared(y_, S_) <= chi_square_gate(len(y_), settings.gate_risk):
                     verdict, reason = Verdict.USED, "part"
-                    keep = fits
+                    part = fits
     decision = Decision(
         utime,
         source,
@@ -459,16 +466,16 @@ def update(
         kind,
         verdict,
         reason,
-        tuple(y.tolist()),
-        tuple(S.ravel().tolist()),
-        tuple(R.ravel().tolist()),
+        tuple(residual),
+        tuple(covariance),
+        tuple(noise),
         nis,
         limit,
     )
     if verdict is not Verdict.USED:
         return nav, decision
     if reason == "part":
-        y, H, R = y[keep], H[keep], R[np.ix_(keep, keep)]
+        y, H, R = y[part], H[part], R[np.ix_(part, part)]
     try:
         error, P = correct(nav.covariance, y, H, R)
     except np.linalg.LinAlgError:
@@ -478,8 +485,8 @@ def update(
 
 def innovation_covariance(P: Array, H: Array, R: Array) -> Array:
     """Return S = H P H' + R, (m, m), symmetric."""
-    S = H @ P @ H.T + R
-    return np.asarray(0.5 * (S + S.T))
+    S: Array = np.dot(np.dot(H, P), H.T) + R
+    return 0.5 * (S + S.T)
 
 
 def normalized_innovation_squared(residual: Array, S: Array) -> float:
@@ -487,7 +494,8 @@ def normalized_innovation_squared(residual: Array, S: Array) -> float:
     singular.
     """
     if len(residual) == 1:
-        return float(residual[0] * residual[0] / S[0, 0]) if S[0, 0] > 0.0 else math.inf
+        y, s = float(residual[0]), float(S[0, 0])
+        return y * y / s if s > 0.0 else math.inf
     try:
         return float(residual @ np.linalg.solve(S, residual))
     except np.linalg.LinAlgError:
@@ -519,10 +527,20 @@ def _workspace(n: int, m: int) -> tuple[Any, Array]:
     and Q are two-dimensional and always given, because its defaults broadcast silently.
     """
     workspace = KalmanFilter(dim_x=n, dim_z=m)
+    if m == 1:
+        workspace.inv = _invert_scalar
     zero = np.zeros(n)
     zero.flags.writeable = False
     workspace.x = zero
     return workspace, zero
+
+
+def _invert_scalar(S: Array) -> Array:
+    """Return the inverse of a (1, 1) matrix, as numpy.linalg.inv does at ten times the cost."""
+    s = float(S[0, 0])
+    if s == 0.0:
+        raise np.linalg.LinAlgError("singular")
+    return np.array(((1.0 / s,),))
 
 
 def chi_square_survival(value: float, dof: int) -> float:
@@ -559,11 +577,11 @@ def is_plausible(nav: NavState, settings: FilterSettings) -> bool:
 def is_sound(nav: NavState, settings: FilterSettings) -> bool:
     """Return whether the state is finite and within its limits; otherwise the filter has diverged."""
     P = nav.covariance
-    diagonal = np.diagonal(P)
-    if not (np.isfinite(P).all() and (diagonal >= 0.0).all()):
+    # one number that is not finite makes the sum of squares so
+    if not (math.isfinite(np.vdot(P, P)) and min(P.diagonal().tolist()) >= 0.0):
         return False
     numbers = (*nav.position, *nav.velocity, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras)
-    if not all(map(math.isfinite, numbers)):
+    if not math.isfinite(sum(numbers)):
         return False
     return (
         math.hypot(*nav.velocity) <= 2.0 * settings.maximum_speed

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
@@ -16,7 +15,7 @@ from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.eskf import Innovation
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample, S
+from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
 from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
 from modelserver.messages import (
     AbsolutePoseSample,
@@ -168,11 +167,9 @@ def get_steering_angle(setup: Setup, state: Navigating) -> float:
     return steering.angle
 
 
-def remember(state: S, key: tuple[str, str], item: Item) -> S:
-    """Return the state with an item as the previous one of its source and kind."""
-    common = state.common
-    previous = MappingProxyType({**common.previous, key: PreviousSample(item.utime, item.sample)})
-    return state._replace(common=common._replace(previous=previous))
+def remember(common: Common, key: tuple[str, str], item: Item) -> Common:
+    """Return the common state with an item as the previous one of its source and kind."""
+    return common._replace(previous={**common.previous, key: PreviousSample(item.utime, item.sample)})
 
 
 def fuse_constraint(setup: Setup, state: N, kind: str, innovation: Innovation) -> tuple[N, Decision]:
@@ -213,4 +210,4 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
         offset = state.gnss.offset
         a, b, c = (item.utime if measures[:, axis].any() else offset.aided_utimes[axis] for axis in range(3))
         state = state._replace(gnss=state.gnss._replace(offset=offset._replace(aided_utimes=(a, b, c))))
-    return remember(state, key, item), (decision,)
+    return state._replace(common=remember(state.common, key, item)), (decision,)

@@ -88,8 +88,11 @@ def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | 
     rate, force = sample.angular_velocity, sample.specific_force
     if rate is None or force is None:
         return "nan"
-    if not (math.isfinite(sum(rate)) and math.isfinite(sum(force))):
+    (a, b, c), (d, e, f) = rate, force
+    if not (math.isfinite(a + b + c) and math.isfinite(d + e + f)):
         return "nan"
-    if max(map(abs, rate)) > MAX_RATE or max(map(abs, force)) > MAX_FORCE:
+    if not (-MAX_RATE <= a <= MAX_RATE and -MAX_RATE <= b <= MAX_RATE and -MAX_RATE <= c <= MAX_RATE):
+        return "range"
+    if not (-MAX_FORCE <= d <= MAX_FORCE and -MAX_FORCE <= e <= MAX_FORCE and -MAX_FORCE <= f <= MAX_FORCE):
         return "range"
     return so3.rotate(mount, rate), so3.rotate(mount, force)

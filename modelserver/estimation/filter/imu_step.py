@@ -72,7 +72,7 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         return leveled, NOTHING
     nav = state.nav
     P = nav.covariance
-    bias_sigma = math.sqrt(max(P[9, 9], P[10, 10], P[11, 11]))
+    bias_sigma = math.sqrt(max(P.item(9, 9), P.item(10, 10), P.item(11, 11)))
     detector = state.stationary.update(utime, rate, force, nav.gyro_bias, bias_sigma, settings)
     is_gap = (utime - state.imu.used_utime) * 1e-6 > settings.rate_hold and state.imu.used_utime > 0
     if is_gap:
@@ -148,7 +148,7 @@ def _may_be_stationary(setup: Setup, state: Navigating, utime: int) -> bool:
     settings, nav, common = setup.settings, state.nav, state.common
     speed = math.hypot(*nav.velocity)
     P = nav.covariance
-    sigma = math.sqrt(max(P[3, 3], P[4, 4]))
+    sigma = math.sqrt(max(P.item(3, 3), P.item(4, 4)))
     if common.mode is not Mode.NO_WHEELS and state.stationary.is_confirmed_by_wheels(utime):
         # stuck wheels on a smooth road look the same: then fixes have kept the speed
         return not isinstance(state, Aligned) or speed - 4.0 * sigma < 10.0 * settings.stationary_speed

@@ -39,22 +39,25 @@ class Odometry(NamedTuple):
 
     def advance(self, nav: NavState, base: Vector3, is_stationary: bool) -> Odometry:
         """Return Odom at a newer state; `base` leads from the IMU to the rolling frame's origin, body axes, m."""
-        velocity, rate = (ZERO, ZERO) if is_stationary else (nav.body_velocity(base), nav.angular_rate)
+        velocity = rate = ZERO
+        if not is_stationary:
+            velocity, rate = nav.body_velocity(base), nav.angular_rate
+        drift, yaw_drift = self.drift, self.yaw_drift
         if not self.is_started:
             tilt = _follow_tilt(so3.IDENTITY, nav.up, 1.0)
-            return Odometry(nav.utime, self.position, tilt, velocity, rate, self.drift, self.yaw_drift, True)
+            return Odometry(nav.utime, self.position, tilt, velocity, rate, drift, yaw_drift, True)
         dt = (nav.utime - self.utime) * 1e-6
         if dt <= 0.0:
             return self
         step = min(dt, MAX_EXTRAPOLATION)
         position, attitude = _integrate(self, velocity, rate, step)
         attitude = _follow_tilt(attitude, nav.up, step / (TILT_TIME + step))
-        P = nav.covariance
-        speed_sigma = math.sqrt(P[3, 3] + P[4, 4])
-        rate_sigma = math.sqrt(P[11, 11])
-        yaw_drift = self.yaw_drift + (0.0 if is_stationary else rate_sigma * dt)
-        drift = self.drift + (0.0 if is_stationary else (speed_sigma + self.yaw_drift * math.hypot(*velocity)) * dt)
-        return Odometry(nav.utime, position, attitude, velocity, rate, min(drift, 1e6), min(yaw_drift, 1e3), True)
+        if not is_stationary:
+            P = nav.covariance
+            speed_sigma = math.sqrt(P.item(3, 3) + P.item(4, 4))
+            drift = min(drift + (speed_sigma + yaw_drift * math.hypot(*velocity)) * dt, 1e6)
+            yaw_drift = min(yaw_drift + math.sqrt(P.item(11, 11)) * dt, 1e3)
+        return Odometry(nav.utime, position, attitude, velocity, rate, drift, yaw_drift, True)
 
     def stop(self, utime: int) -> Odometry:
         """Return Odom at its pose from `utime` on, while the motion is unknown."""
@@ -78,13 +81,13 @@ class Odometry(NamedTuple):
 
 def _integrate(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> tuple[Vector3, Quaternion]:
     (ax, ay, az), (bx, by, bz) = odom.rate, rate
-    h = 0.5 * dt
-    turn = ((ax + bx) * h, (ay + by) * h, (az + bz) * h)
-    middle = so3.multiply(odom.attitude, so3.small_angle_exponential((0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2])))
+    h, q = 0.5 * dt, odom.attitude
+    tx, ty, tz = turn = ((ax + bx) * h, (ay + by) * h, (az + bz) * h)
+    middle = so3.multiply(q, so3.small_angle_exponential((0.5 * tx, 0.5 * ty, 0.5 * tz)))
     (ux, uy, uz), (vx, vy, vz) = odom.velocity, velocity
     x, y, z = so3.rotate(middle, ((ux + vx) * h, (uy + vy) * h, (uz + vz) * h))
     px, py, pz = odom.position
-    attitude = so3.normalize(so3.multiply(odom.attitude, so3.small_angle_exponential(turn)))
+    attitude = so3.normalize(so3.multiply(q, so3.small_angle_exponential(turn)))
     return (px + x, py + y, pz + z), attitude
 
 

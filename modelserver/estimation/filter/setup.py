@@ -24,8 +24,8 @@ class Setup:
     """A vehicle for the filter. Immutable.
 
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
-    layout holds the error states that they need. `findings` has, by mode, the configured sensors that cannot be used.
-    The process noises: `driving` on the IMU, `stationary`, `coasting` without any measurement of the motion,
+    layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
+    the configured sensors that cannot be used. The process noises: `driving` on the IMU, `stationary`, `coasting` without any measurement of the motion,
     `interpolated` on made-up IMU samples, `rolling` on wheels alone.
     """
 
@@ -41,6 +41,7 @@ class Setup:
         if self.wheels is not None:
             extras += wheel_states(settings)
         extras += [state for each in present for state in each.states]
+        self.has_imu = bool(rig.imu_frame)
         self.mount = rig.pose(rig.imu_frame).wxyz if rig.imu_frame else so3.IDENTITY
         self.layout = ErrorLayout(extras)
         by_sample: dict[type, list[Measurement]] = {}
@@ -65,11 +66,6 @@ class Setup:
         )
         self.findings = {mode: find_unusable(rig, mode) for mode in Mode}
 
-    @property
-    def has_imu(self) -> bool:
-        """Whether the vehicle has an IMU."""
-        return bool(self.rig.imu_frame)
-
     def uses_imu(self, mode: Mode) -> bool:
         """Return whether the IMU propagates the state in a mode."""
-        return self.has_imu and mode is not Mode.NO_IMU
+        return mode is not Mode.NO_IMU and self.has_imu

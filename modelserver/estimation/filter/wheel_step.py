@@ -55,8 +55,8 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     previous = _get_wheels(compared)
     received = _get_wheels(common.previous.get((item.source, RECEIVED)))
     are_stationary = are_wheels_stationary(sample, received, measurement.contacts, settings)
-    state = state._replace(stationary=state.stationary.update_wheels(item.utime, are_stationary))
-    state = remember(state, (item.source, RECEIVED), item)
+    detector = state.stationary.update_wheels(item.utime, are_stationary)
+    state = state._replace(stationary=detector, common=remember(common, (item.source, RECEIVED), item))
     has_imu = setup.uses_imu(common.mode)
     if isinstance(state, Leveling):
         return (state if has_imu else leveling.start_level(setup, state, item.utime)), NOTHING
@@ -65,8 +65,8 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, NOTHING
     state = propagation.advance(setup, state, item.utime)
     state, decisions, is_first_speed = _fuse_speed(setup, state, item, measurement, sample, age, previous)
-    state = state._replace(nav=state.nav._replace(travel=ZERO, rotation=ZERO))
-    state = remember(state, (item.source, item.kind), item)
+    nav = state.nav._replace(travel=ZERO, rotation=ZERO)
+    state = state._replace(nav=nav, common=remember(state.common, (item.source, item.kind), item))
     if not has_imu:
         state, more = _fuse_stationary(setup, state, item.utime, are_stationary is True)
         decisions += more
