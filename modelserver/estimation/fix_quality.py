@@ -7,7 +7,10 @@ dilution of precision: HDOP covers both horizontal axes, each has (UERE HDOP)^2 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
+from typing import TypeVar
 
 from modelserver.earth.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
 from modelserver.estimation.settings import FixSettings
@@ -44,6 +47,32 @@ class AcceptedFix:
         return math.sqrt(0.5 * (self.east_variance + self.north_variance))
 
 
+A = TypeVar("A")
+B = TypeVar("B")
+C = TypeVar("C")
+
+
+def reuse_last(function: Callable[[A, B], C]) -> Callable[[A, B], C]:
+    """Return a pure function that reuses its last value if it gets the same two objects again (decorator).
+
+    For values of a sample that each of its measurements needs. The arguments are immutable.
+    """
+    last: tuple[A, B, C] | None = None
+
+    @wraps(function)
+    def call(a: A, b: B) -> C:
+        nonlocal last
+        known = last
+        if known is not None and known[0] is a and known[1] is b:
+            return known[2]
+        found = function(a, b)
+        last = (a, b, found)
+        return found
+
+    return call
+
+
+@reuse_last
 def evaluate_fix(sample: GpsSample, settings: FixSettings) -> AcceptedFix | str:
     """Return the fix, or the reason why it is not good enough.
 

@@ -96,29 +96,26 @@ class History:
         """
         extended = History.__new__(History)
         extended._horizon = self._horizon
-        start, end = self._start, self._end
-        while end > start and self._times[end - 1] >= estimate.utime:
+        start, end, times, estimates, utime = self._start, self._end, self._times, self._estimates, estimate.utime
+        while end > start and times[end - 1] >= utime:
             end -= 1
-        oldest = estimate.utime - self._horizon
-        while start < end and self._times[start] < oldest:
+        oldest = utime - self._horizon
+        while start < end and times[start] < oldest:
             start += 1
-        fresh = end != len(self._times)
-        if fresh or (start > 1024 and start > end - start):
+        if end != len(times) or (start > 1024 and start > end - start):
             # an older history is extended, or most of the list has expired: copy the range
-            extended._times = self._times[start:end]
-            extended._estimates = self._estimates[start:end]
+            times, estimates = times[start:end], estimates[start:end]
             start, end = 0, end - start
-        else:
-            extended._times = self._times
-            extended._estimates = self._estimates
-        extended._times.append(estimate.utime)
-        extended._estimates.append(estimate)
+        times.append(utime)
+        estimates.append(estimate)
+        extended._times, extended._estimates = times, estimates
         extended._start, extended._end = start, end + 1
         return extended
 
     def is_too_soon(self, utime: int) -> bool:
         """Return whether an estimate for a time would follow the newest too soon to be stored."""
-        return len(self) > 0 and 0 < utime - self.last < MIN_STEP_US
+        end = self._end
+        return end > self._start and 0 < utime - self._times[end - 1] < MIN_STEP_US
 
     def with_duration(self, seconds: float) -> History:
         """Return the same history, with another duration from the next estimate on."""

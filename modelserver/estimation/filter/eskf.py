@@ -358,14 +358,14 @@ def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, d
 
 
 class MatrixBuffer:
-    """A square matrix with constant places for changing numbers; the other entries stay.
+    """A matrix with constant places for changing numbers; the other entries stay.
 
     It is reused, and filled by way of `struct`: both are faster than a new array of a tuple.
     """
 
     def __init__(self, matrix: Array, places: Iterable[tuple[int, int]]):
-        """Reuse a matrix (n, n), with `places` (row, column) in the order of the numbers."""
-        n = len(matrix)
+        """Reuse a matrix, with `places` (row, column) in the order of the numbers."""
+        n = matrix.shape[1]
         self._matrix, self._flat = matrix, matrix.reshape(-1)
         self._indices = np.array([row * n + column for row, column in places])
         self._values = np.zeros(len(self._indices))
@@ -435,9 +435,9 @@ def update(
     S = innovation_covariance(nav.covariance, H, R)
     residual, covariance, noise = y.tolist(), S.ravel().tolist(), R.ravel().tolist()
     # a number that is not finite makes the sum so, one of H that of S
-    if not math.isfinite(sum(residual) + sum(covariance) + sum(noise)):
-        if not (np.isfinite(y).all() and np.isfinite(H).all() and np.isfinite(R).all()):
-            return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
+    is_finite = math.isfinite(sum(residual) + sum(covariance) + sum(noise))
+    if not is_finite and not (np.isfinite(y).all() and np.isfinite(H).all() and np.isfinite(R).all()):
+        return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
     nis = normalized_innovation_squared(y, S)
     limit = chi_square_gate(len(y), settings.gate_risk)
     verdict, reason = Verdict.USED, ""

@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
 from modelserver.estimation.filter import eskf, propagation, protection_levels
@@ -107,26 +106,26 @@ def _compute_base_covariance(nav: NavState, setup: Setup, noise: ProcessNoise) -
     n = setup.layout.size
     dt = nav.lag
     x, y, z = so3.rotate(nav.attitude, setup.rig.base)
-    J = np.zeros((6, n))
-    J.put(
-        _base_entries(n),
-        (*(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), *(dt, dt, dt), *(z, -y, -z, x, y, -x)),
+    (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
+    J = _base_buffer(n).fill(
+        *(dt, dt, dt),
+        *(z, -y, -z, x, y, -x),
+        *(-dt * a, -dt * b, -dt * c, -dt * d, -dt * e, -dt * f, -dt * g, -dt * h, -dt * i),
     )
-    if dt > 0.0:
-        (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
-        J[3:, 9:12] = ((-dt * a, -dt * b, -dt * c), (-dt * d, -dt * e, -dt * f), (-dt * g, -dt * h, -dt * i))
-    P: Array = J @ nav.covariance @ J.T
+    P: Array = np.dot(np.dot(J, nav.covariance), J.T)
     p, w = noise.accelerometer * dt**3 / 3.0, noise.gyro * dt
     P.reshape(-1)[::7] += (p, p, p, w, w, w)
     return P
 
 
 @lru_cache(maxsize=16)
-def _base_entries(n: int) -> npt.NDArray[np.intp]:
-    """Return the flat indices in a (6, n) matrix of what `_compute_base_covariance` writes, in its order."""
-    rows = [(0, 0), (1, 1), (2, 2), (3, 6), (4, 7), (5, 8), (0, 3), (1, 4), (2, 5)]
-    rows += [(0, 7), (0, 8), (1, 6), (1, 8), (2, 6), (2, 7)]
-    return np.array([r * n + c for r, c in rows])
+def _base_buffer(n: int) -> eskf.MatrixBuffer:
+    """Return the buffer of a (6, n) matrix with the entries that `_compute_base_covariance` fills in, in its order."""
+    J = np.zeros((6, n))
+    J[:3, :3] = J[3:, 6:9] = np.eye(3)
+    places = [(0, 3), (1, 4), (2, 5), (0, 7), (0, 8), (1, 6), (1, 8), (2, 6), (2, 7)]
+    places += [(3 + r, 9 + c) for r in range(3) for c in range(3)]
+    return eskf.MatrixBuffer(J, places)
 
 
 def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime: int) -> float:

@@ -72,10 +72,13 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
         held = state.imu.used_utime + round(setup.settings.rate_hold * 1e6)
         if nav.utime < held:
             until = min(utime, held)
-            rate = _get_stationary_rate(state, nav) if state.is_stationary else nav.rate
             measured = nav.rate
-            nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
-            nav = nav._replace(rate=measured)
+            if state.is_stationary:
+                rate = _get_stationary_rate(state, nav)
+                nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
+                nav = nav._replace(rate=measured)
+            else:
+                nav = eskf.propagate(nav, until, measured, nav.force, state.earth, base)
             if until == utime:
                 return nav
             nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)

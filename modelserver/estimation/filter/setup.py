@@ -25,8 +25,8 @@ class Setup:
 
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
     layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
-    the configured sensors that cannot be used. The process noises: `driving` on the IMU, `stationary`, `coasting` without any measurement of the motion,
-    `interpolated` on made-up IMU samples, `rolling` on wheels alone.
+    the configured sensors that cannot be used. The process noises: `driving` on the IMU, `stationary`, `coasting`
+    without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone.
     """
 
     def __init__(self, rig: SensorRig, settings: FilterSettings | None = None, kinds: Iterable[type[Measurement]] = ()):

@@ -32,7 +32,7 @@ from modelserver.estimation.filter.measurements.measurement import (
 )
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.findings import MIN_BASELINE
-from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix, range_error
+from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix, range_error, reuse_last
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.messages import FixType, GpsSample
 from modelserver.transforms import so3
@@ -69,12 +69,17 @@ def split_variance(variance: float, fix_type: FixType, settings: FilterSettings)
 
 def locate_fix(fix: AcceptedFix, site: LocalFrame, fallback_up: float) -> Vector3:
     """Return a fix as east, north, up of a tangent plane; `fallback_up` replaces an unknown height."""
-    height = fix.height
-    if math.isnan(height):
-        # the height of the plane there: off by r^2 / 2R, far below what a horizontal fix needs
-        flat = site.from_ecef(ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0))
-        height = fallback_up - flat[2]
+    if not math.isnan(fix.height):
+        return _locate_at_height(fix, site)
+    # the height of the plane there: off by r^2 / 2R, far below what a horizontal fix needs
+    flat = site.from_ecef(ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0))
+    height = fallback_up - flat[2]
     return site.from_ecef(ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height))
+
+
+@reuse_last
+def _locate_at_height(fix: AcceptedFix, site: LocalFrame) -> Vector3:
+    return site.from_ecef(ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height))
 
 
 @dataclass(frozen=True, slots=True)
