@@ -285,13 +285,14 @@ def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:
     if known is None or decision.kind in UNCOUNTED_KINDS:
         return state
     is_rejected = decision.verdict is messages.Verdict.REJECTED
-    updated = known._replace(
-        measured=known.measured + 1,
-        used=known.used + (decision.verdict in (messages.Verdict.USED, messages.Verdict.RESET)),
-        dropped=known.dropped + 1 if is_rejected else 0,
-        reason=decision.reason if is_rejected else "",
+    updated = SourceTraffic(
+        *known[:7],
+        known.measured + 1,
+        known.used + (decision.verdict in (messages.Verdict.USED, messages.Verdict.RESET)),
+        known.dropped + 1 if is_rejected else 0,
+        decision.reason if is_rejected else "",
     )
-    return state._replace(traffic={**state.traffic, source: updated})
+    return CoreState(state.view, state.host_clock, {**state.traffic, source: updated}, *state[3:])
 
 
 def get_silence_limit(interval: float) -> float:

@@ -178,7 +178,7 @@ def _unwrap_mode_command(event: LogEvent, channels: Mapping[str, SensorChannel])
     sensor = channels.get(channel)
     if sensor is None or sensor.type_name != MODE_TYPE:
         return event
-    return replace(event, channel=channel, data=envelope.payload)
+    return event._replace(channel=channel, data=envelope.payload)
 
 
 def _instant(utime: int) -> Instant:

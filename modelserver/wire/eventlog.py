@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 from modelserver.errors import RecordingError
 from modelserver.files.regular import NotRegularFileError, open_regular
@@ -24,13 +24,13 @@ MAX_DATA = 256 << 20
 """Longer messages are treated as damage."""
 
 _HEAD = struct.Struct(">Iqqii")  # sync word, event number, utime, lengths of channel and data
-_SYNC = struct.pack(">I", 0xEDA1DA01)
+_SYNC_WORD = 0xEDA1DA01
+_SYNC = struct.pack(">I", _SYNC_WORD)
 
 Buffer: TypeAlias = bytes | mmap.mmap
 
 
-@dataclass(frozen=True, slots=True)
-class LogEvent:
+class LogEvent(NamedTuple):
     """One message of a log: receive time, channel, bytes. `end` is its end offset in the file."""
 
     number: int
@@ -61,7 +61,7 @@ class LogDamage:
 
 def encode_event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
     """Encode an event; `channel` is ASCII, of 1 to MAX_CHANNEL_LENGTH characters."""
-    return _HEAD.pack(0xEDA1DA01, number, utime, len(channel), len(data)) + channel + data
+    return _HEAD.pack(_SYNC_WORD, number, utime, len(channel), len(data)) + channel + data
 
 
 def scan(data: Buffer) -> Iterator[LogEvent | LogDamage]:
@@ -85,10 +85,12 @@ def scan(data: Buffer) -> Iterator[LogEvent | LogDamage]:
 
 def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
     """Return the event that starts at an offset, None where there is no complete one."""
-    if size - at < _HEAD.size or data[at : at + 4] != _SYNC:
+    if size - at < _HEAD.size:
         return None
-    _, number, utime, channel_length, data_length = _HEAD.unpack(data[at : at + _HEAD.size])
-    if not (0 < channel_length <= MAX_CHANNEL_LENGTH and 0 <= data_length <= MAX_DATA and 0 <= utime < MAX_UTIME):
+    sync, number, utime, channel_length, data_length = _HEAD.unpack_from(data, at)
+    if sync != _SYNC_WORD or not (
+        0 < channel_length <= MAX_CHANNEL_LENGTH and 0 <= data_length <= MAX_DATA and 0 <= utime < MAX_UTIME
+    ):
         return None
     start = at + _HEAD.size
     end = start + channel_length + data_length
@@ -100,7 +102,7 @@ def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
         channel = data[start : start + channel_length].decode("ascii")
     except UnicodeDecodeError:
         return None
-    return LogEvent(number, utime, channel, bytes(data[start + channel_length : end]), end)
+    return LogEvent(number, utime, channel, data[start + channel_length : end], end)
 
 
 class LogFile:

@@ -146,7 +146,9 @@ class FilterLocalizer(NamedTuple):
         waits = setup.uses_imu(self.head.common.mode) and not isinstance(sample, SwitchMode)
         limit = clocks.get_complete_utime() if waits else clocks.newest
         events: tuple[LocalizerEvent, ...] = ()
-        timeline = self.timeline.append(setup, items[0], limit, oldest) if len(items) == 1 else None
+        timeline = None
+        if len(items) == 1:
+            timeline = self.timeline.append(setup, items[0], settings.replay_budget, limit, oldest)
         if timeline is not None:
             head = timeline.newest
         else:

@@ -229,7 +229,7 @@ class Aligned(NamedTuple):
 
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""
-        return self._replace(nav=nav)
+        return Aligned(nav, *self[1:])
 
 
 Navigating: TypeAlias = Unaligned | Aligned

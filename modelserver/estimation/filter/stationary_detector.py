@@ -105,8 +105,8 @@ class StationaryDetector(NamedTuple):
         if are_stationary is None:
             return self
         if are_stationary:
-            return self._replace(wheels_stationary=True, wheels_utime=utime)
-        return self._replace(wheels_stationary=False, wheels_utime=utime, since=0, rate_sum=ZERO, sum_time=0.0)
+            return StationaryDetector(*self[:6], True, utime, *self[8:])
+        return StationaryDetector(*self[:5], 0, False, utime)
 
     def restart_mean(self) -> StationaryDetector:
         """Return the detector with the integral of the rate restarted."""

@@ -58,20 +58,25 @@ class Timeline(NamedTuple):
         """Return whether everything up to the instant `limit` is fused."""
         return self.num_fused == len(self.entries) or self.entries[self.num_fused].item.utime > limit
 
-    def append(self, setup: Setup, item: Item, limit: int, oldest: int) -> Timeline | None:
-        """Return the timeline with an item more that is fused; None unless it follows all others, which are fused.
+    def append(self, setup: Setup, item: Item, budget: int, limit: int, oldest: int) -> Timeline | None:
+        """Return the timeline with an item more, all of it fused; None if the item does not follow all others.
 
-        The usual case, at a fraction of the cost of `insert` and `fuse`. It is no later than the instant `limit` and
-        not before `oldest`.
+        The usual case of `insert` and `fuse`, at a fraction of their cost; `oldest` is the beginning of the horizon.
         """
-        entries = self.entries
-        if self.num_fused != len(entries) or not entries or not oldest <= item.utime <= limit:
+        entries, num_fused = self.entries, self.num_fused
+        if not entries or not oldest <= item.utime <= limit or item.utime <= entries[-1].item.utime:
             return None
-        last, before, _ = entries[-1]
-        if before is None or item.utime <= last.utime:
+        if num_fused == len(entries):
+            state, decisions = step(setup, self.newest, item)
+            return Timeline(self.base, (*entries, Entry(item, state, decisions)), num_fused + 1)
+        waiting = [each.item for each in entries[num_fused:]]
+        if len(waiting) >= budget:
             return None
-        state, decisions = step(setup, before, item)
-        return Timeline(self.base, (*entries, Entry(item, state, decisions)), self.num_fused + 1)
+        state, fused = self.newest, []
+        for each in (*waiting, item):
+            state, decisions = step(setup, state, each)
+            fused.append(Entry(each, state, decisions))
+        return Timeline(self.base, (*entries[:num_fused], *fused), len(entries) + 1)
 
     def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
         """Return the timeline with an item more, and the item that it replaces; or in one word why not.

@@ -102,7 +102,9 @@ def _fuse_speed(
             context, innovation = context._replace(nav=nav), again
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
-    wheels = state.common.wheels._replace(source=item.source)
+    wheels = state.common.wheels
+    if wheels.source != item.source:
+        wheels = wheels._replace(source=item.source)
     if decision.verdict is Verdict.USED:
         turn_rate = 0.0
         if not has_gyro:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -164,8 +163,8 @@ def test_given_an_unknown_frame_when_replayed_then_the_error_comes_before_any_wo
 
 def test_given_bad_messages_when_replayed_then_they_are_counted_and_the_rest_is_used() -> None:
     whole = gps(10)
-    cut = dataclasses.replace(whole, data=whole.data[:40])
-    junk = dataclasses.replace(whole, data=b"junk")
+    cut = whole._replace(data=whole.data[:40])
+    junk = whole._replace(data=b"junk")
     run = OfflineRun(
         vehicle(), [cut, junk, gps(20), gps(30, fix=FixType.NONE), gps(40, channel="RADAR"), gps(50)], "V:Base"
     )
