@@ -15,6 +15,7 @@ begin with `@`, what Python needs beyond that:
              @word                     a str, the name of one of the constants above it, which count from 0
              @default EXPRESSION       its default in the value
              @optional                 None in Python where the first number is nan
+             @partial                  with @optional, of three numbers: None only where all are nan
              @none NUMBER              None in Python for this number
              @enum NAME [PREFIX]       a member of an enumeration, made of the constants above without their prefix
              @flags NAME               a set of flags of `messages.flags`
@@ -640,7 +641,8 @@ class _Reader:
         value = f"({', '.join(numbers)})"
         if "optional" not in each.options:
             return self._check_expression(each, value)
-        known = f"read_{VECTORS[each.size].lower()}({value})"
+        partial = "partial_" if "partial" in each.options else ""
+        known = f"read_{partial}{VECTORS[each.size].lower()}({value})"
         if "check" not in each.options:
             return known
         return f"None if ({name} := {known}) is None else {self._check_expression(each, name)}"

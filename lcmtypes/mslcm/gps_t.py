@@ -24,7 +24,10 @@ class gps_t(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, [9], [3], [9], None, None, None, None, None, None, None]
 
     FIX_NONE = 0
-    """ No fix: coordinates, if any, must not be used. """
+    """
+    No fix: coordinates, if any, must not be used. Of a source that never states another type: not stated; then a
+    position with a covariance is used.
+    """
     FIX_2D = 1
     """ Position only in the horizontal, height held or unknown. """
     FIX_3D = 2

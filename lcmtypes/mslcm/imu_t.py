@@ -45,7 +45,8 @@ class imu_t(object):
         self.angular_velocity = [ 0.0 for dim0 in range(3) ]
         """
         Angular velocity of the sensor with respect to inertial space, along the sensor's axes, rad/s, right-hand rule.
-        @optional
+        A gyro with one axis fills that one (imu.yaw_rate_only of the vehicle file).
+        @optional @partial
         LCM Type: double[3]
         """
 

@@ -123,6 +123,32 @@ class GpsConfig(SensorConfig):
 
 
 @dataclass(frozen=True, slots=True)
+class ImuConfig(SensorConfig):
+    """The inertial measurement unit."""
+
+    yaw_rate_only: bool = False
+    """Whether it measures the turn rate alone: angular_velocity along the axis nearest to up, the rest nan. The vehicle
+    is then taken to be level."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedometerConfig:
+    """One speed for the whole vehicle, where no wheels are measured: forward_speed of the vehicle controller."""
+
+    channel: str = "VEHICLE_STATUS"
+    """Channel of the vehicle controller's status (vehicle_status_t)."""
+    sigma: float = 0.1
+    """Standard deviation of the speed, m/s."""
+    unsigned: bool = False
+    """Whether the speed is a magnitude, also in reverse."""
+    latency: float = 0.0
+    """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        _check(self, channel="channel", sigma=(1e-3, 5.0))
+
+
+@dataclass(frozen=True, slots=True)
 class SteeringConfig:
     """Source of the angle of steered wheels that do not measure it themselves."""
 
@@ -202,8 +228,9 @@ class SensorsConfig:
     """The sensors. Their mounting poses are in the geometry file alone."""
 
     gps: GpsConfig | None = None
-    imu: SensorConfig | None = None
+    imu: ImuConfig | None = None
     wheels: WheelsConfig | None = None
+    speedometer: SpeedometerConfig | None = None
     joints: JointsConfig = field(default_factory=JointsConfig)
     aiding: dict[str, AidingConfig] = field(default_factory=dict)
     """Further sources, each by the name in its messages (`header.source`)."""
@@ -214,7 +241,9 @@ class SensorsConfig:
         for name in self.aiding:
             if not (0 < len(name) <= MAX_NAME and name.isprintable()):
                 raise ValueError(f"aiding names sources with 1 to {MAX_NAME} printable characters, got {quote(name)}")
-        sensors = (self.gps, self.imu, self.wheels, self.steering, self.joints, *self.aiding.values())
+        if self.wheels is not None and self.speedometer is not None:
+            raise ValueError("speedometer is for a vehicle without measured wheels: remove it, or wheels")
+        sensors = (self.gps, self.imu, self.wheels, self.speedometer, self.steering, self.joints, *self.aiding.values())
         channels = [each.channel for each in sensors if each]
         twice = {channel for channel in channels if channels.count(channel) > 1}
         if twice:

@@ -16,6 +16,9 @@ from modelserver.messages import Mode, SensorFinding
 MIN_BASELINE = 0.01
 """Meters between two antennas, horizontally, below which they give no heading."""
 
+MIN_UP_SHARE = 0.9
+"""Component of up along the axis of a gyro that measures the turn rate alone: 26 deg."""
+
 _EXCLUDING_MODES: dict[str, tuple[Mode, ...]] = {
     "gps": (Mode.NO_GPS, Mode.DEAD_RECKONING),
     "imu": (Mode.NO_IMU,),
@@ -28,7 +31,8 @@ def find_unusable(rig: SensorRig, mode: Mode) -> tuple[SensorFinding, ...]:
     """Return the configured sensors, or parts of their configuration, that a mode of localization cannot use."""
     return (
         *_check_mode(rig, mode),
-        *_check_wheels(rig),
+        *_check_wheels(rig, mode),
+        *_check_yaw_gyro(rig, mode),
         *_check_steering(rig),
         *_check_antennas(rig),
         *_check_heading(rig),
@@ -36,11 +40,15 @@ def find_unusable(rig: SensorRig, mode: Mode) -> tuple[SensorFinding, ...]:
 
 
 def _check_mode(rig: SensorRig, mode: Mode) -> Iterator[SensorFinding]:
-    configured = {"gps": bool(rig.gps_frame), "imu": bool(rig.imu_frame), "wheels": bool(rig.wheel_frames)}
+    configured = {
+        "gps": bool(rig.gps_frame),
+        "imu": _has_gyro(rig),
+        "wheels": bool(rig.wheel_frames),
+    }
     for sensor, modes in _EXCLUDING_MODES.items():
         if configured[sensor] and mode in modes:
             yield SensorFinding(
-                sensor,
+                "speedometer" if sensor == "wheels" and rig.speedometer is not None else sensor,
                 "mode",
                 "localization.mode",
                 f"mode {mode.name.lower()} does not use it",
@@ -49,7 +57,7 @@ def _check_mode(rig: SensorRig, mode: Mode) -> Iterator[SensorFinding]:
             )
 
 
-def _check_wheels(rig: SensorRig) -> Iterator[SensorFinding]:
+def _check_wheels(rig: SensorRig, mode: Mode) -> Iterator[SensorFinding]:
     frames = "sensors.wheels.frames"
     if rig.has_wheels and not rig.wheel_frames:
         text = "frames names no wheels, so they are not used"
@@ -60,9 +68,40 @@ def _check_wheels(rig: SensorRig) -> Iterator[SensorFinding]:
             text,
             "write frames: {NAME: BODY:FRAME} with the names that the driver publishes",
         )
-    elif rig.kinematics == "ackermann" and len(rig.wheel_frames) == 1:
-        text = "ackermann with a single wheel: the wheels measure no turn rate"
-        yield SensorFinding("wheels", "single", frames, text, "name the wheels of the other side and axle too")
+    elif len(rig.wheel_frames) == 1:
+        sensor, element = ("wheels", frames) if rig.speedometer is None else ("speedometer", "sensors.speedometer")
+        has_gyro = _has_gyro(rig) and mode is not Mode.NO_IMU
+        if has_gyro:
+            text = "one speed: used for the speed and while stationary, not for the turn rate, which is the IMU's"
+            fix = ""
+        else:
+            text = "one speed and no IMU: nothing measures the turn rate, so the heading follows the fixes in each turn"
+            fix = "name the wheels of both sides, or an IMU (imu.yaw_rate_only: true for a gyro alone)"
+        yield SensorFinding(sensor, "single", element, text, fix, is_choice=has_gyro)
+
+
+def _has_gyro(rig: SensorRig) -> bool:
+    return bool(rig.imu_frame or rig.yaw_gyro_frame)
+
+
+def _check_yaw_gyro(rig: SensorRig, mode: Mode) -> Iterator[SensorFinding]:
+    if rig.yaw_gyro is None:
+        return
+    share = abs(rig.yaw_gyro.share)
+    if share < MIN_UP_SHARE:
+        text = (
+            f"its axis nearest to up is {math.degrees(math.acos(share)):.0f} deg off: it does not measure the turn rate"
+        )
+        yield SensorFinding("imu", "axis", "sensors.imu.frame", text, "correct the frame in the geometry")
+    elif mode is Mode.RAW:
+        text = "raw mode needs all three rates: with yaw_rate_only the IMU is not used"
+        yield SensorFinding("imu", "mode", "localization.mode", text, "write mode: full")
+    else:
+        text = (
+            "yaw rate only: used for the heading; the vehicle is taken to be level, and wheels or a speedometer are "
+            "needed to know whether it is stationary or reverses"
+        )
+        yield SensorFinding("imu", "yaw_rate", "sensors.imu.yaw_rate_only", text, is_choice=True)
 
 
 def _check_steering(rig: SensorRig) -> Iterator[SensorFinding]:
@@ -100,6 +139,6 @@ def _check_antennas(rig: SensorRig) -> Iterator[SensorFinding]:
 
 
 def _check_heading(rig: SensorRig) -> Iterator[SensorFinding]:
-    if rig.gps_frame and not (rig.imu_frame or rig.wheel_frames or rig.second_antenna_frame):
+    if rig.gps_frame and not (_has_gyro(rig) or rig.wheel_frames or rig.second_antenna_frame):
         text = "no IMU, no wheels and no second antenna: heading is known above localization.filter.reverse_speed alone"
         yield SensorFinding("gps", "alone", "sensors.gps", text, "name an IMU or wheels")

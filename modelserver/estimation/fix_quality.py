@@ -10,7 +10,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
-from typing import TypeVar
+from operator import is_
+from typing import Any, ParamSpec, TypeVar
 
 from modelserver.earth.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
 from modelserver.estimation.settings import FixSettings
@@ -47,41 +48,45 @@ class AcceptedFix:
         return math.sqrt(0.5 * (self.east_variance + self.north_variance))
 
 
-A = TypeVar("A")
-B = TypeVar("B")
-C = TypeVar("C")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-def reuse_last(function: Callable[[A, B], C]) -> Callable[[A, B], C]:
-    """Return a pure function that reuses its last value if it gets the same two objects again (decorator).
+def reuse_last(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a pure function that reuses its last value if it gets the same objects again (decorator).
 
     For values of a sample that each of its measurements needs. The arguments are immutable.
     """
-    last: tuple[A, B, C] | None = None
+    last: tuple[tuple[Any, ...], R] | None = None
 
     @wraps(function)
-    def call(a: A, b: B) -> C:
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
         nonlocal last
         known = last
-        if known is not None and known[0] is a and known[1] is b:
-            return known[2]
-        found = function(a, b)
-        last = (a, b, found)
+        if known is not None and len(known[0]) == len(args) and all(map(is_, known[0], args)):
+            return known[1]
+        found = function(*args, **kwargs)
+        last = (args, found)
         return found
 
     return call
 
 
 @reuse_last
-def evaluate_fix(sample: GpsSample, settings: FixSettings) -> AcceptedFix | str:
+def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool = False) -> AcceptedFix | str:
     """Return the fix, or the reason why it is not good enough.
+
+    `may_lack_type`: a fix of type NONE with a covariance is one of a publisher that fills in neither type nor number of
+    satellites.
 
     Reasons: no_fix, satellites, dilution, sigma, range (an invalid place, latitude 0 with longitude 0, beyond UTM),
     nan.
     """
     latitude, longitude = sample.latitude_deg, sample.longitude_deg
     # the receiver's dead reckoning is not an independent measurement
-    if sample.fix_type < settings.minimum_fix_type or sample.fix_type == FixType.DEAD_RECKONING:
+    is_untyped = may_lack_type and sample.fix_type is FixType.NONE and _has_covariance(sample)
+    fix_type = FixType.FIX_2D if is_untyped else sample.fix_type
+    if fix_type < settings.minimum_fix_type or fix_type == FixType.DEAD_RECKONING:
         return "no_fix"
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return "nan"
@@ -89,7 +94,7 @@ def evaluate_fix(sample: GpsSample, settings: FixSettings) -> AcceptedFix | str:
         return "range"
     if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
         return "range"  # sent by receivers and drivers without a fix
-    if 0 <= sample.satellites < settings.minimum_satellites:
+    if 0 <= sample.satellites < settings.minimum_satellites and not (is_untyped and sample.satellites == 0):
         return "satellites"
     if sample.hdop > settings.maximum_hdop:
         return "dilution"
@@ -119,18 +124,23 @@ def range_error(fix_type: FixType, settings: FixSettings) -> float:
     return settings.uere
 
 
+def _has_covariance(sample: GpsSample) -> bool:
+    """Return whether a fix states its horizontal variances."""
+    stated = sample.position_covariance
+    return stated is not None and 0.0 < stated[0] < math.inf and 0.0 < stated[4] < math.inf
+
+
 def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float, float, float]:
     """Return variances east and north, covariance, variance up: the receiver's, else range error times dilution."""
     stated = sample.position_covariance
-    if stated is not None:
+    if stated is not None and _has_covariance(sample):
         east, cross, north, up = stated[0], stated[1], stated[4], stated[8]
-        if 0.0 < east < math.inf and 0.0 < north < math.inf:
-            if not cross * cross < east * north:
-                cross = 0.0
-            if not 0.0 < up < math.inf:
-                up = _VERTICAL_RATIO**2 * 0.5 * (east + north)
-            least = _MIN_VARIANCE
-            return max(east, least), max(north, least), cross, min(max(up, least), _MAX_VARIANCE)
+        if not cross * cross < east * north:
+            cross = 0.0
+        if not 0.0 < up < math.inf:
+            up = _VERTICAL_RATIO**2 * 0.5 * (east + north)
+        least = _MIN_VARIANCE
+        return max(east, least), max(north, least), cross, min(max(up, least), _MAX_VARIANCE)
     uere = range_error(sample.fix_type, settings)
     hdop = sample.hdop if sample.hdop > 0.0 else settings.assumed_hdop
     vdop = sample.vdop if 0.0 < sample.vdop < math.inf else _VERTICAL_RATIO * hdop

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 from modelserver.errors import QueryError
 from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.geometry.model import Model
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 
@@ -80,6 +81,33 @@ class SteeringSignal:
         return sum(ahead) / len(ahead) if ahead else 0.0
 
 
+SPEEDOMETER: Final = "speedometer"
+"""Name of the wheel that stands for a vehicle's one speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedometerSignal:
+    """The one speed of a vehicle that its controller measures (VEHICLE_STATUS.forward_speed), to `sigma`, m/s.
+
+    It is that of a wheel at the rolling frame, which `wheel_frames` then has under the name SPEEDOMETER.
+    `is_unsigned`: it is a magnitude, also when the vehicle reverses.
+    """
+
+    sigma: float = 0.1
+    is_unsigned: bool = False
+
+
+class YawGyro(NamedTuple):
+    """A gyro that measures the turn rate of the vehicle alone.
+
+    `axis` is the sensor's axis nearest to the vehicle's up, 0 to 2, and `share` the component of up along it: the
+    turn rate w of a level vehicle shows as share w.
+    """
+
+    axis: int
+    share: float
+
+
 @dataclass(frozen=True)
 class SensorRig:
     """The vehicle's frames that localization uses. The body axes are those of `rolling_frame`.
@@ -87,8 +115,9 @@ class SensorRig:
     `rolling_frame` moves along its own x axis; `imu_frame`, `gps_frame` and `second_antenna_frame` are full names,
     empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name.
     `steering` is the measured steering angle, where one is configured; `has_wheels` is whether wheels are configured at
-    all, with frames or without. Raises QueryError for a frame that the model does not have or join to the rolling
-    frame.
+    all, with frames or without. `speedometer`: there is one speed instead of wheels. `yaw_gyro_frame` is the frame of a
+    gyro that measures the turn rate alone; there is no `imu_frame` then. Raises QueryError for a frame that the model
+    does not have or join to the rolling frame.
     """
 
     model: Model
@@ -101,12 +130,14 @@ class SensorRig:
     magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
     steering: SteeringSignal | None = None
     has_wheels: bool = False
+    speedometer: SpeedometerSignal | None = None
+    yaw_gyro_frame: str = ""
 
     def __post_init__(self) -> None:
         imu = self.pose(self.imu_frame).xyz if self.imu_frame else (0.0, 0.0, 0.0)
         object.__setattr__(self, "imu", imu)
         object.__setattr__(self, "base", self.lever_arm_to((0.0, 0.0, 0.0)))
-        for frame in (self.gps_frame, self.second_antenna_frame, *self.wheel_frames.values()):
+        for frame in (self.gps_frame, self.second_antenna_frame, self.yaw_gyro_frame, *self.wheel_frames.values()):
             if frame:
                 self.pose(frame)
 
@@ -114,9 +145,18 @@ class SensorRig:
         """Return the pose of a frame in the rolling frame. Raises QueryError."""
         return self.model.get_transformation(frame, self.rolling_frame).pose
 
+    @property
+    def yaw_gyro(self) -> YawGyro | None:
+        """The gyro that measures the turn rate alone, None without one. Raises QueryError."""
+        if not self.yaw_gyro_frame:
+            return None
+        up = so3.rotate(so3.conjugate(self.pose(self.yaw_gyro_frame).wxyz), (0.0, 0.0, 1.0))
+        axis = max(range(3), key=lambda k: abs(up[k]))
+        return YawGyro(axis, up[axis])
+
     def geometry_key(self) -> tuple[object, ...]:
         """Return everything that localization takes from the geometry: equal where nothing of it has moved."""
-        frames = (self.imu_frame, self.gps_frame, self.second_antenna_frame)
+        frames = (self.imu_frame, self.yaw_gyro_frame, self.gps_frame, self.second_antenna_frame)
         wheels = ((wheel, frame, self.pose(frame)) for wheel, frame in sorted(self.wheel_frames.items()))
         return (self.rolling_frame, *((frame, self.pose(frame)) for frame in frames if frame), *wheels)
 

@@ -698,7 +698,9 @@ class FixType(IntEnum):
     """What the fix rests on."""
 
     NONE = 0
-    """No fix: coordinates, if any, must not be used."""
+    """No fix: coordinates, if any, must not be used. Of a source that never states another type: not stated; then a
+    position with a covariance is used.
+    """
     FIX_2D = 1
     """Position only in the horizontal, height held or unknown."""
     FIX_3D = 2
@@ -965,6 +967,7 @@ class ImuSample:
         Time and source.
     angular_velocity
         Angular velocity of the sensor with respect to inertial space, along the sensor's axes, rad/s, right-hand rule.
+        A gyro with one axis fills that one (imu.yaw_rate_only of the vehicle file).
     angular_velocity_covariance
         Covariance of the angular velocity, row-major, along the sensor's axes, (rad/s)2.
     specific_force

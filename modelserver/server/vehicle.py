@@ -19,7 +19,7 @@ from modelserver.core.commands import ModelLoaded
 from modelserver.core.state import START
 from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.estimation.findings import find_unusable
-from modelserver.estimation.sensor_rig import Mounts, SensorRig, SteeringSignal
+from modelserver.estimation.sensor_rig import SPEEDOMETER, Mounts, SensorRig, SpeedometerSignal, SteeringSignal
 from modelserver.formats import FileExamination, examine_file
 from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
@@ -227,6 +227,7 @@ def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
         ("gps", sensors.gps, messages.GpsSample, ""),
         ("imu", sensors.imu, messages.ImuSample, ""),
         ("wheels", sensors.wheels, messages.WheelsSample, ""),
+        ("speedometer", sensors.speedometer, messages.VehicleStatusSample, ""),
         ("wheels.steering", sensors.steering, messages.VehicleStatusSample, ""),
         ("joints", sensors.joints, messages.JointsSample, ""),
         *((f"aiding.{name}", each, AIDING_SAMPLES[each.type], name) for name, each in sensors.aiding.items()),
@@ -348,22 +349,31 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
 def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:
     """Make the sensor rig of the filter; None without a localization sensor."""
     gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
-    if gps is None and imu is None and wheels is None:
+    speedometer, steering = config.sensors.speedometer, config.sensors.steering
+    if gps is None and imu is None and wheels is None and speedometer is None:
         return None
-    steering = config.sensors.steering
+    rolling_frame = config.rolling_frame or config.base_frame
+    frames = wheels.frames if wheels is not None else {}
+    if speedometer is not None:
+        frames = {SPEEDOMETER: rolling_frame}
+    imu_frame, yaw_gyro_frame = (imu.frame, "") if imu is not None else ("", "")
+    if imu is not None and imu.yaw_rate_only:
+        imu_frame, yaw_gyro_frame = "", imu.frame
     return SensorRig(
         model,
-        config.rolling_frame or config.base_frame,
-        imu.frame if imu is not None else "",
+        rolling_frame,
+        imu_frame,
         gps.frame if gps is not None else "",
         gps.second_frame if gps is not None else "",
-        wheels.frames if wheels is not None else {},
+        frames,
         wheels.kinematics if wheels is not None else "differential",
         config.localization.magnetometer,
         SteeringSignal(steering.wheels, steering.geometry, steering.sigma, steering.limit, steering.max_age)
         if steering is not None
         else None,
         wheels is not None,
+        SpeedometerSignal(speedometer.sigma, speedometer.unsigned) if speedometer is not None else None,
+        yaw_gyro_frame,
     )
 
 

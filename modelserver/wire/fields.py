@@ -71,6 +71,12 @@ def read_vector3(values: Sequence[float]) -> Vector3 | None:
     return None if x != x or y != y or z != z else (x, y, z)
 
 
+def read_partial_vector3(values: Sequence[float]) -> Vector3 | None:
+    """Return three numbers, or None where all are nan."""
+    x, y, z = values
+    return None if x != x and y != y and z != z else (x, y, z)
+
+
 def read_quaternion(values: Sequence[float]) -> Quaternion | None:
     """Return four numbers, or None where one is nan."""
     w, x, y, z = values

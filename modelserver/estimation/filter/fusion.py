@@ -14,6 +14,7 @@ from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.eskf import Innovation
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
+from modelserver.estimation.filter.measurements.wheels import read_speedometer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
 from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
@@ -80,8 +81,12 @@ def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
         items.append(Item(utime, source, seq, 0, IMU, None, sample))
     elif isinstance(sample, SwitchMode):
         items.append(Item(utime, source, seq, 0, MODE, None, sample))
-    elif isinstance(sample, VehicleStatusSample) and setup.rig.steering is not None:
-        items.append(Item(utime, source, seq, 0, STEERING, None, sample))
+    elif isinstance(sample, VehicleStatusSample):
+        if setup.rig.steering is not None:
+            items.append(Item(utime, source, seq, 0, STEERING, None, sample))
+        if setup.rig.speedometer is not None and setup.wheels is not None:
+            wheels = read_speedometer(sample, setup.rig.speedometer)
+            items.append(Item(utime, source, seq, 1, setup.wheels.kind, setup.wheels, wheels))
     for part, measurement in enumerate(setup.measurements.get(type(sample), ()), start=1):
         instant = measurement.get_utime(sample)
         if instant is not None:
@@ -129,7 +134,7 @@ def uses_item(mode: Mode, item: Item) -> bool:
 
 def accept_fix(setup: Setup, state: FilterState, sample: GpsSample) -> AcceptedFix | str:
     """Return the fix, or in one word why it is not good enough."""
-    fix = evaluate_fix(sample, setup.settings)
+    fix = evaluate_fix(sample, setup.settings, not state.common.receiver.states_type)
     geodesy = state.common.geodesy
     if isinstance(fix, str) or geodesy is None:
         return fix
@@ -193,6 +198,8 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     sample, measurement = item.sample, item.measurement
     if isinstance(state, Leveling) or measurement is None or not uses_item(state.common.mode, item):
         return state, NOTHING
+    if isinstance(sample, GpsSample) and not state.common.receiver.may_use(sample):
+        return state, NOTHING  # counted by the position
     key = (item.source, item.kind)
     previous = state.common.previous.get(key)
     age = math.inf if previous is None else (item.utime - previous.utime) * 1e-6

@@ -89,6 +89,9 @@ def fuse_fix(setup: Setup, state: FilterState, item: Item) -> Fused:
     sample, measurement = item.sample, item.measurement
     assert isinstance(sample, GpsSample)
     assert isinstance(measurement, GpsPosition)
+    receiver = state.common.receiver.update(sample)
+    if receiver is not state.common.receiver:
+        state = state._replace(common=state.common._replace(receiver=receiver))
     fix = accept_fix(setup, state, sample)
     if isinstance(fix, str):
         return state, (reject(item, fix),)
@@ -217,7 +220,7 @@ def _compare_with_path(
 
 def _shows_motion(setup: Setup, state: Leveling, sample: GpsSample) -> bool:
     """Return whether fixes show, before leveling, that the vehicle moves: by velocity, or by their positions."""
-    stated = read_velocity(sample, setup.settings)
+    stated = None if state.common.receiver.is_unfilled(sample) else read_velocity(sample, setup.settings)
     if stated is not None:
         velocity, R = stated
         return math.hypot(velocity[0], velocity[1]) > 4.0 * math.sqrt(max(R[0, 0], R[1, 1])) + 0.2

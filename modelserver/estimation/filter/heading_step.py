@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -62,6 +63,10 @@ MAX_FIX_AGE: Final = 1.5
 COURSE_SIGMA: Final = 0.05
 """Sigma of the course in N, rad, below which the receiver's course measures the heading of N: about that of a course.
 """
+
+
+MOVING_SPEED: Final = 0.5
+"""Speed of the state, m/s, beyond its uncertainty, that shows that a velocity of 0 is none."""
 
 
 # --- by fixes ------------------------------------------------------------------------------------------------
@@ -155,6 +160,15 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
     assert isinstance(sample, GpsSample)
     if not uses_gnss(state.common.mode) or isinstance(state, Leveling):
         return state, NOTHING
+    receiver = state.common.receiver
+    if receiver.is_unfilled(sample):
+        if not sample.speed > 0.0:
+            if not _moves(propagation.predict(setup, state, item.utime)):
+                return state, NOTHING
+            state = state._replace(common=state.common._replace(receiver=receiver.count_unfilled()))
+            return state, (reject(item, "unfilled"),)
+        sample = replace(sample, velocity=None)
+        item = item._replace(sample=sample)
     if isinstance(state, Aligned):
         return fuse_measurement(setup, state, item)
     if isinstance(accept_fix(setup, state, sample), str):
@@ -170,6 +184,16 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
         nav = heading_alignment.set_speed(nav, speed, setup.settings.velocity_sigma)
     text = f"heading, to {math.degrees(rotation.sigma):.1f} deg, by the receiver's velocity"
     return initialize(setup, state, nav, rotation, newest), (report_reset(item, text),)
+
+
+def _moves(state: Navigating) -> bool:
+    """Return whether fixes or the state's own speed show that the vehicle moves."""
+    nav = state.nav
+    if nav.utime < state.common.moving_until:
+        return True
+    P = nav.covariance
+    least = MOVING_SPEED + 4.0 * math.sqrt(max(P[3, 3], P[4, 4]))
+    return is_speed_known(state) and math.hypot(nav.velocity[0], nav.velocity[1]) > least
 
 
 def _align_by_velocity(setup: Setup, state: Unaligned, sample: GpsSample, utime: int) -> tuple[Rotation, float] | None:

@@ -11,6 +11,7 @@ import math
 from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO
+from modelserver.estimation.sensor_rig import YawGyro
 from modelserver.messages import ImuSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
@@ -86,6 +87,8 @@ class ImuMonitor(NamedTuple):
 def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | str:
     """Return angular rate and specific force along the body axes, rad/s and m/s2; or in one word why not."""
     rate, force = sample.angular_velocity, sample.specific_force
+    if force is None and rate is not None:
+        return "no_force"
     if rate is None or force is None:
         return "nan"
     (a, b, c), (d, e, f) = rate, force
@@ -96,3 +99,11 @@ def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | 
     if not (-MAX_FORCE <= d <= MAX_FORCE and -MAX_FORCE <= e <= MAX_FORCE and -MAX_FORCE <= f <= MAX_FORCE):
         return "range"
     return so3.rotate(mount, rate), so3.rotate(mount, force)
+
+
+def read_turn_rate(sample: ImuSample, gyro: YawGyro) -> float | str:
+    """Return the turn rate to the left by a gyro that measures nothing else, rad/s; or in one word why not."""
+    rate = sample.angular_velocity
+    if rate is None or not math.isfinite(rate[gyro.axis]):
+        return "nan"
+    return rate[gyro.axis] / gyro.share if abs(rate[gyro.axis]) <= MAX_RATE else "range"

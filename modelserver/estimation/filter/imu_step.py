@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import imu_monitor, leveling, propagation
-from modelserver.estimation.filter.eskf import ZERO
+from modelserver.estimation.filter import eskf, imu_monitor, leveling, propagation
+from modelserver.estimation.filter.eskf import ZERO, Innovation
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
     NOTHING,
@@ -27,6 +27,7 @@ from modelserver.estimation.filter.fusion import (
     report_reset,
 )
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
+from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
@@ -46,6 +47,8 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
     assert isinstance(sample, ImuSample)
     if state.common.mode is Mode.NO_IMU:
         return state, NOTHING
+    if setup.yaw_gyro is not None:
+        return _fuse_turn_rate(setup, state, item, imu_monitor.read_turn_rate(sample, setup.yaw_gyro))
     values = imu_monitor.read_imu(sample, setup.mount)
     if isinstance(values, str):
         return state, (reject(item, values),)
@@ -84,6 +87,47 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
     state, more = _fuse_constraints(setup, state, utime)
     return state, decisions + more if more else decisions
+
+
+def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | str) -> Fused:
+    """Return the state of a level vehicle after the turn rate of a gyro that measures nothing else.
+
+    Roll and pitch follow the ground as without an IMU. While wheels are stationary the mean rate is the bias (ZARU).
+    """
+    if isinstance(rate, str):
+        return state, (reject(item, rate),)
+    utime, settings = item.utime, setup.settings
+    measured = (0.0, 0.0, rate)
+    imu = ImuMonitor(utime, measured, changed_utime=utime, used_utime=utime)
+    if isinstance(state, Leveling):
+        return leveling.start_level(setup, state, utime)._replace(imu=imu), NOTHING
+    if propagation.measures_turn_rate(setup, state, utime):
+        mean = (0.0, 0.0, 0.5 * (state.imu.rate[2] + rate))
+        state = state._replace(imu=state.imu._replace(rate=mean))
+    state = propagation.predict(setup, state, utime)
+    nav = state.nav
+    bias_sigma = math.sqrt(nav.covariance[11, 11])
+    detector = state.stationary.update(utime, measured, ZERO, nav.gyro_bias, bias_sigma, settings)
+    lag = nav.lag
+    if lag >= eskf.COVARIANCE_STEP:
+        nav = eskf.propagate_covariance(nav, propagation.select_noise(setup, state, nav), setup.layout)
+        P = nav.covariance.copy()
+        P[11, 11] += settings.gyro_bias_walk**2 * lag
+        if not state.is_stationary:
+            P[6, 6] += settings.wheel_rate_sigma**2 * settings.slip_time * lag
+            P[7, 7] += settings.wheel_rate_sigma**2 * settings.slip_time * lag
+        nav = nav._replace(covariance=P)
+    state = state._replace(nav=nav, imu=imu, stationary=detector)
+    if not (
+        state.is_stationary and detector.sum_time > 1.0 and detector.get_quiet_time(utime) >= settings.recapture_time
+    ):
+        return state, NOTHING
+    state = propagation.propagate_covariance(setup, state)
+    context, mean_rate = create_context(setup, state), detector.mean_stationary_rate
+    whole = constraints.zero_rate(context, mean_rate, state.earth.rotation, detector.sum_time)
+    turn = Innovation(whole.residual[2:], whole.jacobian[2:], whole.noise[2:, 2:])
+    state, decision = fuse_constraint(setup, state, constraints.ZERO_RATE, turn)
+    return state._replace(stationary=detector.restart_mean()), (decision,)
 
 
 def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:

@@ -140,6 +140,8 @@ def create_nav(
 def start_level(setup: Setup, state: Leveling, utime: int) -> Unaligned:
     """Return the state of a vehicle without an IMU, which is taken to be level."""
     nav = create_nav(setup, utime, so3.IDENTITY, LEVEL_SIGMA, 0.5 * setup.settings.maximum_speed, ZERO, 1e-6)
+    if setup.yaw_gyro is not None:
+        nav.covariance[11, 11] = setup.settings.gyro_bias_sigma**2
     return Unaligned(
         nav,
         state.imu,

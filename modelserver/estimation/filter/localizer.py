@@ -196,7 +196,7 @@ class FilterLocalizer(NamedTuple):
         head = self.head
         if item.kind == IMU and isinstance(sample, ImuSample) and not isinstance(head, Leveling):
             values = imu_monitor.read_imu(sample, self.setup.mount)
-            if not isinstance(values, str) and item.utime > head.nav.utime and head.common.mode is not Mode.NO_IMU:
+            if not isinstance(values, str) and item.utime > head.nav.utime and self.setup.uses_imu(head.common.mode):
                 imu = head.imu._replace(used_utime=item.utime)
                 return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, imu)
         return head
@@ -281,6 +281,10 @@ class FilterLocalizer(NamedTuple):
                 text = "no fresh steering angle: the steered wheels are used by the speed of their contact points alone"
                 fix = "start the driver of the vehicle controller, and see that it measures steering_angle"
                 findings += (SensorFinding("wheels", "steering", "sensors.wheels.steering", text, fix),)
+        if head.common.receiver.lacks_velocity:
+            text = "the velocity of its fixes is always 0 while the vehicle moves: nobody fills it, and it is not used"
+            fix = "fill velocity in its driver, or leave it nan where the receiver measures none"
+            findings += (SensorFinding("gps", "unfilled", "sensors.gps", text, fix),)
         if isinstance(head, Unaligned) and head.alignment.is_direction_unknown:
             text = (
                 "the course is known, but not whether the vehicle drives forward or backward: the heading waits until "

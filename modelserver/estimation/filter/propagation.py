@@ -1,7 +1,8 @@
 """Propagation of the state to an instant: by the IMU, by the wheels' turn rate, or at constant velocity.
 
 Between IMU samples, and up to `rate_hold` after the last one, the last sample holds. After that, or without an IMU, the
-speed is constant and the turn rate that of the wheels, if they measure one; the process noise covers what is unknown.
+speed is constant and the turn rate that of a gyro that measures nothing else, or of the wheels, if they measure one;
+the process noise covers what is unknown.
 A stationary vehicle does not turn: what its gyros measure is their bias and the earth rate.
 """
 
@@ -13,6 +14,7 @@ from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.messages import Mode
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
 
@@ -22,6 +24,8 @@ def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise
     if not setup.uses_imu(state.common.mode):
         if state.is_stationary:
             return setup.stationary
+        if measures_turn_rate(setup, state, nav.utime):
+            return setup.turning
         return setup.rolling if state.common.wheels.measures_speed(nav.utime) else setup.coasting
     if (nav.utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
         return setup.coasting
@@ -33,6 +37,13 @@ def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
     if state.is_stationary:
         return setup.stationary
     return setup.interpolated if state.imu.is_interpolated else setup.driving
+
+
+def measures_turn_rate(setup: Setup, state: Navigating, utime: int) -> bool:
+    """Return whether a gyro of the turn rate alone measures it at an instant."""
+    if setup.yaw_gyro is None or state.common.mode is Mode.NO_IMU:
+        return False
+    return (utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold
 
 
 def propagate_imu(
@@ -82,8 +93,12 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
             if until == utime:
                 return nav
             nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)
-    wheels = state.common.wheels
-    turn = wheels.turn_rate if not state.is_stationary and wheels.measures_speed(nav.utime) else 0.0
+    wheels, turn = state.common.wheels, 0.0
+    if not state.is_stationary:
+        if measures_turn_rate(setup, state, nav.utime):
+            turn = state.imu.rate[2] - nav.gyro_bias[2]
+        elif wheels.measures_speed(nav.utime):
+            turn = wheels.turn_rate
     return eskf.propagate_without_imu(nav, utime, (0.0, 0.0, turn), base)
 
 

@@ -26,7 +26,8 @@ class Setup:
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
     layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
     the configured sensors that cannot be used. The process noises: `driving` on the IMU, `stationary`, `coasting`
-    without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone.
+    without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone, `turning`
+    on a gyro of the turn rate alone.
     """
 
     def __init__(self, rig: SensorRig, settings: FilterSettings | None = None, kinds: Iterable[type[Measurement]] = ()):
@@ -52,6 +53,9 @@ class Setup:
         }
         s = settings
         biases = (s.gyro_bias_walk**2, s.accelerometer_bias_walk**2)
+        self.yaw_gyro = rig.yaw_gyro
+        if self.yaw_gyro is not None:
+            biases = (0.0, 0.0)  # imu_step propagates that of its one axis
         gap_acceleration, gap_rate = s.gap_acceleration**2, s.gap_rate_sigma
         self.driving = ProcessNoise(s.gyro_noise**2, s.accelerometer_noise**2, *biases)
         self.stationary = ProcessNoise(
@@ -64,6 +68,7 @@ class Setup:
         self.rolling = ProcessNoise(
             s.wheel_rate_sigma**2 * s.slip_time, gap_acceleration, *biases, gyros_drive_attitude=False
         )
+        self.turning = ProcessNoise(s.gyro_noise**2, gap_acceleration, *biases)
         self.findings = {mode: find_unusable(rig, mode) for mode in Mode}
 
     def uses_imu(self, mode: Mode) -> bool:

@@ -18,6 +18,7 @@ from modelserver.estimation.filter.eskf import ZERO, Earth, NavState
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.receiver_monitor import ReceiverMonitor
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 from modelserver.estimation.origin import OriginCapture
@@ -98,6 +99,7 @@ class Common(NamedTuple):
     previous: the previous sample by source and kind.
     moving_until: until when fixes show that the vehicle moves.
     warm_start: the persisted state of an earlier run, until it is used or rejected.
+    receiver: which fields of its fixes the receiver fills.
     """
 
     mode: Mode = Mode.FULL
@@ -111,10 +113,12 @@ class Common(NamedTuple):
     previous: Mapping[tuple[str, str], PreviousSample] = MappingProxyType({})
     moving_until: int = 0
     warm_start: WarmStart | None = None
+    receiver: ReceiverMonitor = ReceiverMonitor()
 
     def restart(self) -> Common:
         """Return what a restarted filter continues with: origin, mode and good gyro biases, in a new epoch."""
-        return Common(self.mode, self.geodesy, self.capture, self.epoch + 1, self.gyro_biases)
+        common = Common(self.mode, self.geodesy, self.capture, self.epoch + 1, self.gyro_biases)
+        return common._replace(receiver=self.receiver)
 
     def measures_wheel_speed(self, utime: int) -> bool:
         """Return whether the wheels measure the speed of the vehicle at an instant."""

@@ -92,7 +92,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     geometry, of_vehicle = examine_vehicle(config, file, strict)
     more = [*of_vehicle, *find_driver_problems(config, file, geometry.constraints)]
     sensors = config.sensors
-    if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
+    if (sensors.gps, sensors.imu, sensors.wheels, sensors.speedometer) == (None, None, None, None):
         # valid, but rarely intended
         words = "no localization sensor is configured, so there is no pose"
         more.append(Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md"))

@@ -105,7 +105,7 @@ class GpsPosition(_AtAntenna):
 
     def evaluate(self, context: MeasurementContext, sample: GpsSample) -> Innovation | str:
         """Compare east and north."""
-        fix = evaluate_fix(sample, context.settings)
+        fix = evaluate_fix(sample, context.settings, True)
         if isinstance(fix, str):
             return fix
         if context.site is None:
@@ -152,7 +152,7 @@ class GpsHeight(_AtAntenna):
 
     def evaluate(self, context: MeasurementContext, sample: GpsSample) -> Innovation | str:
         """Compare up."""
-        fix = evaluate_fix(sample, context.settings)
+        fix = evaluate_fix(sample, context.settings, True)
         if isinstance(fix, str) or context.site is None or math.isnan(fix.height):
             return ""
         _, _, z = context.nav.point(self.lever)
@@ -207,7 +207,7 @@ class GpsVelocity(_AtAntenna):
 
     def evaluate(self, context: MeasurementContext, sample: GpsSample) -> Innovation | str:
         """Compare east, north and up; for course and speed the first two."""
-        if isinstance(evaluate_fix(sample, context.settings), str):
+        if isinstance(evaluate_fix(sample, context.settings, True), str):
             return ""  # counted by the position
         stated = read_velocity(sample, context.settings)
         if stated is None or context.site is None:

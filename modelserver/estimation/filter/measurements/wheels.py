@@ -47,8 +47,8 @@ from modelserver.estimation.filter.measurements.measurement import (
     register,
 )
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.sensor_rig import SensorRig, SteeringSignal
-from modelserver.messages import Direction, WheelsSample
+from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal, SteeringSignal
+from modelserver.messages import Direction, VehicleStatusSample, WheelSample, WheelsSample
 from modelserver.transforms.so3 import Array, Vector3, cross
 
 SCALE, YAW = "wheel_scale", "wheel_yaw"
@@ -134,6 +134,13 @@ def read_wheels(
     return found
 
 
+def read_speedometer(sample: VehicleStatusSample, signal: SpeedometerSignal) -> WheelsSample:
+    """Return the one speed of a vehicle as that of a wheel at the rolling frame."""
+    direction = Direction.UNSIGNED if signal.is_unsigned else Direction.UNKNOWN
+    wheel = WheelSample(SPEEDOMETER, speed=sample.forward_speed, speed_sigma=signal.sigma, direction=direction)
+    return WheelsSample(sample.header, (wheel,))
+
+
 class SteeredDirection(NamedTuple):
     """The direction of a wheel: its angle (rad), how much of the course's change it follows, and its variance (rad2).
 
@@ -184,8 +191,12 @@ class WheelSpeed:
             known = [wheel for wheel in sample.wheels if wheel.name in self.contacts]
             if not known:
                 return "names" if sample.wheels else "empty"
-            measured = any(math.isfinite(wheel.speed) or math.isfinite(wheel.travel) for wheel in known)
-            return "steering" if self.skid and measured else "nan"
+            if self.skid and read_wheels(sample, context.previous, self.contacts, settings):
+                return "steering"
+            if not any(math.isfinite(wheel.travel) for wheel in known):
+                return "nan"
+            # the first travel has nothing to be compared with
+            return "" if context.previous is None else "gap"
         top = settings.maximum_speed
         if not all(abs(wheel.speed) <= top for wheel in wheels):
             return "range"
