@@ -9,6 +9,7 @@ Sensor timeout: a source is silent after `get_silence_limit` of its usual interv
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 from modelserver import messages
@@ -128,7 +129,7 @@ def _make_report(state: CoreState, now: Instant) -> messages.Health:
         model_revision=state.model.revision,
         state=state.run_state,
         invalid_reasons=invalid,
-        invalid_text=invalid.explain(),
+        invalid_text=_explain(state, invalid, now),
         pose_epoch=0 if estimate is None else estimate.pose_epoch,
         origin_id=0 if estimate is None or estimate.origin is None else estimate.origin.origin_id,
         poses_published=state.poses_published,
@@ -152,6 +153,19 @@ def _make_report(state: CoreState, now: Instant) -> messages.Health:
         cpu_share=state.health_inputs.cpu_share,
         localization=_make_localization_health(state, estimate, now),
     )
+
+
+def _explain(state: CoreState, invalid: messages.Invalid, now: Instant) -> str:
+    """Return why the pose is invalid, in words: with the distance that is left where the vehicle must drive."""
+    text = invalid.explain()
+    if messages.Invalid.NOT_MOVED_YET not in invalid or state.localizer is None:
+        return text
+    distance = state.localizer.summary(now.utime).distance_to_heading
+    if math.isnan(distance):
+        return text
+    if distance < 1.0:
+        return f"{text}; the vehicle has moved, but its fixes do not show the heading yet"
+    return f"{text}; drive about {distance:.0f} m more"
 
 
 def percentile(ordered: Sequence[float], share: float) -> float:

@@ -144,7 +144,8 @@ class SensorFinding(NamedTuple):
 class LocalizerSummary(NamedTuple):
     """Summary of a localizer: `phase` is None in raw mode, `fix_utime` 0 before the first used fix.
 
-    `findings` lists the configured sensors that cannot be used now.
+    `findings` lists the configured sensors that cannot be used now. `distance_to_heading`: how far the vehicle must
+    still drive until its heading can be found from fixes, about, m; nan: it is known, or there are no fixes.
     """
 
     mode: Mode
@@ -152,6 +153,7 @@ class LocalizerSummary(NamedTuple):
     stationary: bool = False
     fix_utime: int = 0
     findings: tuple[SensorFinding, ...] = ()
+    distance_to_heading: float = NAN
 
 
 class Gauges(NamedTuple):

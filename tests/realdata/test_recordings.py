@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +20,10 @@ from benchmarks import accuracy, protocols
 from benchmarks.protocols import FixTable, load_scorer, read_fixes
 from benchmarks.recordings import dresden, husky, kitti, plaza
 from modelserver.config.vehicle_file import load_config
+from modelserver.estimation.filter.stream_correlation import StreamCorrelation
 from modelserver.formats import load_model
-from modelserver.messages import Direction, FixType, GpsSample, ImuSample, WheelsSample
+from modelserver.messages import Direction, FixType, GpsSample, ImuSample, Mode, WheelsSample
+from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 
@@ -102,6 +105,28 @@ def kitti_drive(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Dri
 def dresden_drive(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Drive:
     log = tmp_path_factory.mktemp("dresden") / "log"
     return read(dresden.convert, iter([dresden.file(data_dir)]), data_dir, log)
+
+
+@pytest.mark.parametrize("recording", accuracy.RECORDINGS, ids=lambda each: each.name)
+def test_given_a_healthy_recording_then_no_stream_contradicts_another(
+    recording: accuracy.Recording, data_dir: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    recording.convert(data_dir, log)
+    vehicle = load_vehicle(load_config(recording.vehicle))
+    prepared = vehicle.make_localizer_setup()
+    assert prepared is not None
+    streams, settled = StreamCorrelation(), 0
+    with LogFile(log) as events:
+        for event in events:
+            if event.channel not in ("GPS", "IMU", "WHEELS"):
+                continue
+            sample: Any = decode(f"{event.channel.lower()}_t", event.data)
+            streams = streams.update(prepared.setup, Mode.FULL, sample)
+            assert streams.find_contradictions(has_gyro=True, has_heading=True) == ()
+            if streams.is_settled:
+                streams, settled = StreamCorrelation(), settled + 1
+    assert settled >= 5
 
 
 def test_given_kitti_when_converted_then_every_row_is_there_and_distances_are_the_files(

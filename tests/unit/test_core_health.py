@@ -270,10 +270,11 @@ class Unusable(ScriptedLocalizer):
     """A localizer with findings and decisions that a test sets."""
 
     findings: tuple[SensorFinding, ...] = ()
+    distance: float = math.nan
     verdicts: tuple[Decision, ...] = ()
 
     def summary(self, utime: int) -> LocalizerSummary:
-        return super().summary(utime)._replace(findings=type(self).findings)
+        return super().summary(utime)._replace(findings=type(self).findings, distance_to_heading=type(self).distance)
 
     def process(self, sample: Any) -> tuple[Any, tuple[Any, ...]]:
         taken, notes = super().process(sample)
@@ -284,6 +285,7 @@ class Unusable(ScriptedLocalizer):
 def unusable() -> Iterable[type[Unusable]]:
     yield Unusable
     Unusable.findings = Unusable.verdicts = ()
+    Unusable.distance = math.nan
 
 
 def verdict(source: str, verdict: Verdict, reason: str = "", kind: str = "wheel_speed") -> Decision:
@@ -302,6 +304,22 @@ def test_given_a_sensor_that_cannot_be_used_then_a_report_goes_out_at_once_with_
     unusable.findings = ()
     run.until(2.5)
     assert run.reports[-1][1].warnings == ()
+
+
+def test_given_a_heading_that_is_not_known_then_the_report_states_how_far_to_drive(unusable) -> None:
+    run = Run(unusable(invalid=Invalid.NOT_MOVED_YET, stale_s=10.0))
+    run.until(0.1, [(0.05, imu(START + 40_000))])
+    for begin, distance, words in (
+        (0.5, 8.6, "; drive about 9 m more"),
+        (1.5, 0.2, "fixes do not show the heading yet"),
+    ):
+        unusable.distance = distance
+        run.until(begin + 1.0)
+        assert Invalid.NOT_MOVED_YET.explain() in run.last.invalid_text
+        assert run.last.invalid_text.endswith(words)
+    unusable.distance = math.nan
+    run.until(3.6)
+    assert run.last.invalid_text.endswith(Invalid.NOT_MOVED_YET.explain())
 
 
 def test_given_dropped_measurements_then_the_used_and_all_are_reported(unusable) -> None:

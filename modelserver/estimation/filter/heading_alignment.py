@@ -52,6 +52,9 @@ DIRECTION_FIXES: Final = 12
 DIRECTION_SIGMA: Final = 0.15
 """Sigma of c below which the direction of travel is accepted: c is +1 or -1, thirteen sigmas apart."""
 
+TYPICAL_SECONDS: Final = 10.0
+"""Seconds of driving after which the heading is usually known."""
+
 CUBIC_VARIANCE_RATIO: Final = 40.0
 """Ratio by which a cubic reduces the variance of a random walk over its segment."""
 
@@ -152,6 +155,21 @@ class HeadingAlignment(NamedTuple):
             self.accelerated_path + step * (self.accelerated_velocity + 0.5 * change),
             self.is_direction_unknown,
         )
+
+    def estimate_distance(self, settings: FilterSettings) -> float:
+        """Return how far the vehicle must still drive until the heading is known to `align_sigma`, about, m.
+
+        The sigma of a heading by fixes is that of the change of their error between the ends of the path, over its
+        length. nan before the first fix.
+        """
+        newest = self.last_fix
+        if newest is None:
+            return math.nan
+        seconds = max((newest.utime - self.fixes[0].utime) * 1e-6 if self.fixes else 0.0, TYPICAL_SECONDS)
+        changed = newest.correlated * math.sqrt(2.0 * (1.0 - math.exp(-seconds / settings.gps_correlation_time)))
+        needed = math.hypot(1.5 * newest.white, changed) / settings.align_sigma
+        driven = max((abs(newest.position - each.position) for each in self.fixes), default=0.0)
+        return max(needed - driven, 0.0)
 
 
 # --- fit ----------------------------------------------------------------------------------------------------

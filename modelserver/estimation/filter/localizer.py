@@ -16,6 +16,7 @@ from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Unaligned
 from modelserver.estimation.filter.step import start
+from modelserver.estimation.filter.stream_correlation import StreamCorrelation
 from modelserver.estimation.filter.timeline import Timeline
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.messages import (
@@ -72,6 +73,7 @@ class FilterLocalizer(NamedTuple):
     clocks: the stamps of all sources.
     odom, odoms: Odom now, and in the last two seconds.
     is_origin_reported: whether the origin was configured or reported.
+    streams: finds sensors whose clocks, axes or signs contradict each other.
     """
 
     setup: Setup
@@ -81,6 +83,7 @@ class FilterLocalizer(NamedTuple):
     odom: Odometry = Odometry()
     odoms: tuple[Odometry, ...] = ()
     is_origin_reported: bool = False
+    streams: StreamCorrelation = StreamCorrelation()
 
     @classmethod
     def start(
@@ -134,6 +137,9 @@ class FilterLocalizer(NamedTuple):
         items = split_sample(setup, sample)
         if not items:
             return self, ()
+        streams = self.streams.update(setup, self.mode, sample)
+        if streams is not self.streams:
+            self = self._replace(streams=streams)
         settings = setup.settings
         name, rank = (type(sample).__name__, header.source), _get_rank(sample)
         clocks, verdict = self.clocks.update(name, rank, items[0].utime, header.seq, settings)
@@ -170,7 +176,8 @@ class FilterLocalizer(NamedTuple):
         if not is_origin_reported and geodesy is not None:
             is_origin_reported = True
             events = (*events, PersistOrigin(geodesy.origin))
-        return FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported), events
+        found = FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported, self.streams)
+        return found, events
 
     def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, tuple[LocalizerEvent, ...]]:
         """Return the timeline with the items that are neither too old nor duplicates, and the decisions on the rest."""
@@ -223,7 +230,12 @@ class FilterLocalizer(NamedTuple):
             common = common._replace(gyro_biases=GyroBiases(old.nav.gyro_bias, sigma))
         fresh = Leveling(common)
         return self._replace(
-            timeline=Timeline(fresh), head=fresh, odom=self.odom.stop(utime), odoms=(), clocks=ClockMonitor()
+            timeline=Timeline(fresh),
+            head=fresh,
+            odom=self.odom.stop(utime),
+            odoms=(),
+            clocks=ClockMonitor(),
+            streams=StreamCorrelation(),
         )
 
     def estimate(self, utime: int) -> Estimate:
@@ -260,7 +272,8 @@ class FilterLocalizer(NamedTuple):
         """Return mode and phase, whether the vehicle is stationary, when a fix was last used, and the findings."""
         head = self.head
         used_utime = head.gnss.used_utime if isinstance(head, Aligned) else 0
-        return LocalizerSummary(self.mode, head.phase, head.is_stationary, used_utime, self._find_unusable())
+        distance = head.alignment.estimate_distance(self.setup.settings) if isinstance(head, Unaligned) else math.nan
+        return LocalizerSummary(self.mode, head.phase, head.is_stationary, used_utime, self._find_unusable(), distance)
 
     def _find_unusable(self) -> tuple[SensorFinding, ...]:
         """Return the configured sensors that cannot be used now: by their configuration, or by what they measure."""
@@ -285,6 +298,8 @@ class FilterLocalizer(NamedTuple):
             text = "the velocity of its fixes is always 0 while the vehicle moves: nobody fills it, and it is not used"
             fix = "fill velocity in its driver, or leave it nan where the receiver measures none"
             findings += (SensorFinding("gps", "unfilled", "sensors.gps", text, fix),)
+        has_gyro = (setup.has_imu or setup.yaw_gyro is not None) and self.mode is not Mode.NO_IMU
+        findings += self.streams.find_contradictions(has_gyro=has_gyro, has_heading=isinstance(head, Aligned))
         if isinstance(head, Unaligned) and head.alignment.is_direction_unknown:
             text = (
                 "the course is known, but not whether the vehicle drives forward or backward: the heading waits until "
