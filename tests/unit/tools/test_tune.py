@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,12 @@ from support_recordings import HUSKY, drive, write_log
 from support_tuning import RAPTOR, write_simulated_log
 
 from modelserver.config.vehicle_file import load_config
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, Timing
 from mstools import cli
-from mstools.commands.tune import TUNABLES
-from mstools.tuning.evaluation import mixture_log_density
+from mstools.commands.tune import TUNABLES, choose_parameters
+from mstools.tuning.evaluation import EvaluationJob, evaluate, mixture_log_density
 from mstools.tuning.search import Parameter, Score, search
 
 Run = Callable[..., tuple[int, str, str]]
@@ -75,6 +78,22 @@ def test_given_a_gain_that_costs_accuracy_then_the_step_is_not_taken() -> None:
     begin = {"a": 1.0}
     hill = Hill(begin, {"a": 4.0}, rmse={"a": 0.5})
     assert search(begin, hill.score(begin), [Parameter("a")], hill).settings == {}
+
+
+@pytest.mark.parametrize(
+    ("first", "after", "expected"), [(1.0, 1.9, 4.0), (1.0, 3.0, 1.0), (3.0, 2.9, 4.0), (3.0, 3.1, 1.0)]
+)
+def test_given_a_gain_that_makes_the_filter_overconfident_in_gaps_then_the_step_is_not_taken(
+    first: float, after: float, expected: float
+) -> None:
+    begin = {"a": 1.0}
+    hill = Hill(begin, {"a": 4.0})
+
+    def evaluate(trials: Sequence[Mapping[str, float]]) -> list[Score | None]:
+        return [replace(score, nees=after) for score in hill(trials) if score is not None]
+
+    found = search(begin, replace(hill.score(begin), nees=first), [Parameter("a")], evaluate)
+    assert found.settings.get("a", 1.0) == expected
 
 
 def test_given_bounds_then_the_search_stays_within_and_not_far_from_where_it_began() -> None:
@@ -150,6 +169,34 @@ def test_given_the_same_drive_when_tuned_twice_then_the_same_is_reported(
     assert report["before"] == report["after"]
     assert report["before"]["rmse"] < 2.0
     assert set(report) == {"runs", "withheld", "before", "after", "proposal", "unseen"}
+
+
+@pytest.mark.slow
+def test_given_settings_that_are_overconfident_in_gaps_then_they_lose_by_the_ends_of_the_gaps(tmp_path: Path) -> None:
+    receiver = GpsModel(Timing(3.0), correlated_sigma=1.0, time_constant=20.0, white_sigma=0.1, has_velocity=False)
+    log, config = write_simulated_log(tmp_path, seconds=60.0, gps_model=receiver)
+    overconfident = (("gps_correlation_time", 600.0),)
+    good, bad = (evaluate(EvaluationJob(log, config, "outage", each)) for each in ((), overconfident))
+    assert len(good.nees) == len(bad.nees) == len(good.gaps) == 4
+    assert np.mean(bad.nees) > 1.3 * np.mean(good.nees)
+    # the errors are much the same: the covariance is what makes the difference
+    assert np.mean(bad.gaps) < 1.1 * np.mean(good.gaps)
+    assert bad.likelihood < good.likelihood - 1.0
+    half, half_bad = (evaluate(EvaluationJob(log, config, "half", each)) for each in ((), overconfident))
+    assert half_bad.likelihood > half.likelihood - 0.1
+    assert half.nees == half.gaps == ()
+
+
+def test_given_the_types_of_fixes_then_their_range_error_is_tuned() -> None:
+    vehicle = load_vehicle(load_config(RAPTOR))
+
+    def choose(*types: FixType, quick: bool = False) -> set[str]:
+        fixes = [GpsSample(SensorHeader(1, "gps"), each, 50.0, -111.0) for each in types]
+        return {each.name for each in choose_parameters(vehicle, fixes, quick=quick) if "uere" in each.name}
+
+    assert choose(FixType.FIX_3D, quick=True) == choose(FixType.NONE) == choose(FixType.FIX_2D) == {"uere"}
+    assert choose(FixType.RTK_FIXED, FixType.RTK_FLOAT) == {"uere_rtk_fixed", "uere_rtk_float"}
+    assert choose(FixType.DIFFERENTIAL) == {"uere_differential"}
 
 
 def test_given_no_vehicle_then_usage(tmp_path: Path, run: Run) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
+from modelserver.messages import FixType, GpsSample
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
 from mstools.terminal.progress import show_progress
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A setting that withheld fixes can tune: the sensor it needs, and whether --quick includes it."""
+    """A setting that withheld fixes can tune: the sensor or type of fix it needs, and whether --quick includes it."""
 
     parameter: Parameter
     needs: str = "gps"
@@ -40,6 +41,10 @@ TUNABLES = (
     Tunable(Parameter("gps_white_share", 0.01, 1.0), quick=True),
     Tunable(Parameter("gps_sigma_floor", 0.005, 10.0), quick=True),
     Tunable(Parameter("gps_correlation_time", 5.0, 600.0), quick=True),
+    Tunable(Parameter("uere", 0.1, 20.0), FixType.FIX_3D.name, quick=True),
+    Tunable(Parameter("uere_differential", 0.05, 5.0), FixType.DIFFERENTIAL.name, quick=True),
+    Tunable(Parameter("uere_rtk_float", 0.02, 2.0), FixType.RTK_FLOAT.name, quick=True),
+    Tunable(Parameter("uere_rtk_fixed", 0.005, 0.5), FixType.RTK_FIXED.name, quick=True),
     Tunable(Parameter("accelerometer_noise", 1e-3, 1.0), "imu", quick=True),
     Tunable(Parameter("gyro_noise", 1e-5, 0.05), "imu"),
     Tunable(Parameter("wheel_sigma", 1e-3, 0.5), "wheels", quick=True),
@@ -55,7 +60,7 @@ def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
-    quick: Annotated[bool, option("--quick", "One round over few settings, without GNSS gaps: a first look.")] = False,
+    quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
     rounds: Annotated[int, option("--rounds N", "Rounds over all settings, at most.", min=1, max=5)] = 2,
     processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
     as_json: JsonOption = False,
@@ -64,7 +69,8 @@ def command(
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
 
     Every second fix is withheld, and all fixes in four gaps. A search changes each setting by factors of two while the
-    likelihood of the withheld fixes increases and the accuracy does not decrease. It is deterministic for a log, a
+    likelihood of the withheld fixes increases, the accuracy does not decrease, and the covariance covers the errors at
+    the ends of the gaps. It is deterministic for a log, a
     vehicle file and a version. Nothing is changed: the proposal is part of a vehicle file, to be reviewed and merged.
 
     \b
@@ -86,13 +92,13 @@ def command(
     fixes = tune_runs.read_fixes(log, config)
     if vehicle.config.localization.mode == "raw":
         raise RecordingError(f"{escape(str(config))}: localization.mode is raw, without a filter to tune")
-    chosen = [each.parameter for each in TUNABLES if _has_sensor(vehicle, each.needs) and (each.quick or not quick)]
+    chosen = choose_parameters(vehicle, fixes.samples, quick=quick)
     sigmas = sorted(tune_runs.stated_sigma(each, vehicle) for each in fixes.samples)
     for number, each in enumerate(chosen):
         # a floor below the receiver's sigma has no effect: steps upward start there
         if each.name == "gps_sigma_floor":
             chosen[number] = Parameter(each.name, each.low, each.high, sigmas[len(sigmas) // 2])
-    parts: tuple[Part, ...] = ("half",) if quick else ("half", "outage")
+    parts: tuple[Part, ...] = ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else rounds
@@ -114,6 +120,17 @@ def command(
     else:
         typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
     write_file(output, format_proposal(str(log), result), replace=force)
+
+
+def choose_parameters(vehicle: Vehicle, fixes: Sequence[GpsSample], *, quick: bool) -> list[Parameter]:
+    """Return the parameters that the sensors of a vehicle and its fixes can tune."""
+    # the range error of a plain fix is also that of one with two dimensions or without a type
+    types = {max(each.fix_type, FixType.FIX_3D).name for each in fixes}
+    return [
+        each.parameter
+        for each in TUNABLES
+        if (each.needs in types or _has_sensor(vehicle, each.needs)) and (each.quick or not quick)
+    ]
 
 
 @dataclass
@@ -149,9 +166,12 @@ class Trials:
         good = [each for each in outcomes if each is not None]
         if len(good) < len(self.parts):
             return None
-        gaps = good[-1].gaps
         likelihood = sum(each.likelihood for each in good) / len(good)
-        return Score(likelihood, good[0].rmse, sum(gaps) / len(gaps) if gaps else math.nan)
+        return Score(likelihood, good[0].rmse, _mean(good[-1].gaps), _mean(good[-1].nees))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
 
 
 @dataclass(frozen=True)
@@ -177,6 +197,7 @@ def format_result(log: str, result: TuningResult) -> list[str]:
     rows = [
         ("RMSE at withheld fixes, m", result.first.rmse, found.score.rmse),
         ("mean error at gap ends, m", result.first.gaps, found.score.gaps),
+        ("NEES at gap ends", result.first.nees, found.score.nees),
         ("log-likelihood of a withheld fix", result.first.likelihood, found.score.likelihood),
     ]
     text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
@@ -202,6 +223,7 @@ def as_data(result: TuningResult) -> dict[str, object]:
             "likelihood": to_json(score.likelihood),
             "rmse": to_json(score.rmse),
             "gap_ends": list(outcomes[-1].gaps),
+            "gap_nees": list(outcomes[-1].nees),
             "nis": {each.kind: {"mean": each.mean, "beyond": each.beyond} for each in outcomes[0].consistency},
         }
 
@@ -288,7 +310,9 @@ def _has_sensor(vehicle: Vehicle, needs: str) -> bool:
         return sensors.imu is not None or wheels is not None
     if needs == "skid_steer":
         return wheels is not None and wheels.kinematics == "skid_steer"
-    return getattr(sensors, needs) is not None
+    if needs == "wheels":
+        return wheels is not None or sensors.speedometer is not None
+    return getattr(sensors, needs, None) is not None
 
 
 def _print_step(step: SearchStep) -> None:

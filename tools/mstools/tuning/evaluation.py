@@ -8,9 +8,12 @@ Two runs, each through the daemon's own core, as `modelserver replay` does it:
 
 At the stamp of each withheld fix the antenna's position is predicted from the samples that arrived before. Error: the
 horizontal distance to the fix. Likelihood: log density of the fix's residual y under the innovation covariance
-S = H P H' + R, as a mixture (1 - e) N(y; 0, S) + e N(y; 0, S + sigma_o^2 I) with a share e of outliers, so that a
-single outlier does not dominate the mean. Limits: fixes with time-correlated errors are not independent, so that the
-likelihoods compare settings on one log and are no absolute measure.
+S = H P H' + R. In `half` it is that of a mixture (1 - e) N(y; 0, S) + e N(y; 0, S + sigma_o^2 I) with a share e of
+outliers, so that a single outlier does not dominate the mean. In `outage` it is log N(y; 0, S) at the ends of the gaps,
+the median over the last fixes of each: without an allowance for outliers, which would forgive a covariance that is far
+too small there. NEES: y' S^-1 y over its degrees of freedom, at the ends of the gaps too; its mean is 1 if the
+covariance is right, and above if it is overconfident. Limits: fixes with time-correlated errors are not independent, so
+that the likelihoods compare settings on one log and are no absolute measure.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from statistics import median
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -50,6 +54,9 @@ SKIP_S = 30.0
 GAP_S = 30.0
 GAP_STARTS = (0.2, 0.4, 0.6, 0.8)
 
+END_S = 2.0
+"""Seconds at the end of a gap that its error and consistency are taken over."""
+
 OUTLIER_SHARE = 0.02
 """Share of fixes that are assumed to be outliers."""
 
@@ -66,8 +73,8 @@ Part = Literal["half", "outage"]
 class EvaluationResult:
     """Result of a run. `likelihood` is the mean log density of the withheld fixes, 1/m2; `rmse` in meters.
 
-    `gaps` are the mean errors over the last 2 s of each gap, meters; empty in `half`. `consistency` is that of the
-    measurements that were not withheld.
+    `gaps` are the mean errors over the last END_S of each gap, meters, and `nees` the medians of the NEES there; both
+    are empty in `half`. `consistency` is that of the measurements that were not withheld.
     """
 
     scored: int
@@ -75,7 +82,18 @@ class EvaluationResult:
     likelihood: float
     rmse: float
     gaps: tuple[float, ...] = ()
+    nees: tuple[float, ...] = ()
     consistency: tuple[Consistency, ...] = ()
+
+
+class ScoredFix(NamedTuple):
+    """A withheld fix beside its prediction: error (m; nan: no pose), log density with and without outliers, NEES."""
+
+    sample: GpsSample
+    error: float
+    mixture: float = UNKNOWN_LOG_DENSITY
+    normal: float = UNKNOWN_LOG_DENSITY
+    nees: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,17 +204,20 @@ def evaluate(job: EvaluationJob) -> EvaluationResult:
         events = _drop_withheld(recording, gps_channel(vehicle), {known.numbers[n] for n in withheld})
         replay = OfflineRun(vehicle, events, gps.frame, on_decision=decisions.append)
         scored = [known.samples[n] for n in withheld]
-        rows: list[tuple[GpsSample, float, float]] = []
+        rows: list[ScoredFix] = []
         for sample, row in zip(scored, replay.rows([s.header.utime for s in scored]), strict=True):
             if job.part == "outage" or sample.header.utime >= skip:
-                rows.append((sample, _error(row, sample, replay.localizer), _log_density(replay.localizer, sample)))
-    good = [error for _, error, _ in rows if math.isfinite(error)]
+                rows.append(_score(sample, _error(row, sample, replay.localizer), replay.localizer))
+    good = [each.error for each in rows if math.isfinite(each.error)]
+    ends = _gap_ends(known, rows) if job.part == "outage" else []
+    likelihoods = [median(each.normal for each in end) for end in ends] or [each.mixture for each in rows]
     return EvaluationResult(
         len(rows),
         len(rows) - len(good),
-        sum(density for _, _, density in rows) / len(rows) if rows else math.nan,
+        sum(likelihoods) / len(likelihoods) if likelihoods else math.nan,
         math.sqrt(sum(error * error for error in good) / len(good)) if good else math.inf,
-        _gap_ends(known, rows) if job.part == "outage" else (),
+        tuple(sum(errors) / len(errors) for end in ends if (errors := _finite(each.error for each in end))),
+        tuple(median(found) for end in ends if (found := _finite(each.nees for each in end))),
         tuple(compute_consistency(decisions)),
     )
 
@@ -226,34 +247,43 @@ def _error(row: TrackRow, sample: GpsSample, localizer: Localizer | None) -> flo
     return math.hypot(row.easting - east, row.northing - north)
 
 
-def _log_density(localizer: Localizer | None, sample: GpsSample) -> float:
-    """Return the log density of a withheld fix under the filter's prediction."""
+def _score(sample: GpsSample, error: float, localizer: Localizer | None) -> ScoredFix:
+    """Return a withheld fix with its log densities and NEES under the filter's prediction."""
+    unknown = ScoredFix(sample, error)
     if not isinstance(localizer, ModeLocalizer) or not isinstance(localizer.active, FilterLocalizer):
-        return UNKNOWN_LOG_DENSITY
+        return unknown
     setup, utime = localizer.active.setup, sample.header.utime
     state = localizer.active.defer_estimate(utime).state
     measurement = next((each for each in setup.measurements.get(GpsSample, ()) if isinstance(each, GpsPosition)), None)
     if not isinstance(state, Aligned) or measurement is None:
-        return UNKNOWN_LOG_DENSITY
+        return unknown
     state = propagation.advance(setup, state, utime)
     gnss = state.gnss
     seconds = (utime - gnss.last_fix.utime) * 1e-6 if gnss.last_fix is not None else 0.0
     nav = gnss_monitor.inflate_correlated_error(state.nav, gnss.noise_inflation, seconds, setup.layout, setup.settings)
     innovation = measurement.evaluate(create_context(setup, state._replace(nav=nav)), sample)
     if isinstance(innovation, str):
-        return UNKNOWN_LOG_DENSITY
+        return unknown
     S = eskf.innovation_covariance(nav.covariance, innovation.jacobian, innovation.noise)
-    return mixture_log_density(innovation.residual, S)
+    residual = innovation.residual
+    return ScoredFix(
+        sample,
+        error,
+        mixture_log_density(residual, S),
+        normal_log_density(residual, S),
+        eskf.normalized_innovation_squared(residual, S) / len(residual),
+    )
 
 
 def mixture_log_density(residual: Array, S: Array) -> float:
     """Return the log density of a residual (m) under its covariance S (m, m), with a share of outliers."""
-    right = math.log(1.0 - OUTLIER_SHARE) + _normal_log_density(residual, S)
-    wrong = math.log(OUTLIER_SHARE) + _normal_log_density(residual, S + np.eye(len(S)) * OUTLIER_SIGMA**2)
+    right = math.log(1.0 - OUTLIER_SHARE) + normal_log_density(residual, S)
+    wrong = math.log(OUTLIER_SHARE) + normal_log_density(residual, S + np.eye(len(S)) * OUTLIER_SIGMA**2)
     return float(np.logaddexp(right, wrong))
 
 
-def _normal_log_density(residual: Array, S: Array) -> float:
+def normal_log_density(residual: Array, S: Array) -> float:
+    """Return the log density of a residual (m) under its covariance S (m, m)."""
     sign, size = np.linalg.slogdet(S)
     if sign <= 0.0:
         return -math.inf
@@ -262,13 +292,17 @@ def _normal_log_density(residual: Array, S: Array) -> float:
     )
 
 
-def _gap_ends(known: UsableFixes, rows: Iterable[tuple[GpsSample, float, float]]) -> tuple[float, ...]:
-    """Return the mean error over the last 2 s of each gap; a gap without an estimate at its end is left out."""
-    ends: dict[int, list[float]] = {}
-    for sample, error, _ in rows:
-        gap = known.gap_of(sample)
-        if gap is not None and math.isfinite(error):
+def _gap_ends(known: UsableFixes, rows: Iterable[ScoredFix]) -> list[list[ScoredFix]]:
+    """Return the fixes of the last END_S of each gap that has some."""
+    ends: dict[int, list[ScoredFix]] = {}
+    for each in rows:
+        gap = known.gap_of(each.sample)
+        if gap is not None:
             end = known.begin + round(1e6 * (GAP_STARTS[gap] * known.seconds + known.gap))
-            if sample.header.utime > end - 2_000_000:
-                ends.setdefault(gap, []).append(error)
-    return tuple(sum(errors) / len(errors) for _, errors in sorted(ends.items()))
+            if each.sample.header.utime > end - END_S * 1e6:
+                ends.setdefault(gap, []).append(each)
+    return [ends[gap] for gap in sorted(ends)]
+
+
+def _finite(values: Iterable[float]) -> list[float]:
+    return [value for value in values if math.isfinite(value)]

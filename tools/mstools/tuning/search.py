@@ -1,8 +1,9 @@
 """Coordinate search of `modelserver tune`: each setting is multiplied or divided by 2 while that helps. Pure.
 
 Objective: mean log-likelihood of withheld fixes, with the constraints that neither their RMSE nor the error at the ends
-of gaps gets noticeably worse. A step must gain MIN_GAIN, or it would fit the noise of this log. Settings that change
-nothing are left out after the first round. Deterministic; converges to a local optimum within MAX_FACTOR.
+of gaps gets noticeably worse, and that the filter is not overconfident there (NEES). A step must gain MIN_GAIN, or it
+would fit the noise of this log. Settings that change nothing are left out after the first round. Deterministic;
+converges to a local optimum within MAX_FACTOR.
 """
 
 from __future__ import annotations
@@ -26,17 +27,22 @@ RMSE_SLACK = 1.02
 GAPS_SLACK = 1.05
 """Factors by which a step may worsen the error at withheld fixes, and at the ends of gaps."""
 
+NEES_LIMIT = 2.0
+"""Mean NEES at gap ends beyond which a step may not lead: four gaps with two axes each exceed it with a probability of
+5 % if the covariance is right (chi-square with 8 degrees of freedom)."""
+
 MAX_FACTOR = 8.0
 """Largest ratio of a proposal to the initial setting, and its reciprocal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Score of settings: mean log-likelihood and RMSE at withheld fixes, mean error at gap ends (nan: no gaps)."""
+    """Score of settings: log-likelihood and RMSE at withheld fixes, mean error and NEES at gap ends (nan: none)."""
 
     likelihood: float
     rmse: float
     gaps: float = math.nan
+    nees: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +135,7 @@ def _step(parameter: Parameter, value: float, begin: float, up: bool) -> float |
 
 
 def _best(best: Score, trials: Sequence[float], scores: Sequence[Score | None]) -> tuple[float, Score] | None:
-    """Return the trial with the largest sufficient gain without loss of accuracy; None without one."""
+    """Return the trial with the largest sufficient gain without loss of accuracy or consistency; None without one."""
     good = [
         (trial, score)
         for trial, score in zip(trials, scores, strict=True)
@@ -137,5 +143,6 @@ def _best(best: Score, trials: Sequence[float], scores: Sequence[Score | None]) 
         and score.likelihood > best.likelihood + MIN_GAIN
         and score.rmse <= best.rmse * RMSE_SLACK
         and (math.isnan(best.gaps) or score.gaps <= best.gaps * GAPS_SLACK)
+        and (math.isnan(best.nees) or score.nees <= max(NEES_LIMIT, best.nees))
     ]
     return max(good, key=lambda each: each[1].likelihood, default=None)
