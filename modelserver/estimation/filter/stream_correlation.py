@@ -241,7 +241,8 @@ class StreamCorrelation(NamedTuple):
         if 0.0 <= seconds < STEP:
             return self
         if not 0.0 < seconds < MAX_STEP_TIME:
-            return self._replace(last_wheels=sample, wheels=())
+            # by how much the vehicle has turned meanwhile is not known
+            return self._replace(last_wheels=sample, wheels=(), turns=self.turns if has_gyro else ())
         turn = seconds * estimate_turn_rate(sample, before, setup.wheels, setup.settings)
         angle = self.wheels[-1].angle + turn if self.wheels else turn
         streams = self._replace(last_wheels=sample, wheels=(*_keep(self.wheels, utime), WheelTurn(utime, angle)))

@@ -246,6 +246,21 @@ def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(c
         assert words in out
 
 
+def test_a_speedometer_and_a_turn_rate_alone_are_notes_of_what_they_are_used_for(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    imu = "imu: {channel: IMU, frame: Cart:Mast, yaw_rate_only: true}"
+    code, out, _ = check("--notes", **{"vehicle.yaml": f"{VEHICLE}sensors:\n  {imu}\n  speedometer: {{sigma: 0.2}}\n"})
+    assert code == 0
+    assert "vehicle.yaml:5: note: sensors.imu: yaw rate only: used for the heading" in out
+    assert "vehicle.yaml:6: note: sensors.speedometer: one speed: used for the speed and while stationary" in out
+    code, out, _ = check(**{"vehicle.yaml": f"{VEHICLE}sensors:\n  speedometer: {{sigma: 0.2}}\n"})
+    assert code == 1
+    assert "vehicle.yaml:5: warning: one speed and no IMU" in out
+    code, out, _ = check(**{"vehicle.yaml": f"{VEHICLE}sensors:\n  speedometer: {{}}\n  wheels: {{}}\n"})
+    assert code == 1
+    assert "speedometer is for a vehicle without measured wheels" in out
+
+
 def test_everything_wrong_with_drivers_is_reported_at_once_with_lines(check, tmp_path):
     (tmp_path / "geometry.yaml").write_text(YAML)
     (tmp_path / "cart.dbc").write_text('BO_ 5 Wheels: 8 A\n SG_ Left : 0|16@1+ (1,0) [0|0] "" A\n')
