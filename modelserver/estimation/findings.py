@@ -68,7 +68,7 @@ def _check_wheels(rig: SensorRig, mode: Mode) -> Iterator[SensorFinding]:
             text,
             "write frames: {NAME: BODY:FRAME} with the names that the driver publishes",
         )
-    elif len(rig.wheel_frames) == 1:
+    elif len(rig.wheel_frames) == 1 and mode not in _EXCLUDING_MODES["wheels"]:
         sensor, element = ("wheels", frames) if rig.speedometer is None else ("speedometer", "sensors.speedometer")
         has_gyro = _has_gyro(rig) and mode is not Mode.NO_IMU
         if has_gyro:
