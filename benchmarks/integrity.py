@@ -1,0 +1,739 @@
+"""Integrity of the filter: seconds wrong and valid, per fault, over drives with errors that it does not model.
+
+    python -m benchmarks integrity
+    python -m benchmarks integrity --quick
+    python -m benchmarks integrity --faults spoof_02 --vehicles car --seeds 1 --minutes 30 --events
+
+An error beyond the published bound while the pose is valid is wrong; the pose is looked at five times a second, for the
+present. Faults come as events, with healthy stretches between: "noticed" is from the start of an event to the first
+invalid pose, "healed" to when the pose is valid and right for 5 s again. Drives and sensors: `integrity_drives`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only wait for each other
+
+import numpy as np
+
+from benchmarks.integrity_drives import (
+    ORIGIN,
+    RATE,
+    START,
+    VEHICLES,
+    Array,
+    Mask,
+    Receiver,
+    Scenario,
+    Segment,
+    Window,
+    compute_truth,
+    measure,
+    wander,
+)
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.setup import Setup
+
+LOOK_PERIOD: Final = 0.2
+"""Seconds between two looks at the pose."""
+HEALED_TIME: Final = 5.0
+FIRST_EVENT: Final = (170.0, 220.0)
+"""When the first event begins, seconds: after heading alignment, and after the filter has settled."""
+PARKED: Final = 600.0
+SETTLE: Final = 20.0
+"""How long the vehicle stands before its movement is measured, seconds."""
+
+
+# --- faults -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Required:
+    """What is required of a fault. None: nothing.
+
+    `hour` and `event`: seconds wrong and valid, in an hour and in an event, at most; `healed`: seconds after which the
+    pose is right and valid again, at most; `valid`: share of time valid, at most; `moved` (m) and `turned` (rad): the
+    movement of the pose of a parked vehicle, at most. `text` states it.
+    """
+
+    text: str
+    hour: float | None = None
+    event: float | None = None
+    healed: float | None = None
+    valid: float | None = None
+    moved: float | None = None
+    turned: float | None = None
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: how it changes a drive, what was measured of the filter before, and what is required.
+
+    `session` is the length of a drive, which starts with a new localizer, seconds: None, one drive for the whole time.
+    `quick` is the vehicle and the minutes of a quick run.
+    """
+
+    name: str
+    inject: Callable[[Scenario], None]
+    before: str
+    required: Required
+    session: float | None = None
+    quick: tuple[str, float] = ("rover", 15.0)
+    has_wheels: bool = True
+    has_velocity: bool = False
+    receiver: Receiver = Receiver.STATED
+
+
+def _schedule(
+    s: Scenario, lasting: tuple[float, float], pause: tuple[float, float], first: tuple[float, float] = FIRST_EVENT
+) -> list[Window]:
+    """Set and return the events of a drive: as many as end before it."""
+    begin = float(s.rng.uniform(*first))
+    while True:
+        end = begin + float(s.rng.uniform(*lasting))
+        if end > s.seconds - 15.0:
+            return s.events
+        s.events.append((begin, end))
+        begin = end + float(s.rng.uniform(*pause))
+
+
+def _add_outages(s: Scenario) -> None:
+    """Add an outage of 20 to 60 s about every two minutes."""
+    begin = float(s.rng.uniform(150.0, 220.0))
+    while begin < s.seconds - 80.0:
+        end = begin + float(s.rng.uniform(20.0, 60.0))
+        s.outages.append((begin, end))
+        begin = end + float(s.rng.uniform(50.0, 120.0))
+
+
+def _direction(s: Scenario) -> Array:
+    angle = s.rng.uniform(-math.pi, math.pi)
+    return np.array((math.cos(angle), math.sin(angle)))
+
+
+def _inject_nothing(s: Scenario) -> None:
+    pass
+
+
+def _step_gyro(size: float) -> Callable[[Scenario], None]:
+    def inject(s: Scenario) -> None:
+        bias = 0.0
+        for begin, _ in _schedule(s, (150.0, 150.0), (10.0, 60.0)):
+            sign = float(s.rng.choice([-1.0, 1.0]))
+            if abs(bias + sign * size) > 1.5 * size:
+                sign = -sign
+            bias += sign * size
+            s.gyro_bias[round(begin * RATE) :] = bias
+
+    return inject
+
+
+def _scale_gyro(s: Scenario) -> None:
+    s.gyro_scale = 0.02
+    _add_outages(s)
+
+
+def _spoof(rate: float, moves_velocity: bool) -> Callable[[Scenario], None]:
+    def inject(s: Scenario) -> None:
+        for window in _schedule(s, (300.0, 600.0), (150.0, 240.0)):
+            inside, towards = s.between(window), _direction(s)
+            since = s.t[inside] - window[0]
+            s.fix_offset[inside] = rate * since[:, None] * towards
+            if moves_velocity:
+                s.velocity_offset[inside] = rate * towards
+
+    return inject
+
+
+def _ramp_multipath(s: Scenario) -> None:
+    for window in _schedule(s, (60.0, 150.0), (60.0, 120.0)):
+        size = 3.0 * 10.0 ** float(s.rng.uniform(0.0, 1.0))
+        most = 0.4 * (window[1] - window[0])
+        rise, fall = (min(float(s.rng.uniform(10.0, 60.0)), most) for _ in range(2))
+        s.fix_offset += size * s.ramp(window, rise, fall)[:, None] * _direction(s)
+
+
+def _step_multipath(s: Scenario) -> None:
+    for window in _schedule(s, (60.0, 60.0), (90.0, 150.0)):
+        s.fix_offset[s.between(window)] = float(s.rng.uniform(10.0, 60.0)) * _direction(s)
+
+
+def _stick_encoders(s: Scenario) -> None:
+    for begin, end in _schedule(s, (60.0, 120.0), (90.0, 150.0)):
+        s.stuck.append((begin, end))
+        lost = begin + float(s.rng.uniform(-15.0, 30.0))
+        s.outages.append((lost, lost + float(s.rng.uniform(20.0, 60.0))))
+
+
+def _move_antenna(s: Scenario) -> None:
+    x, y = 0.5 * _direction(s)
+    s.antenna_error = (float(x), float(y), 0.0)
+
+
+def _turn_mount(angle: float, outages: bool = False) -> Callable[[Scenario], None]:
+    def inject(s: Scenario) -> None:
+        s.mount_yaw = math.radians(angle) * float(s.rng.choice([-1.0, 1.0]))
+        if outages:
+            _add_outages(s)
+
+    return inject
+
+
+def _age_fixes(s: Scenario) -> None:
+    s.latency = 0.0
+    s.age = np.clip(0.45 + 0.2 * wander(s.rng, s.size, 40.0), 0.1, 0.8)
+
+
+def _jump_clock(s: Scenario) -> None:
+    for window in _schedule(s, (120.0, 240.0), (60.0, 150.0)):
+        s.stamp_shift[s.between(window)] = 0.2 * float(s.rng.choice([-1.0, 1.0]))
+
+
+def _silence_imu(s: Scenario) -> None:
+    s.silent += _schedule(s, (3.0, 3.0), (30.0, 70.0))
+
+
+def _shake(s: Scenario, window: Window, size: float, period: float) -> None:
+    """Roll and pitch within a window, by `size` radians."""
+    inside = s.ramp(window, 3.0, 3.0)
+    for axis in range(2):
+        phase = s.rng.uniform(-math.pi, math.pi)
+        s.tilt[:, axis] += size * inside * np.sin(math.tau / (period * s.rng.uniform(0.8, 1.3)) * s.t + phase)
+
+
+def _ride_ferry(s: Scenario) -> None:
+    s.is_flat = True
+    margin = s.vehicle.smoothing
+    for window in _schedule(s, (120.0, 300.0), (150.0, 240.0)):
+        s.stops.append((window[0] - margin - 15.0, window[1] + margin + 5.0))
+        moving = s.ramp(window, 20.0, 20.0)
+        s.carried_rate += 0.012 * moving * wander(s.rng, s.size, 60.0)
+        s.carried_velocity += 3.0 * moving[:, None] * _direction(s)
+        _shake(s, window, 0.004, 8.0)
+
+
+def _carry(s: Scenario) -> None:
+    s.is_flat = True
+    margin = s.vehicle.smoothing
+    for window in _schedule(s, (15.0, 40.0), (150.0, 240.0)):
+        s.stops.append((window[0] - margin - 10.0, window[1] + margin + 10.0))
+        lasting = window[1] - window[0]
+        moving = s.ramp(window, 4.0, 4.0)
+        turned = float(s.rng.uniform(-math.pi, math.pi))
+        s.carried_rate += turned / (lasting - 4.0) * moving
+        s.carried_velocity += float(s.rng.uniform(0.4, 1.2)) * moving[:, None] * _direction(s)
+        s.lift += 0.5 * s.ramp(window, 3.0, 3.0)
+        _shake(s, window, 0.03, 3.0)
+
+
+def _start_in_reverse(s: Scenario) -> None:
+    top = s.vehicle.top_speed
+    speed = min(top, float(s.rng.choice([1.0, 2.0, 8.0]) * s.rng.uniform(0.7, 1.2)))
+    curvature = float(s.rng.normal(0.0, 0.05)) / s.vehicle.min_radius * min(1.0, 3.0 / speed)
+    waits = float(s.rng.uniform(3.0, 12.0))
+    s.segments = [
+        Segment(waits, 0.0),
+        Segment(float(s.rng.uniform(25.0, 60.0)), -speed, curvature),
+        Segment(float(s.rng.uniform(4.0, 12.0)), 0.0),
+        Segment(float(s.rng.uniform(15.0, 30.0)), min(2.0 * speed, top)),
+        Segment(8.0, min(2.0 * speed, 0.4 * top), 0.4 / s.vehicle.min_radius),
+        Segment(20.0, min(2.0 * speed, top)),
+    ]
+    s.events.append((waits, s.seconds))
+
+
+def _park(s: Scenario) -> None:
+    begin = s.seconds - PARKED - SETTLE - 5.0
+    s.stops.append((begin - s.vehicle.smoothing, s.seconds + 10.0))
+    s.events.append((begin + SETTLE, begin + SETTLE + PARKED))
+
+
+def _circle(s: Scenario) -> None:
+    radius = s.vehicle.min_radius * float(s.rng.uniform(2.0, 4.0))
+    speed = min(s.vehicle.top_speed, math.sqrt(0.6 * s.vehicle.lateral * radius))
+    s.segments = [
+        Segment(8.0, 0.0),
+        Segment(40.0, 0.5 * s.vehicle.top_speed),
+        Segment(s.seconds, speed, float(s.rng.choice([-1.0, 1.0])) / radius),
+    ]
+    s.latency = float(s.rng.uniform(0.2, 0.4))
+    s.events.append((50.0, s.seconds))
+
+
+ONE_AN_EVENT: Final = Required("<= 1 s an event", event=1.0)
+ONE_AN_HOUR: Final = Required("<= 1 s/h", hour=1.0)
+COVERED: Final = Required("bound covers: <= 1 s/h", hour=1.0)
+STEP: Final = Required("<= 1 s a step, healed in 15 s", event=1.0, healed=15.0)
+DETECTED: Final = Required("bound covers until detected: <= 1 s an event", event=1.0)
+NEVER_VALID: Final = Required("never valid", valid=0.0)
+
+FAULTS: Final = (
+    Fault("none", _inject_nothing, "", Required("0 s", hour=0.0)),
+    Fault("gyro_bias_step_005", _step_gyro(0.005), "302 s/h, longest 181", STEP),
+    Fault("gyro_bias_step_02", _step_gyro(0.02), "302 s/h, longest 181; 115 deg", STEP),
+    Fault("gyro_scale_2pct", _scale_gyro, "184 s/h, longest 44", ONE_AN_HOUR),
+    Fault("spoof_01", _spoof(0.1, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 18.0)),
+    Fault("spoof_02", _spoof(0.2, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 18.0)),
+    Fault("spoof_05", _spoof(0.5, False), "2600 to 3000 s/h, longest 755; 391 m", DETECTED, quick=("car", 18.0)),
+    Fault(
+        "spoof_05_true_velocity",
+        _spoof(0.5, False),
+        "2600 to 3000 s/h, longest 755",
+        DETECTED,
+        quick=("rover", 18.0),
+        has_velocity=True,
+    ),
+    Fault(
+        "spoof_05_false_velocity",
+        _spoof(0.5, True),
+        "2600 to 3000 s/h, longest 755",
+        DETECTED,
+        quick=("rover", 18.0),
+        has_velocity=True,
+    ),
+    Fault("multipath_ramps", _ramp_multipath, "399 s/h, longest 53", ONE_AN_EVENT),
+    Fault("multipath_steps", _step_multipath, "727 s/h, longest 98", ONE_AN_EVENT),
+    Fault("encoders_stuck", _stick_encoders, "663 s/h, longest 72; 157 m", ONE_AN_EVENT, quick=("car", 15.0)),
+    Fault("lever_arm_05", _move_antenna, "936 s/h, longest 71", COVERED, session=1200.0, receiver=Receiver.RTK),
+    Fault("mount_yaw_3", _turn_mount(3.0, outages=True), "158 s/h, longest 17", COVERED, quick=("car", 15.0)),
+    Fault("mount_yaw_90", _turn_mount(90.0), "heading 65 deg wrong", NEVER_VALID, session=450.0),
+    Fault("mount_yaw_180", _turn_mount(180.0), "heading 65 deg wrong", NEVER_VALID, session=450.0),
+    Fault("gps_age", _age_fixes, "34 to 120 s/h, longest 19", ONE_AN_HOUR, quick=("car", 15.0)),
+    Fault("host_clock", _jump_clock, "43 s/h, longest 9", ONE_AN_EVENT, quick=("car", 15.0)),
+    Fault("imu_silent_3s", _silence_imu, "16 s/h, longest 6", Required("0 s", hour=0.0)),
+    Fault("ferry", _ride_ferry, "1166 to 1935 s/h, longest 574; 149 deg", ONE_AN_EVENT, has_wheels=False),
+    Fault("carried", _carry, "1166 to 1935 s/h, longest 574; 149 deg", ONE_AN_EVENT, has_wheels=False),
+    Fault(
+        "reverse_start",
+        _start_in_reverse,
+        "860 s/h, longest 104; 180 deg",
+        Required("not valid until known: <= 1 s a start", event=1.0),
+        session=150.0,
+        quick=("car", 15.0),
+        has_wheels=False,
+    ),
+    Fault(
+        "stationary_3d",
+        _park,
+        "moves 5.5 m in 10 min, valid",
+        Required("< 0.3 m, < 1 deg in 10 min", hour=1.0, moved=0.3, turned=math.radians(1.0)),
+        session=900.0,
+        receiver=Receiver.UNSTATED,
+    ),
+    Fault("steady_circle", _circle, "132 s/h, longest 9", COVERED, session=450.0, quick=("car", 15.0)),
+)
+BY_NAME: Final = {fault.name: fault for fault in FAULTS}
+
+
+# --- one drive ----------------------------------------------------------------------------------------------
+
+
+class Task(NamedTuple):
+    """A vehicle with a fault for a time, by the seed."""
+
+    fault: str
+    vehicle: str
+    seed: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Breach:
+    """A time wrong and valid: `what` is horizontal (m) or heading (rad); `error` and `bound` are at the worst ratio.
+
+    `begin` and `seconds` in its session; `since_fault`: from the start of the last event, nan before the first.
+    """
+
+    fault: str
+    vehicle: str
+    seed: int
+    session: int
+    what: str
+    begin: float
+    seconds: float
+    error: float
+    bound: float
+    since_fault: float
+
+
+@dataclass(frozen=True)
+class EventResult:
+    """An event of a fault: seconds wrong and valid, and when noticed and healed; nan: not."""
+
+    begin: float
+    wrong: float
+    noticed: float
+    healed: float
+
+
+@dataclass
+class Result:
+    """Result of a task. `ratio`: worst error over bound while valid; `moved` (m) and `turned` (rad) while parked."""
+
+    task: Task
+    seconds: float = 0.0
+    valid: float = 0.0
+    wrong: float = 0.0
+    ratio: dict[str, float] = field(default_factory=lambda: {"horizontal": 0.0, "heading": 0.0})
+    median_bound: list[float] = field(default_factory=list)
+    breaches: list[Breach] = field(default_factory=list)
+    events: list[EventResult] = field(default_factory=list)
+    moved: float = 0.0
+    turned: float = 0.0
+    cpu: float = 0.0
+
+
+class Looks(NamedTuple):
+    """The pose at each look: seconds, validity, errors and bounds (m, rad), and the estimated x, y, yaw."""
+
+    t: Array
+    valid: Mask
+    errors: dict[str, Array]
+    bounds: dict[str, Array]
+    pose: Array
+
+
+def run_task(task: Task) -> Result:
+    """Run the sessions of a task."""
+    fault, vehicle = BY_NAME[task.fault], VEHICLES[task.vehicle]
+    result = Result(task)
+    started = time.process_time()
+    length = fault.session or task.seconds
+    names = list(BY_NAME)
+    for session in range(max(round(task.seconds / length), 1)):
+        seed = (task.seed, names.index(task.fault), list(VEHICLES).index(task.vehicle), session)
+        scenario = Scenario(
+            vehicle,
+            min(length, task.seconds) if fault.name != "stationary_3d" else length,
+            np.random.default_rng(seed),
+            has_wheels=fault.has_wheels,
+            has_velocity=fault.has_velocity,
+            receiver=fault.receiver,
+        )
+        fault.inject(scenario)
+        _evaluate(result, session, scenario, observe(scenario))
+    result.cpu = time.process_time() - started
+    return result
+
+
+def observe(scenario: Scenario) -> Looks:
+    """Drive a scenario through the filter, and look at the pose."""
+    truth = compute_truth(scenario)
+    setup = Setup(scenario.vehicle.build_rig(scenario.has_wheels))
+    localizer = FilterLocalizer.start(setup, ORIGIN)
+    rows = []
+    look, n = LOOK_PERIOD, scenario.seconds - 0.5
+    for arrival, sample in measure(scenario, truth):
+        while look <= arrival and look < n:
+            estimate = localizer.estimate(START + round(look * 1e6))
+            if estimate.enu is None:
+                rows.append((look, 0.0, math.nan, math.nan, math.nan, math.nan, math.nan))
+            else:
+                x, y, _ = estimate.enu.xyz
+                yaw = estimate.enu.rpy[2]
+                bounds = (estimate.horizontal_protection_level, estimate.heading_protection_level)
+                rows.append((look, float(not estimate.invalid), x, y, yaw, *bounds))
+            look = round(look + LOOK_PERIOD, 6)
+        localizer, _ = localizer.process(sample)
+    table = np.array(rows)
+    at = np.round(table[:, 0] * RATE).astype(int)
+    apart = table[:, 2:4] - truth.position[at, :2]
+    turned = np.remainder(table[:, 4] - truth.yaw[at] + math.pi, math.tau) - math.pi
+    return Looks(
+        table[:, 0],
+        table[:, 1] > 0.5,
+        {"horizontal": np.hypot(*apart.T), "heading": np.abs(turned)},
+        {"horizontal": table[:, 5], "heading": table[:, 6]},
+        table[:, 2:5],
+    )
+
+
+def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) -> None:
+    """Add a session to a result."""
+    task = result.task
+    result.seconds += len(looks.t) * LOOK_PERIOD
+    result.valid += float(looks.valid.sum()) * LOOK_PERIOD
+    starts = np.array([begin for begin, _ in scenario.events])
+    wrong_any = np.zeros(len(looks.t), bool)
+    for what, error in looks.errors.items():
+        bound = looks.bounds[what]
+        wrong = looks.valid & ~(error <= bound)
+        wrong_any |= wrong
+        ratio = np.where(looks.valid, error / bound, 0.0)
+        result.ratio[what] = max(result.ratio[what], float(ratio.max()))
+        for first, last in _find_runs(wrong):
+            worst = first + int(np.argmax(ratio[first:last]))
+            began = starts[starts <= looks.t[first]]
+            since = float(looks.t[first] - began[-1]) if len(began) else math.nan
+            result.breaches.append(
+                Breach(
+                    task.fault,
+                    task.vehicle,
+                    task.seed,
+                    session,
+                    what,
+                    float(looks.t[first]),
+                    (last - first) * LOOK_PERIOD,
+                    float(error[worst]),
+                    float(bound[worst]),
+                    since,
+                )
+            )
+    result.wrong += float(wrong_any.sum()) * LOOK_PERIOD
+    if looks.valid.any():
+        result.median_bound.append(float(np.median(looks.bounds["horizontal"][looks.valid])))
+    for k, begin in enumerate(starts.tolist()):
+        end = starts[k + 1] if k + 1 < len(starts) else looks.t[-1] + 1.0
+        result.events.append(_evaluate_event(looks, wrong_any, begin, end))
+    if scenario.receiver is Receiver.UNSTATED:
+        _measure_movement(result, scenario, looks)
+
+
+def _find_runs(mask: Mask) -> list[tuple[int, int]]:
+    """Return first and past-the-last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(int), [0]))))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _evaluate_event(looks: Looks, wrong: Mask, begin: float, end: float) -> EventResult:
+    inside = (looks.t >= begin) & (looks.t < end)
+    good = looks.valid & ~wrong
+    noticed = looks.t[inside & ~looks.valid]
+    bad = np.flatnonzero(inside & ~good)
+    healed = math.nan
+    if len(bad):
+        count = round(HEALED_TIME / LOOK_PERIOD)
+        for first, last in _find_runs(good):
+            if first > bad[0] and last - first >= count and looks.t[first] < end:
+                healed = float(looks.t[first] - begin)
+                break
+    else:
+        healed = 0.0
+    return EventResult(
+        begin,
+        float((wrong & inside).sum()) * LOOK_PERIOD,
+        float(noticed[0] - begin) if len(noticed) else math.nan,
+        healed,
+    )
+
+
+def _measure_movement(result: Result, scenario: Scenario, looks: Looks) -> None:
+    """Measure how far the valid pose of a parked vehicle moves."""
+    for begin, end in scenario.events:
+        pose = looks.pose[(looks.t >= begin) & (looks.t < end) & looks.valid]
+        if len(pose):
+            away = pose - pose[0]
+            result.moved = max(result.moved, float(np.hypot(away[:, 0], away[:, 1]).max()))
+            turned = np.remainder(away[:, 2] + math.pi, math.tau) - math.pi
+            result.turned = max(result.turned, float(np.abs(turned).max()))
+
+
+# --- report -------------------------------------------------------------------------------------------------
+
+
+class Summary(NamedTuple):
+    """The figures of a fault over its tasks."""
+
+    fault: str
+    hours: float
+    wrong_per_hour: float
+    longest: float
+    worst_event: float
+    num_wrong_events: int
+    num_events: int
+    ratio_horizontal: float
+    ratio_heading: float
+    worst_error: float
+    worst_heading_deg: float
+    valid: float
+    bound: float
+    noticed: float
+    healed: float
+    healed_worst: float
+    moved: float
+    turned_deg: float
+    holds: bool
+
+
+def summarize(fault: Fault, results: list[Result]) -> Summary:
+    """Return the figures of a fault."""
+    hours = sum(each.seconds for each in results) / 3600.0
+    events = [event for each in results for event in each.events]
+    breaches = [breach for each in results for breach in each.breaches]
+    noticed = [event.noticed for event in events if not math.isnan(event.noticed)]
+    healed = [event.healed for event in events if event.healed != 0.0]
+    wrong = sum(each.wrong for each in results) / hours
+    worst_event = max((event.wrong for event in events), default=0.0)
+    valid = sum(each.valid for each in results) / (hours * 3600.0)
+    moved, turned = max(each.moved for each in results), max(each.turned for each in results)
+    # an event that ends before it heals is no shorter than the worst
+    healed_worst = max((math.inf if math.isnan(x) else x for x in healed), default=0.0)
+    r = fault.required
+    holds = all(
+        limit is None or value <= limit
+        for value, limit in (
+            (wrong, r.hour),
+            (worst_event, r.event),
+            (healed_worst, r.healed),
+            (valid, r.valid),
+            (moved, r.moved),
+            (turned, r.turned),
+        )
+    )
+    bounds = [bound for each in results for bound in each.median_bound]
+    return Summary(
+        fault.name,
+        hours,
+        wrong,
+        max((breach.seconds for breach in breaches), default=0.0),
+        worst_event,
+        sum(event.wrong > 0.0 for event in events),
+        len(events),
+        max(each.ratio["horizontal"] for each in results),
+        max(each.ratio["heading"] for each in results),
+        max((breach.error for breach in breaches if breach.what == "horizontal"), default=0.0),
+        math.degrees(max((breach.error for breach in breaches if breach.what == "heading"), default=0.0)),
+        valid,
+        float(np.median(bounds)) if bounds else math.nan,
+        float(np.median(noticed)) if noticed else math.nan,
+        float(np.median([x for x in healed if not math.isnan(x)] or [math.nan])),
+        healed_worst,
+        moved,
+        math.degrees(turned),
+        holds,
+    )
+
+
+HEADER: Final = (
+    f"  {'fault':24}{'hours':>6}{'s/h':>8}{'longest':>8}{'event':>8}{'of events':>10}"
+    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'noticed':>8}{'healed':>7}{'worst':>7}"
+    "  before -> required"
+)
+LEGEND: Final = (
+    "  s/h: seconds wrong and valid per hour. longest: interval, event: sum of the worst event, of events: with any.\n"
+    "  x: worst error / bound while valid, horizontal and heading. m, deg: worst error while wrong. bound: median, m.\n"
+    "  noticed: median seconds to the first invalid pose. healed, worst: median and longest until right and valid."
+)
+
+
+def format_summary(summary: Summary) -> str:
+    """Return the row of a fault."""
+    fault = BY_NAME[summary.fault]
+    events = f"{summary.num_wrong_events}/{summary.num_events}" if summary.num_events else "-"
+
+    def number(value: float, digits: int = 1) -> str:
+        return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+    row = (
+        f"  {fault.name:24}{summary.hours:6.2f}{summary.wrong_per_hour:8.1f}{summary.longest:8.1f}"
+        f"{summary.worst_event:8.1f}{events:>10}{summary.ratio_horizontal:7.2f}{summary.ratio_heading:7.2f}"
+        f"{summary.worst_error:7.1f}{summary.worst_heading_deg:6.1f}{summary.valid:7.1%}{number(summary.bound):>7}"
+        f"{number(summary.noticed):>8}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
+        f"  {fault.before or '-'} -> {fault.required.text}"
+    )
+    if fault.required.moved is not None:
+        row += f"; moved {summary.moved:.2f} m, {summary.turned_deg:.2f} deg"
+    return row + ("" if summary.holds else "  <-- OUT OF BOUNDS")
+
+
+def format_breach(breach: Breach) -> str:
+    """Return the line of a time wrong and valid."""
+    is_heading = breach.what == "heading"
+    factor, unit = (180.0 / math.pi, "deg") if is_heading else (1.0, "m")
+    since = (
+        "before the fault" if math.isnan(breach.since_fault) else f"{breach.since_fault:.1f} s after the fault began"
+    )
+    return (
+        f"    {breach.vehicle} seed {breach.seed} session {breach.session} at {breach.begin:.1f} s for "
+        f"{breach.seconds:.1f} s: {breach.what} {breach.error * factor:.2f} {unit}, bound "
+        f"{breach.bound * factor:.2f} {unit}, {since}"
+    )
+
+
+def plan_tasks(options: argparse.Namespace) -> list[Task]:
+    """Return the tasks of the options, by fault."""
+    tasks = []
+    for fault in FAULTS:
+        if options.faults and fault.name not in options.faults:
+            continue
+        vehicle, minutes = fault.quick
+        vehicles = options.vehicles or ([vehicle] if options.quick else list(VEHICLES))
+        minutes = options.minutes or (minutes if options.quick else 60.0)
+        seeds = options.seeds or (1 if options.quick else 5)
+        tasks += [
+            Task(fault.name, each, seed, minutes * 60.0)
+            for each in vehicles
+            for seed in range(options.first, options.first + seeds)
+        ]
+    return tasks
+
+
+def run(tasks: Iterable[Task], jobs: int, events: bool) -> tuple[list[Summary], list[Result]]:
+    """Run the tasks, and print each fault when its last one is done."""
+    tasks = list(tasks)
+    print(HEADER, flush=True)
+    summaries, finished = [], []
+    grouped: dict[str, list[Result]] = {}
+    with ProcessPoolExecutor(jobs) as pool:
+        for result in pool.map(run_task, tasks):
+            fault = result.task.fault
+            grouped.setdefault(fault, []).append(result)
+            finished.append(result)
+            if len(grouped[fault]) == sum(task.fault == fault for task in tasks):
+                summaries.append(summarize(BY_NAME[fault], grouped[fault]))
+                print(format_summary(summaries[-1]), flush=True)
+                if events:
+                    for each in grouped[fault]:
+                        for breach in sorted(each.breaches, key=lambda breach: (breach.session, breach.begin)):
+                            print(format_breach(breach), flush=True)
+    return summaries, finished
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks integrity", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("--faults", nargs="+", choices=list(BY_NAME), metavar="NAME", help="only these")
+    parser.add_argument("--vehicles", nargs="+", choices=list(VEHICLES), metavar="NAME", help="only these")
+    parser.add_argument("--seeds", type=int, help="drives of each vehicle with each fault; default 5")
+    parser.add_argument("--first", type=int, default=1, help="the first seed")
+    parser.add_argument("--minutes", type=float, help="of each drive; default 60")
+    parser.add_argument("--jobs", type=int, default=min(os.cpu_count() or 1, 2))
+    parser.add_argument("--quick", action="store_true", help="one vehicle, one seed, 15 to 18 minutes of each fault")
+    parser.add_argument("--list", action="store_true", help="list faults and vehicles")
+    parser.add_argument("--events", action="store_true", help="print each time wrong and valid")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures, events and times here")
+    options = parser.parse_args(arguments or [])
+    if options.list:
+        for fault in FAULTS:
+            print(f"{fault.name:24} before: {fault.before or '-'}; required: {fault.required.text}")
+        print(f"vehicles: {', '.join(VEHICLES)}")
+        return 0
+    started = time.monotonic()
+    summaries, results = run(plan_tasks(options), options.jobs, options.events)
+    print(LEGEND)
+    simulated, spent = sum(each.seconds for each in results), sum(each.cpu for each in results)
+    print(f"  {simulated / 3600.0:.1f} h in {time.monotonic() - started:.0f} s, {simulated / spent:.0f} x per core")
+    if options.json:
+        data = {
+            "faults": [summary._asdict() for summary in summaries],
+            "tasks": [dataclasses.asdict(result) for result in results],
+        }
+        options.json.write_text(json.dumps(data, indent=1), encoding="utf-8")
+    return 0 if all(summary.holds for summary in summaries) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
