@@ -5,8 +5,9 @@
     python -m benchmarks integrity --faults spoof_02 --vehicles car --seeds 1 --minutes 30 --events
 
 An error beyond the published bound while the pose is valid is wrong; the pose is looked at five times a second, for the
-present. Faults come as events, with healthy stretches between: "noticed" is from the start of an event to the first
-invalid pose, "healed" to when the pose is valid and right for 5 s again. Drives and sensors: `integrity_drives`.
+present. Faults come as events, with healthy stretches between. "Detected" is from the start of an event to the first
+invalid pose; "healed" from the first pose that is wrong or invalid to the first of 5 s of right and valid ones. Drives
+and sensors: `integrity_drives`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import math
 import os
 import sys
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -45,10 +47,14 @@ from benchmarks.integrity_drives import (
 )
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
+from modelserver.messages import Invalid
 
 LOOK_PERIOD: Final = 0.2
 """Seconds between two looks at the pose."""
 HEALED_TIME: Final = 5.0
+MERGED_GAP: Final = 2.0
+"""Seconds right between two times wrong that are shown as one."""
+FINDINGS_PERIOD: Final = 10.0
 FIRST_EVENT: Final = (170.0, 220.0)
 """When the first event begins, seconds: after heading alignment, and after the filter has settled."""
 PARKED: Final = 600.0
@@ -82,7 +88,8 @@ class Fault:
     """A fault: how it changes a drive, what was measured of the filter before, and what is required.
 
     `session` is the length of a drive, which starts with a new localizer, seconds: None, one drive for the whole time.
-    `quick` is the vehicle and the minutes of a quick run.
+    `quick` is the vehicle and the minutes of a quick run. `has_velocity`: whether fixes have one; None, in every other
+    drive.
     """
 
     name: str
@@ -92,7 +99,7 @@ class Fault:
     session: float | None = None
     quick: tuple[str, float] = ("rover", 15.0)
     has_wheels: bool = True
-    has_velocity: bool = False
+    has_velocity: bool | None = False
     receiver: Receiver = Receiver.STATED
 
 
@@ -219,21 +226,21 @@ def _ride_ferry(s: Scenario) -> None:
     for window in _schedule(s, (120.0, 300.0), (150.0, 240.0)):
         s.stops.append((window[0] - margin - 15.0, window[1] + margin + 5.0))
         moving = s.ramp(window, 20.0, 20.0)
-        s.carried_rate += 0.012 * moving * wander(s.rng, s.size, 60.0)
-        s.carried_velocity += 3.0 * moving[:, None] * _direction(s)
+        s.platform_rate += 0.012 * moving * wander(s.rng, s.size, 60.0)
+        s.platform_velocity += 3.0 * moving[:, None] * _direction(s)
         _shake(s, window, 0.004, 8.0)
 
 
-def _carry(s: Scenario) -> None:
+def _lift(s: Scenario) -> None:
     s.is_flat = True
     margin = s.vehicle.smoothing
-    for window in _schedule(s, (15.0, 40.0), (150.0, 240.0)):
+    for window in _schedule(s, (15.0, 60.0), (150.0, 240.0)):
         s.stops.append((window[0] - margin - 10.0, window[1] + margin + 10.0))
         lasting = window[1] - window[0]
         moving = s.ramp(window, 4.0, 4.0)
         turned = float(s.rng.uniform(-math.pi, math.pi))
-        s.carried_rate += turned / (lasting - 4.0) * moving
-        s.carried_velocity += float(s.rng.uniform(0.4, 1.2)) * moving[:, None] * _direction(s)
+        s.platform_rate += turned / (lasting - 4.0) * moving
+        s.platform_velocity += float(s.rng.uniform(0.4, 1.5)) * moving[:, None] * _direction(s)
         s.lift += 0.5 * s.ramp(window, 3.0, 3.0)
         _shake(s, window, 0.03, 3.0)
 
@@ -258,6 +265,7 @@ def _park(s: Scenario) -> None:
     begin = s.seconds - PARKED - SETTLE - 5.0
     s.stops.append((begin - s.vehicle.smoothing, s.seconds + 10.0))
     s.events.append((begin + SETTLE, begin + SETTLE + PARKED))
+    s.idling = float(s.rng.choice([0.02, 0.2, 0.4]))
 
 
 def _circle(s: Scenario) -> None:
@@ -310,11 +318,11 @@ FAULTS: Final = (
     Fault("mount_yaw_3", _turn_mount(3.0, outages=True), "158 s/h, longest 17", COVERED, quick=("car", 15.0)),
     Fault("mount_yaw_90", _turn_mount(90.0), "heading 65 deg wrong", NEVER_VALID, session=450.0),
     Fault("mount_yaw_180", _turn_mount(180.0), "heading 65 deg wrong", NEVER_VALID, session=450.0),
-    Fault("gps_age", _age_fixes, "34 to 120 s/h, longest 19", ONE_AN_HOUR, quick=("car", 15.0)),
-    Fault("host_clock", _jump_clock, "43 s/h, longest 9", ONE_AN_EVENT, quick=("car", 15.0)),
+    Fault("gps_age", _age_fixes, "34 to 120 s/h, longest 19", ONE_AN_HOUR, quick=("car", 15.0), has_velocity=None),
+    Fault("host_clock", _jump_clock, "43 s/h, longest 9", ONE_AN_EVENT, quick=("car", 15.0), has_velocity=None),
     Fault("imu_silent_3s", _silence_imu, "16 s/h, longest 6", Required("0 s", hour=0.0)),
     Fault("ferry", _ride_ferry, "1166 to 1935 s/h, longest 574; 149 deg", ONE_AN_EVENT, has_wheels=False),
-    Fault("carried", _carry, "1166 to 1935 s/h, longest 574; 149 deg", ONE_AN_EVENT, has_wheels=False),
+    Fault("lifted", _lift, "1166 to 1935 s/h, longest 574; 149 deg", ONE_AN_EVENT, has_wheels=False),
     Fault(
         "reverse_start",
         _start_in_reverse,
@@ -332,7 +340,9 @@ FAULTS: Final = (
         session=900.0,
         receiver=Receiver.UNSTATED,
     ),
-    Fault("steady_circle", _circle, "132 s/h, longest 9", COVERED, session=450.0, quick=("car", 15.0)),
+    Fault(
+        "steady_circle", _circle, "132 s/h, longest 9", COVERED, session=450.0, quick=("car", 15.0), has_velocity=None
+    ),
 )
 BY_NAME: Final = {fault.name: fault for fault in FAULTS}
 
@@ -353,7 +363,7 @@ class Task(NamedTuple):
 class Breach:
     """A time wrong and valid: `what` is horizontal (m) or heading (rad); `error` and `bound` are at the worst ratio.
 
-    `begin` and `seconds` in its session; `since_fault`: from the start of the last event, nan before the first.
+    `begin` in its session, `seconds` wrong; `since_fault`: from the start of the last event, nan before the first.
     """
 
     fault: str
@@ -370,17 +380,22 @@ class Breach:
 
 @dataclass(frozen=True)
 class EventResult:
-    """An event of a fault: seconds wrong and valid, and when noticed and healed; nan: not."""
+    """An event of a fault: seconds wrong and valid, and when detected and healed; nan: not."""
 
+    session: int
     begin: float
     wrong: float
-    noticed: float
+    detected: float
     healed: float
 
 
 @dataclass
 class Result:
-    """Result of a task. `ratio`: worst error over bound while valid; `moved` (m) and `turned` (rad) while parked."""
+    """Result of a task. `ratio`: worst error over bound while valid; `moved` (m) and `turned` (rad) while parked.
+
+    `reasons` has the seconds that the pose was not valid, by reason, `findings` how often each finding was seen, and
+    `epochs` the number of new epochs.
+    """
 
     task: Task
     seconds: float = 0.0
@@ -390,19 +405,25 @@ class Result:
     median_bound: list[float] = field(default_factory=list)
     breaches: list[Breach] = field(default_factory=list)
     events: list[EventResult] = field(default_factory=list)
+    reasons: dict[str, float] = field(default_factory=dict)
+    findings: Counter[str] = field(default_factory=Counter)
+    epochs: int = 0
     moved: float = 0.0
     turned: float = 0.0
     cpu: float = 0.0
 
 
 class Looks(NamedTuple):
-    """The pose at each look: seconds, validity, errors and bounds (m, rad), and the estimated x, y, yaw."""
+    """The pose at each look: seconds, validity, errors and bounds (m, rad), the estimated x, y, yaw, the reasons."""
 
     t: Array
     valid: Mask
     errors: dict[str, Array]
     bounds: dict[str, Array]
     pose: Array
+    reasons: list[Invalid]
+    findings: list[str]
+    epochs: int
 
 
 def run_task(task: Task) -> Result:
@@ -419,7 +440,7 @@ def run_task(task: Task) -> Result:
             min(length, task.seconds) if fault.name != "stationary_3d" else length,
             np.random.default_rng(seed),
             has_wheels=fault.has_wheels,
-            has_velocity=fault.has_velocity,
+            has_velocity=(task.seed + session) % 2 == 0 if fault.has_velocity is None else fault.has_velocity,
             receiver=fault.receiver,
         )
         fault.inject(scenario)
@@ -433,11 +454,19 @@ def observe(scenario: Scenario) -> Looks:
     truth = compute_truth(scenario)
     setup = Setup(scenario.vehicle.build_rig(scenario.has_wheels))
     localizer = FilterLocalizer.start(setup, ORIGIN)
-    rows = []
+    rows: list[tuple[float, ...]] = []
+    reasons: list[Invalid] = []
+    findings: list[str] = []
+    epochs: set[int] = set()
     look, n = LOOK_PERIOD, scenario.seconds - 0.5
     for arrival, sample in measure(scenario, truth):
         while look <= arrival and look < n:
-            estimate = localizer.estimate(START + round(look * 1e6))
+            utime = START + round(look * 1e6)
+            estimate = localizer.estimate(utime)
+            reasons.append(estimate.invalid)
+            epochs.add(estimate.pose_epoch)
+            if math.fmod(look, FINDINGS_PERIOD) < LOOK_PERIOD:
+                findings += [f"{each.sensor}:{each.reason}" for each in localizer.summary(utime).findings]
             if estimate.enu is None:
                 rows.append((look, 0.0, math.nan, math.nan, math.nan, math.nan, math.nan))
             else:
@@ -457,6 +486,9 @@ def observe(scenario: Scenario) -> Looks:
         {"horizontal": np.hypot(*apart.T), "heading": np.abs(turned)},
         {"horizontal": table[:, 5], "heading": table[:, 6]},
         table[:, 2:5],
+        reasons,
+        findings,
+        len(epochs) - 1,
     )
 
 
@@ -465,6 +497,10 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
     task = result.task
     result.seconds += len(looks.t) * LOOK_PERIOD
     result.valid += float(looks.valid.sum()) * LOOK_PERIOD
+    for reason, count in Counter(str(flag.name) for reasons in looks.reasons for flag in reasons).items():
+        result.reasons[reason] = result.reasons.get(reason, 0.0) + count * LOOK_PERIOD
+    result.findings.update(looks.findings)
+    result.epochs += looks.epochs
     starts = np.array([begin for begin, _ in scenario.events])
     wrong_any = np.zeros(len(looks.t), bool)
     for what, error in looks.errors.items():
@@ -473,7 +509,7 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
         wrong_any |= wrong
         ratio = np.where(looks.valid, error / bound, 0.0)
         result.ratio[what] = max(result.ratio[what], float(ratio.max()))
-        for first, last in _find_runs(wrong):
+        for first, last in _merge(_find_runs(wrong)):
             worst = first + int(np.argmax(ratio[first:last]))
             began = starts[starts <= looks.t[first]]
             since = float(looks.t[first] - began[-1]) if len(began) else math.nan
@@ -485,7 +521,7 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
                     session,
                     what,
                     float(looks.t[first]),
-                    (last - first) * LOOK_PERIOD,
+                    float(wrong[first:last].sum()) * LOOK_PERIOD,
                     float(error[worst]),
                     float(bound[worst]),
                     since,
@@ -496,7 +532,7 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
         result.median_bound.append(float(np.median(looks.bounds["horizontal"][looks.valid])))
     for k, begin in enumerate(starts.tolist()):
         end = starts[k + 1] if k + 1 < len(starts) else looks.t[-1] + 1.0
-        result.events.append(_evaluate_event(looks, wrong_any, begin, end))
+        result.events.append(_evaluate_event(session, looks, wrong_any, begin, end))
     if scenario.receiver is Receiver.UNSTATED:
         _measure_movement(result, scenario, looks)
 
@@ -507,24 +543,36 @@ def _find_runs(mask: Mask) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def _evaluate_event(looks: Looks, wrong: Mask, begin: float, end: float) -> EventResult:
+def _merge(runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the runs with those joined that are at most `MERGED_GAP` apart."""
+    merged: list[tuple[int, int]] = []
+    for first, last in runs:
+        start = first
+        if merged and first - merged[-1][1] <= MERGED_GAP / LOOK_PERIOD:
+            start = merged.pop()[0]
+        merged.append((start, last))
+    return merged
+
+
+def _evaluate_event(session: int, looks: Looks, wrong: Mask, begin: float, end: float) -> EventResult:
     inside = (looks.t >= begin) & (looks.t < end)
     good = looks.valid & ~wrong
-    noticed = looks.t[inside & ~looks.valid]
+    detected = looks.t[inside & ~looks.valid]
     bad = np.flatnonzero(inside & ~good)
     healed = math.nan
     if len(bad):
         count = round(HEALED_TIME / LOOK_PERIOD)
         for first, last in _find_runs(good):
             if first > bad[0] and last - first >= count and looks.t[first] < end:
-                healed = float(looks.t[first] - begin)
+                healed = float(looks.t[first] - looks.t[bad[0]])
                 break
     else:
         healed = 0.0
     return EventResult(
+        session,
         begin,
         float((wrong & inside).sum()) * LOOK_PERIOD,
-        float(noticed[0] - begin) if len(noticed) else math.nan,
+        float(detected[0] - begin) if len(detected) else math.nan,
         healed,
     )
 
@@ -559,7 +607,7 @@ class Summary(NamedTuple):
     worst_heading_deg: float
     valid: float
     bound: float
-    noticed: float
+    detected: float
     healed: float
     healed_worst: float
     moved: float
@@ -572,7 +620,7 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
     hours = sum(each.seconds for each in results) / 3600.0
     events = [event for each in results for event in each.events]
     breaches = [breach for each in results for breach in each.breaches]
-    noticed = [event.noticed for event in events if not math.isnan(event.noticed)]
+    detected = [event.detected for event in events if not math.isnan(event.detected)]
     healed = [event.healed for event in events if event.healed != 0.0]
     wrong = sum(each.wrong for each in results) / hours
     worst_event = max((event.wrong for event in events), default=0.0)
@@ -607,7 +655,7 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
         math.degrees(max((breach.error for breach in breaches if breach.what == "heading"), default=0.0)),
         valid,
         float(np.median(bounds)) if bounds else math.nan,
-        float(np.median(noticed)) if noticed else math.nan,
+        float(np.median(detected)) if detected else math.nan,
         float(np.median([x for x in healed if not math.isnan(x)] or [math.nan])),
         healed_worst,
         moved,
@@ -618,13 +666,13 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
 
 HEADER: Final = (
     f"  {'fault':24}{'hours':>6}{'s/h':>8}{'longest':>8}{'event':>8}{'of events':>10}"
-    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'noticed':>8}{'healed':>7}{'worst':>7}"
+    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'detected':>8}{'healed':>7}{'worst':>7}"
     "  before -> required"
 )
 LEGEND: Final = (
     "  s/h: seconds wrong and valid per hour. longest: interval, event: sum of the worst event, of events: with any.\n"
     "  x: worst error / bound while valid, horizontal and heading. m, deg: worst error while wrong. bound: median, m.\n"
-    "  noticed: median seconds to the first invalid pose. healed, worst: median and longest until right and valid."
+    "  detected: median seconds to the first invalid pose. healed, worst: median and longest wrong or invalid, s."
 )
 
 
@@ -640,7 +688,7 @@ def format_summary(summary: Summary) -> str:
         f"  {fault.name:24}{summary.hours:6.2f}{summary.wrong_per_hour:8.1f}{summary.longest:8.1f}"
         f"{summary.worst_event:8.1f}{events:>10}{summary.ratio_horizontal:7.2f}{summary.ratio_heading:7.2f}"
         f"{summary.worst_error:7.1f}{summary.worst_heading_deg:6.1f}{summary.valid:7.1%}{number(summary.bound):>7}"
-        f"{number(summary.noticed):>8}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
+        f"{number(summary.detected):>8}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
         f"  {fault.before or '-'} -> {fault.required.text}"
     )
     if fault.required.moved is not None:
@@ -653,13 +701,42 @@ def format_breach(breach: Breach) -> str:
     is_heading = breach.what == "heading"
     factor, unit = (180.0 / math.pi, "deg") if is_heading else (1.0, "m")
     since = (
-        "before the fault" if math.isnan(breach.since_fault) else f"{breach.since_fault:.1f} s after the fault began"
+        "before any event" if math.isnan(breach.since_fault) else f"{breach.since_fault:.1f} s after the fault began"
     )
     return (
         f"    {breach.vehicle} seed {breach.seed} session {breach.session} at {breach.begin:.1f} s for "
         f"{breach.seconds:.1f} s: {breach.what} {breach.error * factor:.2f} {unit}, bound "
         f"{breach.bound * factor:.2f} {unit}, {since}"
     )
+
+
+def print_events(fault: Fault, results: list[Result]) -> None:
+    """Print what lies behind the figures of a fault."""
+    for name in dict.fromkeys(result.task.vehicle for result in results):
+        summary = summarize(fault, [result for result in results if result.task.vehicle == name])
+        print(
+            f"    {name}: {summary.wrong_per_hour:.1f} s/h, longest {summary.longest:.1f} s, {summary.valid:.1%} valid"
+        )
+    reasons: defaultdict[str, float] = defaultdict(float)
+    findings = Counter[str]()
+    for result in results:
+        task = result.task
+        for reason, seconds in result.reasons.items():
+            reasons[reason] += seconds
+        findings.update(result.findings)
+        for breach in sorted(result.breaches, key=lambda breach: (breach.session, breach.begin)):
+            print(format_breach(breach))
+        for event in result.events:
+            if event.wrong or not math.isnan(event.detected):
+                print(
+                    f"    {task.vehicle} seed {task.seed} session {event.session} event at {event.begin:.1f} s: "
+                    f"wrong {event.wrong:.1f} s, detected after {event.detected:.1f}, healed in {event.healed:.1f} s"
+                )
+    print(
+        "    not valid by " + (", ".join(f"{name} {seconds:.0f} s" for name, seconds in reasons.items()) or "nothing")
+    )
+    print("    findings: " + (", ".join(name for name, _ in findings.most_common()) or "none"), end="; ")
+    print(f"new epochs: {sum(result.epochs for result in results)}", flush=True)
 
 
 def plan_tasks(options: argparse.Namespace) -> list[Task]:
@@ -695,9 +772,7 @@ def run(tasks: Iterable[Task], jobs: int, events: bool) -> tuple[list[Summary], 
                 summaries.append(summarize(BY_NAME[fault], grouped[fault]))
                 print(format_summary(summaries[-1]), flush=True)
                 if events:
-                    for each in grouped[fault]:
-                        for breach in sorted(each.breaches, key=lambda breach: (breach.session, breach.begin)):
-                            print(format_breach(breach), flush=True)
+                    print_events(BY_NAME[fault], grouped[fault])
     return summaries, finished
 
 

@@ -4,7 +4,7 @@ Nothing here is from `modelserver.simulation`, which shares its error models wit
 over arrays at `RATE` Hz; samples are created one at a time, in the order of their arrival.
 
 Truth. World: the tangent plane (ENU) at `ORIGIN`, on a spherical earth. The rolling frame moves with the speeds v along
-its x and u along its y axis and turns at r; both axes lie in the ground, whose slope the frame follows. `carried_*` of
+its x and u along its y axis and turns at r; both axes lie in the ground, whose slope the frame follows. `platform_*` of
 a scenario add the motion of what carries the vehicle: a ferry, a crane. With derivatives of the path at the IMU,
 f = R' (a + 2 W x v - g) and w = vee(R' dR/dt) + R' W, W the earth rate (Groves 2013, 2.3 and 5.4).
 
@@ -64,7 +64,8 @@ class Vehicle:
     """A vehicle. Meters, m/s, seconds.
 
     `smoothing` is how long a change of speed or curvature takes, `half_track` half the distance between its two wheels,
-    `lateral` the largest lateral acceleration (m/s2), `vibration` that of the IMU at top speed (m/s2 and rad/s).
+    `lateral` the largest lateral acceleration (m/s2), `vibration` that of the IMU at top speed (m/s2 and rad/s),
+    `wavelength` that of the hills, `ruts` a side slip (rad) of which few are several times as large.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Vehicle:
     fix_type: FixType
     vibration: tuple[float, float]
     wavelength: float
+    ruts: float
 
     def build_rig(self, has_wheels: bool) -> SensorRig:
         """Return the vehicle as the filter knows it."""
@@ -118,6 +120,7 @@ VEHICLES: Final = {
             fix_type=FixType.DIFFERENTIAL,
             vibration=(0.4, 0.008),
             wavelength=25.0,
+            ruts=0.003,
         ),
         Vehicle(
             name="car",
@@ -134,6 +137,7 @@ VEHICLES: Final = {
             fix_type=FixType.FIX_3D,
             vibration=(0.5, 0.006),
             wavelength=200.0,
+            ruts=0.001,
         ),
         Vehicle(
             name="skid",
@@ -150,6 +154,7 @@ VEHICLES: Final = {
             fix_type=FixType.DIFFERENTIAL,
             vibration=(0.6, 0.015),
             wavelength=20.0,
+            ruts=0.002,
         ),
     )
 }
@@ -187,8 +192,9 @@ class Scenario:
     vehicle is stationary. `fix_offset` (n, 2) in meters and `velocity_offset` (n, 2) in m/s along east and north are
     added to fixes; `age` is how old their position is at their stamp beside the latency, and `stamp_shift` is added to
     the stamp, seconds. `gyro_bias` (rad/s) is about the vehicle's z axis, `mount_yaw` (rad) how far the IMU is turned,
-    `antenna_error` (m) how far the antenna is, from where the geometry has it. `carried_velocity` (n, 2) in m/s along
-    east and north, `carried_rate` (rad/s), `lift` (m), `tilt` (n, 2: roll, pitch, rad).
+    `antenna_error` (m) how far the antenna is, from where the geometry has it. `idling` is the vibration of a
+    stationary vehicle, as a share of that at top speed. `platform_velocity` (n, 2) in m/s along east and north,
+    `platform_rate` (rad/s), `lift` (m), `tilt` (n, 2: roll, pitch, rad).
     """
 
     vehicle: Vehicle
@@ -208,14 +214,15 @@ class Scenario:
     latency: float = 0.0
     mount_yaw: float = 0.0
     antenna_error: Vector3 = (0.0, 0.0, 0.0)
+    idling: float = 0.02
     gyro_scale: float = 0.0
     gyro_bias: Array = field(default_factory=_zeros)
     age: Array = field(default_factory=_zeros)
     stamp_shift: Array = field(default_factory=_zeros)
     fix_offset: Array = field(default_factory=_zeros)
     velocity_offset: Array = field(default_factory=_zeros)
-    carried_velocity: Array = field(default_factory=_zeros)
-    carried_rate: Array = field(default_factory=_zeros)
+    platform_velocity: Array = field(default_factory=_zeros)
+    platform_rate: Array = field(default_factory=_zeros)
     lift: Array = field(default_factory=_zeros)
     tilt: Array = field(default_factory=_zeros)
 
@@ -224,7 +231,7 @@ class Scenario:
         self.latency = float(self.rng.uniform(0.06, 0.1))
         self.gyro_bias, self.age, self.stamp_shift = np.zeros(n), np.zeros(n), np.zeros(n)
         self.fix_offset, self.velocity_offset = np.zeros((n, 2)), np.zeros((n, 2))
-        self.carried_velocity, self.carried_rate = np.zeros((n, 2)), np.zeros(n)
+        self.platform_velocity, self.platform_rate = np.zeros((n, 2)), np.zeros(n)
         self.lift, self.tilt = np.zeros(n), np.zeros((n, 2))
 
     @property
@@ -401,14 +408,14 @@ def compute_truth(scenario: Scenario) -> Truth:
     turn /= np.sqrt(1.0 + (turn * speed / vehicle.lateral) ** 2)
     turn += spin
     # side slip: cornering stiffness that varies, gusts and ruts; a skid-steered vehicle turns about a moving point
-    slip = -0.004 * turn * speed * np.exp(0.5 * wander(rng, n, 10.0)) + 0.003 * wander(rng, n, 2.0) ** 3
+    slip = -0.004 * turn * speed * np.exp(0.5 * wander(rng, n, 10.0)) + vehicle.ruts * wander(rng, n, 2.0) ** 3
     side = slip * speed
     if vehicle.kinematics == "skid_steer":
         side -= (0.02 + 0.03 * wander(rng, n, 5.0)) * turn
-    yaw = rng.uniform(-math.pi, math.pi) + _integrate(turn + scenario.carried_rate)
+    yaw = rng.uniform(-math.pi, math.pi) + _integrate(turn + scenario.platform_rate)
     c, s = np.cos(yaw), np.sin(yaw)
     ground = np.stack((speed * c - side * s, speed * s + side * c), axis=1)
-    flat = ground + scenario.carried_velocity
+    flat = ground + scenario.platform_velocity
     x, y = _integrate(flat[:, 0]), _integrate(flat[:, 1])
     slope_x, slope_y, height = _terrain(rng, x, y, 0.0 if scenario.is_flat else 0.02, vehicle.wavelength)
     z = height + scenario.lift
@@ -509,7 +516,7 @@ def measure_imu(scenario: Scenario, truth: Truth) -> Iterator[Received]:
             misaligned = np.eye(3) + rng.normal(0.0, math.radians(0.3), (3, 3))
             misaligned[np.diag_indices(3)] = 1.0 + rng.normal(0.0, 0.003, 3)
             values[:] = values @ misaligned
-            noise = white / math.sqrt(dt) + 0.02 * shaking + shaking * moving
+            noise = white / math.sqrt(dt) + shaking * (scenario.idling + moving)
             for axis in range(3):
                 values[:, axis] += rng.normal(0.0, bias) + rng.normal(0.0, heat) * warm
                 values[:, axis] += flicker(rng, n, dt, instability)
@@ -532,6 +539,8 @@ def measure_wheels(scenario: Scenario, truth: Truth) -> Iterator[Received]:
     t = np.arange(0.03, scenario.seconds, 1.0 / WHEELS_HZ)
     taken = t + (rng.normal(0.0, 0.002, len(t)) if scenario.has_errors else 0.0)
     push = np.gradient(truth.speed, 1.0 / RATE)
+    # 1 % each: load and pressure change both alike, the rest is of each wheel
+    common = 1.0 + float(np.clip(rng.normal(0.0, 0.008), -0.016, 0.016))
     columns = []
     for y in vehicle.contacts.values():
         rolled = truth.speed - truth.turn * y
@@ -543,7 +552,7 @@ def measure_wheels(scenario: Scenario, truth: Truth) -> Iterator[Received]:
                 1.0 + np.minimum(np.abs(push) + 2.0 * np.abs(truth.turn * truth.speed), 3.0)
             )
             slip += _spin(rng, scenario.t, truth.speed)
-            scale = 1.0 + float(np.clip(rng.normal(0.0, 0.01), -0.02, 0.02))
+            scale = common + float(np.clip(rng.normal(0.0, 0.006), -0.012, 0.012))
             rolled = rolled * scale * (1.0 + slip)
             if is_skid:
                 rolled -= truth.turn * y * (0.3 + 0.1 * wander(rng, n, 6.0))
@@ -582,7 +591,7 @@ def _fix_errors(scenario: Scenario, truth: Truth, when: Array) -> Array:
     e = np.zeros((m, 3))
     if not scenario.has_errors:
         return e
-    turning = np.interp(when, scenario.t, np.abs(truth.turn + scenario.carried_rate))
+    turning = np.interp(when, scenario.t, np.abs(truth.turn + scenario.platform_rate))
     # reflections change as the vehicle turns: 1 rad is as good as 20 s
     pace = 1.0 + 20.0 * turning
     parts: tuple[tuple[float, float, Array | None], ...]

@@ -1,0 +1,145 @@
+"""The drives of the integrity benchmark: their sensors belong to their truth, and a fault is run and judged."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import integrity
+from benchmarks.integrity_drives import (
+    EARTH_RADIUS,
+    HEIGHT,
+    LATITUDE,
+    ORIGIN,
+    RATE,
+    START,
+    VEHICLES,
+    Scenario,
+    compute_imu,
+    compute_truth,
+    measure,
+)
+from modelserver.earth.geodesy import Geodesy
+from modelserver.earth.gravity import earth_rate, gravity
+from modelserver.messages import GpsSample, ImuSample, WheelsSample
+from modelserver.transforms import so3
+
+
+def create_scenario(vehicle: str, seconds: float, seed: int = 3) -> Scenario:
+    scenario = Scenario(VEHICLES[vehicle], seconds, np.random.default_rng(seed))
+    scenario.has_errors = False
+    return scenario
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_strapdown_integration_of_the_imu_reproduces_the_path(name: str) -> None:
+    scenario = create_scenario(name, 60.0)
+    scenario.platform_rate += 0.1 * np.sin(scenario.t)
+    scenario.platform_velocity += np.sin(0.5 * scenario.t)[:, None]
+    scenario.tilt += 0.02 * np.sin(scenario.t)[:, None]
+    truth = compute_truth(scenario)
+    lever = scenario.vehicle.imu.xyz
+    rates, forces = compute_imu(truth, lever)
+    places = truth.locate(lever)
+    earth, g, dt = earth_rate(LATITUDE), gravity(LATITUDE, HEIGHT), 1.0 / RATE
+    turned_back = so3.exponential(so3.scale(-dt, earth))
+    place = places[0]
+    velocity = truth.velocity[0] + truth.rotation[0] @ np.cross(truth.rate[0], lever)
+    attitude = so3.from_matrix(truth.rotation[0])
+    before = np.array(so3.rotate(attitude, tuple(forces[0])))
+    for k in range(1, len(rates)):
+        turn = so3.exponential(tuple(0.5 * dt * (rates[k - 1] + rates[k])))
+        attitude = so3.multiply(turned_back, so3.multiply(attitude, turn))
+        force = np.array(so3.rotate(attitude, tuple(forces[k])))
+        down = np.array((-place[0] / EARTH_RADIUS, -place[1] / EARTH_RADIUS, -1.0))
+        acceleration = 0.5 * (before + force) - 2.0 * np.cross(earth, velocity) + g * down
+        place = place + dt * velocity + 0.5 * dt * dt * acceleration
+        velocity, before = velocity + dt * acceleration, force
+    assert np.ptp(places[:, :2], axis=0).max() > 10.0
+    assert np.linalg.norm(place - places[-1]) < 0.01
+    assert abs(math.remainder(so3.to_rpy(attitude)[2] - truth.yaw[-1], math.tau)) < 1e-4
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_sensors_without_errors_measure_the_truth(name: str) -> None:
+    scenario = create_scenario(name, 120.0)
+    truth = compute_truth(scenario)
+    received = list(measure(scenario, truth))
+    assert all(a[0] <= b[0] for a, b in itertools.pairwise(received))
+    samples = [sample for _, sample in received]
+    fix = [each for each in samples if isinstance(each, GpsSample)][-1]
+    enu = Geodesy(ORIGIN).enu_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height_ellipsoidal)
+    at = (fix.header.utime - START) * 1e-6
+    place = [np.interp(at, scenario.t, column) for column in truth.locate(scenario.vehicle.antenna).T]
+    assert math.dist(enu, place) < 1e-3
+    wheels = [each for each in samples if isinstance(each, WheelsSample)][-1]
+    at = (wheels.header.utime - START) * 1e-6
+    travel = np.concatenate(([0.0], np.cumsum(truth.speed[1:] + truth.speed[:-1]) / (2.0 * RATE)))
+    mean = sum(wheel.travel for wheel in wheels.wheels) / 2.0
+    assert mean == pytest.approx(np.interp(at, scenario.t, travel), abs=1e-3)
+    imu = next(each for each in samples if isinstance(each, ImuSample))
+    # stationary at the start: only the earth turns, and the specific force is gravity along the vehicle's up
+    assert imu.angular_velocity is not None
+    assert imu.specific_force is not None
+    assert math.hypot(*imu.angular_velocity) == pytest.approx(math.hypot(*earth_rate(LATITUDE)))
+    assert math.hypot(*imu.specific_force) == pytest.approx(gravity(LATITUDE, HEIGHT), rel=1e-6)
+
+
+def test_a_seed_gives_the_same_samples() -> None:
+    runs = []
+    for _ in range(2):
+        scenario = Scenario(VEHICLES["skid"], 20.0, np.random.default_rng(7))
+        runs.append(list(measure(scenario, compute_truth(scenario))))
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("fault", integrity.FAULTS, ids=lambda fault: fault.name)
+def test_every_fault_changes_its_drive(fault: integrity.Fault) -> None:
+    changed, healthy = (Scenario(VEHICLES["rover"], fault.session or 900.0, np.random.default_rng(1)) for _ in range(2))
+    fault.inject(changed)
+    same = all(np.array_equal(value, getattr(healthy, name)) for name, value in vars(changed).items() if name != "rng")
+    assert same == (fault.name == "none")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["none", "gps_age"])
+def test_two_minutes_with_a_small_fault_hold(fault: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--faults", fault, "--vehicles", "rover", "--seeds", "1", "--minutes", "2", "--jobs", "1", "--events"]
+    assert integrity.main(arguments) == 0
+    output = capsys.readouterr().out
+    assert "rover: 0.0 s/h" in output
+    assert "OUT OF BOUNDS" not in output
+
+
+def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
+    scenario = create_scenario("rover", 60.0)
+    scenario.events = [(20.0, 30.0)]
+    t = np.arange(1, 251) * integrity.LOOK_PERIOD
+    errors = np.where((t > 22.0) & (t < 25.0), 3.0, 0.5)
+    valid = ~((t > 24.0) & (t < 27.0))
+    ones, zeros = np.ones(250), np.zeros(250)
+    looks = integrity.Looks(
+        t,
+        valid,
+        {"horizontal": errors, "heading": 0.1 * ones},
+        {"horizontal": ones, "heading": 0.2 * ones},
+        np.stack((zeros, zeros, zeros), axis=1),
+        [integrity.Invalid(0 if each else 256) for each in valid],
+        [],
+        0,
+    )
+    result = integrity.Result(integrity.Task("none", "rover", 1, 60.0))
+    integrity._evaluate(result, 0, scenario, looks)
+    assert result.wrong == pytest.approx(2.0, abs=0.21)
+    (breach,) = result.breaches
+    assert (breach.what, breach.error, breach.bound) == ("horizontal", 3.0, 1.0)
+    assert breach.since_fault == pytest.approx(2.0, abs=0.21)
+    (event,) = result.events
+    assert event.detected == pytest.approx(4.0, abs=0.21)
+    assert event.healed == pytest.approx(5.0, abs=0.21)
+    strict = replace(integrity.BY_NAME["none"], required=integrity.Required("", event=1.0))
+    assert not integrity.summarize(strict, [result]).holds
