@@ -406,7 +406,7 @@ class Result:
     breaches: list[Breach] = field(default_factory=list)
     events: list[EventResult] = field(default_factory=list)
     reasons: dict[str, float] = field(default_factory=dict)
-    findings: Counter[str] = field(default_factory=Counter)
+    findings: dict[str, int] = field(default_factory=dict)
     epochs: int = 0
     moved: float = 0.0
     turned: float = 0.0
@@ -499,7 +499,8 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
     result.valid += float(looks.valid.sum()) * LOOK_PERIOD
     for reason, count in Counter(str(flag.name) for reasons in looks.reasons for flag in reasons).items():
         result.reasons[reason] = result.reasons.get(reason, 0.0) + count * LOOK_PERIOD
-    result.findings.update(looks.findings)
+    for finding, count in Counter(looks.findings).items():
+        result.findings[finding] = result.findings.get(finding, 0) + count
     result.epochs += looks.epochs
     starts = np.array([begin for begin, _ in scenario.events])
     wrong_any = np.zeros(len(looks.t), bool)
@@ -666,7 +667,7 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
 
 HEADER: Final = (
     f"  {'fault':24}{'hours':>6}{'s/h':>8}{'longest':>8}{'event':>8}{'of events':>10}"
-    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'detected':>8}{'healed':>7}{'worst':>7}"
+    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'detected':>9}{'healed':>7}{'worst':>7}"
     "  before -> required"
 )
 LEGEND: Final = (
@@ -688,7 +689,7 @@ def format_summary(summary: Summary) -> str:
         f"  {fault.name:24}{summary.hours:6.2f}{summary.wrong_per_hour:8.1f}{summary.longest:8.1f}"
         f"{summary.worst_event:8.1f}{events:>10}{summary.ratio_horizontal:7.2f}{summary.ratio_heading:7.2f}"
         f"{summary.worst_error:7.1f}{summary.worst_heading_deg:6.1f}{summary.valid:7.1%}{number(summary.bound):>7}"
-        f"{number(summary.detected):>8}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
+        f"{number(summary.detected):>9}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
         f"  {fault.before or '-'} -> {fault.required.text}"
     )
     if fault.required.moved is not None:
@@ -806,7 +807,9 @@ def main(arguments: list[str] | None = None) -> int:
             "faults": [summary._asdict() for summary in summaries],
             "tasks": [dataclasses.asdict(result) for result in results],
         }
-        options.json.write_text(json.dumps(data, indent=1), encoding="utf-8")
+        # JSON has neither nan nor infinity
+        plain = json.loads(json.dumps(data), parse_constant=lambda _: None)
+        options.json.write_text(json.dumps(plain, indent=1), encoding="utf-8")
     return 0 if all(summary.holds for summary in summaries) else 1
 
 

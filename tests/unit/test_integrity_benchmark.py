@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,9 +109,11 @@ def test_every_fault_changes_its_drive(fault: integrity.Fault) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["none", "gps_age"])
-def test_two_minutes_with_a_small_fault_hold(fault: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_minutes_with_a_small_fault_hold(fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--faults", fault, "--vehicles", "rover", "--seeds", "1", "--minutes", "2", "--jobs", "1", "--events"]
-    assert integrity.main(arguments) == 0
+    assert integrity.main([*arguments, "--json", str(tmp_path / "figures.json")]) == 0
+    (figures,) = json.loads((tmp_path / "figures.json").read_text())["faults"]
+    assert (figures["fault"], figures["wrong_per_hour"], figures["healed"]) == (fault, 0.0, None)
     output = capsys.readouterr().out
     assert "rover: 0.0 s/h" in output
     assert "OUT OF BOUNDS" not in output
