@@ -7,12 +7,14 @@ predicted beyond the newest sample, or interpolated if a sample with a later sta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
+from modelserver.earth.geodesy import Geodesy
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
@@ -25,16 +27,27 @@ from modelserver.wire.channels import SIGNED
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent
 
-CSV_HEADER: Final = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
+CSV_HEADER: Final = (
+    "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg"
+)
 
 _NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
+_NO_BOUNDS: Final = (NAN, NAN)
+_NO_SIGMAS: Final = (NAN, NAN, NAN, NAN)
+_NO_PLACE: Final = (NAN, NAN)
+_UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f"
+"""Format of the last columns: to 0.1 mm, a microradian, a nanodegree."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackRow:
     """Estimated pose of a frame: UTM easting and northing, height above the ellipsoid, meters; nan = no pose.
 
-    `rotation` maps from the frame to grid east, grid north, up (w, x, y, z). `invalid` are the reason bits.
+    `rotation` maps from the frame to grid east, grid north, up (w, x, y, z). `invalid` are the reason bits. `bounds`
+    are the protection levels, horizontal (m) and heading (rad), of the base frame only; `sigmas` the standard
+    deviations along east, north, up (m) and of the yaw (rad); `place` is latitude and longitude, degrees. nan = not
+    known.
     """
 
     utime: int
@@ -44,12 +57,19 @@ class TrackRow:
     rotation: Quaternion = _NO_ROTATION
     valid: bool = False
     invalid: int = 0
+    bounds: tuple[float, float] = _NO_BOUNDS
+    sigmas: tuple[float, float, float, float] = _NO_SIGMAS
+    place: tuple[float, float] = _NO_PLACE
 
     def to_csv(self) -> str:
-        """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian."""
+        """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian.
+
+        An unknown bound, sigma, latitude or longitude is empty.
+        """
         quaternion = ",".join(f"{value:.9f}" for value in self.rotation)
         place = f"{self.easting:.5f},{self.northing:.5f},{self.up:.5f}"
-        return f"{self.utime},{place},{quaternion},{int(self.valid)},{self.invalid}"
+        uncertainty = (_UNCERTAINTY % (*self.bounds, *self.sigmas, *self.place)).replace("nan", "")
+        return f"{self.utime},{place},{quaternion},{int(self.valid)},{self.invalid},{uncertainty}"
 
 
 @dataclass(slots=True)
@@ -80,6 +100,7 @@ class OfflineRun:
     last_utime: int = 0
     position: int = 0
     _state: CoreState | None = None
+    _geodesy: Geodesy | None = None
 
     def __post_init__(self) -> None:
         self.vehicle.model.get_transformation(self.frame, self.vehicle.config.base_frame)
@@ -153,15 +174,24 @@ class OfflineRun:
         found, origin = answer.transformation, answer.origin
         if origin is None:
             return TrackRow(utime, invalid=int(found.invalid_reasons))
+        if self._geodesy is None or self._geodesy.origin != origin:
+            self._geodesy = Geodesy(origin)
         x, y, z = found.pose.xyz
+        easting, northing, up = origin.easting + x, origin.northing + y, origin.height + z
+        P, sigmas = found.covariance_numbers, _NO_SIGMAS
+        if P is not None:
+            sigmas = (math.sqrt(P[0]), math.sqrt(P[7]), math.sqrt(P[14]), math.sqrt(P[35]))
         return TrackRow(
             utime,
-            origin.easting + x,
-            origin.northing + y,
-            origin.height + z,
+            easting,
+            northing,
+            up,
             found.pose.wxyz,
             found.is_valid,
             int(found.invalid_reasons),
+            (answer.horizontal_protection_level, answer.heading_protection_level),
+            sigmas,
+            self._geodesy.geodetic_from_utm(easting, northing, up)[:2],
         )
 
 

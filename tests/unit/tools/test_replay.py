@@ -21,6 +21,7 @@ from support_tuning import write_raw_mode_vehicle
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
+from modelserver.earth.geodesy import origin_at
 from modelserver.messages import Decision, GetBodyList, GpsSample, PoseAnswer, RequestHeader, Verdict
 from modelserver.server import playback
 from modelserver.server.vehicle import Vehicle
@@ -32,7 +33,10 @@ from mstools.commands.replay import _exclude_service_messages, read_times
 
 pytestmark = pytest.mark.slow
 
-HEADER = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
+HEADER = (
+    "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg"
+)
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -68,7 +72,7 @@ def forward(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def rows(path: Path) -> list[list[float]]:
     lines = path.read_text().splitlines()
     assert lines[0] == HEADER
-    return [[float(value) for value in line.split(",")] for line in lines[1:]]
+    return [[float(value or "nan") for value in line.split(",")] for line in lines[1:]]
 
 
 # --- offline ------------------------------------------------------------------------------------------------
@@ -85,8 +89,8 @@ def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
     assert [row[0] for row in found[:3]] == [START + LATENCY + n * 100_000 for n in range(3)]
     assert len(found) == 400
     assert math.isnan(found[0][1])
-    assert found[0][8:] == [0, 15]
-    utime, easting, northing, up, w, x, y, z, valid, reasons = found[-1]
+    assert found[0][8:10] == [0, 15]
+    utime, easting, northing, up, w, x, y, z, valid, reasons = found[-1][:10]
     assert (valid, reasons) == (1, 0)
     assert easting == pytest.approx(EASTING + SPEED * (utime - START) * 1e-6, abs=0.1)
     assert northing == pytest.approx(NORTHING, abs=0.1)
@@ -101,6 +105,14 @@ def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
     for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCenter"))):
         assert run(recorded_log, "-c", forward, "--poses", tmp_path / name, *options)[0] == 0
     base, antenna = rows(tmp_path / "base.csv")[-1], rows(tmp_path / "antenna.csv")[-1]
+    # the protection levels are those of the base frame
+    horizontal, heading, east, north, up, yaw, latitude, longitude = base[10:]
+    assert horizontal > 3.0 * max(east, north) > 0.0
+    assert heading > 3.0 * yaw > 0.0
+    assert up > 0.0
+    there = origin_at(latitude, longitude, base[3])
+    assert (there.easting, there.northing) == pytest.approx((base[1], base[2]), abs=1e-3)
+    assert [math.isnan(value) for value in antenna[10:]] == [True] * 2 + [False] * 6
     assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
 
