@@ -292,15 +292,15 @@ FAULTS: Final = (
     Fault("gyro_bias_step_005", _step_gyro(0.005), "302 s/h, longest 181", STEP),
     Fault("gyro_bias_step_02", _step_gyro(0.02), "302 s/h, longest 181; 115 deg", STEP),
     Fault("gyro_scale_2pct", _scale_gyro, "184 s/h, longest 44", ONE_AN_HOUR),
-    Fault("spoof_01", _spoof(0.1, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 18.0)),
-    Fault("spoof_02", _spoof(0.2, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 18.0)),
-    Fault("spoof_05", _spoof(0.5, False), "2600 to 3000 s/h, longest 755; 391 m", DETECTED, quick=("car", 18.0)),
+    Fault("spoof_01", _spoof(0.1, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 24.0)),
+    Fault("spoof_02", _spoof(0.2, False), "2600 to 3000 s/h, longest 755", DETECTED, quick=("rover", 24.0)),
+    Fault("spoof_05", _spoof(0.5, False), "2600 to 3000 s/h, longest 755; 391 m", DETECTED, quick=("car", 24.0)),
     Fault(
         "spoof_05_true_velocity",
         _spoof(0.5, False),
         "2600 to 3000 s/h, longest 755",
         DETECTED,
-        quick=("rover", 18.0),
+        quick=("rover", 24.0),
         has_velocity=True,
     ),
     Fault(
@@ -308,7 +308,7 @@ FAULTS: Final = (
         _spoof(0.5, True),
         "2600 to 3000 s/h, longest 755",
         DETECTED,
-        quick=("rover", 18.0),
+        quick=("rover", 24.0),
         has_velocity=True,
     ),
     Fault("multipath_ramps", _ramp_multipath, "399 s/h, longest 53", ONE_AN_EVENT),
@@ -787,7 +787,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--minutes", type=float, help="of each drive; default 60")
     parser.add_argument("--jobs", type=int, default=min(os.cpu_count() or 1, 2))
-    parser.add_argument("--quick", action="store_true", help="one vehicle, one seed, 15 to 18 minutes of each fault")
+    parser.add_argument("--quick", action="store_true", help="one vehicle, one seed, 15 to 24 minutes of each fault")
     parser.add_argument("--list", action="store_true", help="list faults and vehicles")
     parser.add_argument("--events", action="store_true", help="print each time wrong and valid")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures, events and times here")
