@@ -78,7 +78,7 @@ def reverse_wheels(events: Iterable[LogEvent], channel: str = "WHEELS") -> Itera
         if event.channel == channel:
             sample: WheelsSample = codec.decode("wheels_t", event.data)
             wheels = tuple(_reverse(each) for each in sample.wheels)
-            yield replace(event, data=codec.encode(replace(sample, wheels=wheels)))
+            yield event._replace(data=codec.encode(replace(sample, wheels=wheels)))
         else:
             yield event
 

@@ -55,7 +55,7 @@ R = TypeVar("R")
 def reuse_last(function: Callable[P, R]) -> Callable[P, R]:
     """Return a pure function that reuses its last value if it gets the same objects again (decorator).
 
-    For values of a sample that each of its measurements needs. The arguments are immutable.
+    For values of a sample that each of its measurements needs. The arguments are immutable, and given by position.
     """
     last: tuple[tuple[Any, ...], R] | None = None
 
@@ -73,7 +73,7 @@ def reuse_last(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @reuse_last
-def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool = False) -> AcceptedFix | str:
+def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool = False, /) -> AcceptedFix | str:
     """Return the fix, or the reason why it is not good enough.
 
     `may_lack_type`: a fix of type NONE with a covariance is one of a publisher that fills in neither type nor number of

@@ -10,9 +10,11 @@ import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
 from modelserver.estimation.filter import eskf, propagation, protection_levels
+from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.fusion import uses_gnss
 from modelserver.estimation.filter.measurements.constraints import compute_tilt
+from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
 from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.setup import Setup
@@ -44,7 +46,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     X_odom = odom.pose(utime)
     if isinstance(state, Leveling):
         return Estimate(utime, X_odom, invalid=invalid, pose_epoch=epoch, origin=origin)
-    predicted = propagation.predict(setup, state, utime)
+    predicted = propagation.predict(setup, state, utime + _get_sensor_delay_us(setup, state))
     nav = predicted.nav
     quality = _find_quality(setup, predicted, nav, utime, newest)
     odom_covariance = odom.covariance()
@@ -95,6 +97,22 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
         compute_motion(setup, predicted, nav),
     )
+
+
+def _get_sensor_delay_us(setup: Setup, state: Navigating) -> int:
+    """Return by how much IMU and wheels are late, microseconds.
+
+    A fix is not newer than its stamp. Where it seems so, the stamps of the other sensors are late by that latency, and
+    so is the state; as much of it counts as is certain to a standard deviation.
+    """
+    if not isinstance(state, Aligned) or LATENCY not in setup.layout:
+        return 0
+    at, nav = setup.layout.index(LATENCY), state.nav
+    latency = nav.extras[at - STRAPDOWN]
+    if not latency < 0.0:
+        return 0
+    delay = -latency - math.sqrt(max(nav.covariance[at, at], 0.0))
+    return round(1e6 * delay) if delay > 0.0 else 0
 
 
 def _compute_base_covariance(nav: NavState, setup: Setup, noise: ProcessNoise) -> Array:

@@ -254,7 +254,7 @@ class StreamCorrelation(NamedTuple):
 
     def _add_fix(self, setup: Setup, sample: GpsSample, has_gyro: bool) -> StreamCorrelation:
         settings, utime = setup.settings, sample.header.utime
-        fix = evaluate_fix(sample, settings, may_lack_type=True)
+        fix = evaluate_fix(sample, settings, True)
         if isinstance(fix, str):
             return self
         site = self.site or LocalFrame.at(fix.latitude_deg, fix.longitude_deg, 0.0)

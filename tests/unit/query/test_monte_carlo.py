@@ -174,7 +174,7 @@ def test_given_a_heading_sigma_of_20_deg_then_a_95_percent_ellipsoid_covers_90_p
     for at in (AT - 0.01, AT, AT + 0.01):
         uncertain = replace(estimate(at), covariance=tuple(np.diag(sigmas**2).ravel().tolist()))
         history = history.append(uncertain)
-    platform = replace(held(), history=history)
+    platform = held()._replace(history=history)
     samples = Samples(5, platform)
     answer = platform.transformation(frame, UTM, TimeQuery(utime(AT))).transformation
     poses = samples.vehicle(sigmas, AT) @ samples.within(frame, BASE, AT)

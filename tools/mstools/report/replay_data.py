@@ -374,7 +374,7 @@ class ReplayCollector:
         found = []
         for sample in self._fixes:
             header = sample.header
-            fix = gate.evaluate_fix(sample, settings, may_lack_type=True)
+            fix = gate.evaluate_fix(sample, settings, True)
             decision = decided.get((header.source, header.utime, header.seq))
             t = (header.utime - first_utime) * 1e-6
             verdict, reason = ("", "") if decision is None else (decision.verdict.name.lower(), decision.reason)

@@ -158,7 +158,7 @@ def gps_channel(vehicle: Vehicle) -> str:
 
 def stated_sigma(sample: GpsSample, vehicle: Vehicle) -> float:
     """Return the stated sigma of a good fix, meters; nan for a rejected one."""
-    fix = gate.evaluate_fix(sample, vehicle.config.localization.filter, may_lack_type=True)
+    fix = gate.evaluate_fix(sample, vehicle.config.localization.filter, True)
     return math.nan if isinstance(fix, str) else fix.sigma
 
 
@@ -175,9 +175,7 @@ def read_fixes(log: Path, config: Path) -> UsableFixes:
         for number, event in enumerate(event for event in recording if event.channel == channel):
             with suppress(ValueError):
                 sample = codec.decode(event.data)
-                if isinstance(sample, GpsSample) and not isinstance(
-                    gate.evaluate_fix(sample, settings, may_lack_type=True), str
-                ):
+                if isinstance(sample, GpsSample) and not isinstance(gate.evaluate_fix(sample, settings, True), str):
                     found.append((sample, number))
     if len(found) < 20:
         raise RecordingError(
