@@ -47,6 +47,10 @@ class pose_transform_t(object):
     """ A joint on the path was silent for more than a second around that time. """
     JOINT_UNKNOWN = 4096
     """ No sample of a joint on the path was received, and the geometry has no default for it. """
+    GNSS_INCONSISTENT = 8192
+    """ Fixes and the path driven contradict each other: a drift of the fixes, or of gyro or wheels. """
+    MISMOUNTED = 16384
+    """ The accelerations of the IMU do not fit the wheels: its mount in the geometry, or the wheels' signs, are wrong. """
     HEADING_FROM_GYRO = 1
     """ Heading is propagated by the gyro alone: the vehicle is stationary or crawls. """
     PREDICTED = 2
@@ -140,7 +144,7 @@ class pose_transform_t(object):
 
         self.invalid_reasons = 0
         """
-        Why the pose may not be used, bit by bit: NO_FIX to JOINT_UNKNOWN. 0 = it may.
+        Why the pose may not be used, bit by bit: NO_FIX to MISMOUNTED. 0 = it may.
         LCM Type: int32_t
         """
 

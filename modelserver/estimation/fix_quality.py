@@ -31,7 +31,8 @@ _VERTICAL_RATIO = 1.6
 class AcceptedFix:
     """The position of an antenna, degrees and ellipsoidal meters (nan: unknown), with its covariance, m2.
 
-    `east_variance`, `north_variance`, `cross` and `up_variance` are along true east, north, up.
+    `east_variance`, `north_variance`, `cross` and `up_variance` are along true east, north, up. `is_stated`: the
+    receiver states the covariance itself.
     """
 
     latitude_deg: float
@@ -41,6 +42,7 @@ class AcceptedFix:
     north_variance: float
     cross: float
     up_variance: float
+    is_stated: bool = False
 
     @property
     def sigma(self) -> float:
@@ -109,7 +111,7 @@ def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool =
     east, north, cross, up = _covariance(sample, settings)
     if over_sea:
         up = max(up, settings.assumed_height_sigma**2)
-    fix = AcceptedFix(latitude, longitude, height, east, north, cross, up)
+    fix = AcceptedFix(latitude, longitude, height, east, north, cross, up, _has_covariance(sample))
     return fix if fix.sigma <= settings.maximum_sigma else "sigma"
 
 

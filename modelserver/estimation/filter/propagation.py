@@ -8,15 +8,26 @@ A stationary vehicle does not turn: what its gyros measure is their bias and the
 
 from __future__ import annotations
 
+from typing import Final
+
 from modelserver.estimation.filter import eskf
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import N, Navigating
+from modelserver.estimation.filter.state import Aligned, N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Mode
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
+
+SLOW_TURN: Final = 0.02
+"""Turn rate, rad/s, below which the error of the gyro's scale does not count."""
+
+OUTAGE_US: Final = 3_000_000
+"""Microseconds without a fix after which it does."""
+
+TURN_TIME: Final = 10.0
+"""Seconds of a turn, in which the error of the gyro's scale adds up."""
 
 
 def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
@@ -36,7 +47,14 @@ def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
     """Return the process noise while the IMU measures."""
     if state.is_stationary:
         return setup.stationary
-    return setup.interpolated if state.imu.is_interpolated else setup.driving
+    noise = setup.interpolated if state.imu.is_interpolated else setup.driving
+    rate, nav = state.nav.rate[2], state.nav
+    if abs(rate) < SLOW_TURN or not isinstance(state, Aligned) or nav.utime - state.gnss.used_utime < OUTAGE_US:
+        return noise
+    if not state.common.measures_wheel_speed(nav.utime):
+        return noise  # the non-holonomic constraint would turn the heading by it
+    # an error of the gyro's scale lasts through a turn; fixes correct it
+    return noise._replace(gyro=noise.gyro + TURN_TIME * (setup.settings.gyro_scale_sigma * rate) ** 2)
 
 
 def measures_turn_rate(setup: Setup, state: Navigating, utime: int) -> bool:

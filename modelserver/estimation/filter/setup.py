@@ -65,9 +65,9 @@ class Setup:
         self.coasting = ProcessNoise(gap_rate**2, gap_acceleration, *biases, gyros_drive_attitude=False)
         # interpolated numbers run from one real sample to the next: a third of the error of a gap
         self.interpolated = ProcessNoise((gap_rate / 3.0) ** 2, gap_acceleration, *biases)
-        self.rolling = ProcessNoise(
-            s.wheel_rate_sigma**2 * s.slip_time, gap_acceleration, *biases, gyros_drive_attitude=False
-        )
+        # a single speed measures no turns: a third of the error of a gap, since they are smooth
+        rolling = s.wheel_rate_sigma**2 * s.slip_time if len(rig.wheel_frames) > 1 else (gap_rate / 3.0) ** 2
+        self.rolling = ProcessNoise(rolling, gap_acceleration, *biases, gyros_drive_attitude=False)
         self.turning = ProcessNoise(s.gyro_noise**2, gap_acceleration, *biases)
         self.findings = {mode: find_unusable(rig, mode) for mode in Mode}
 

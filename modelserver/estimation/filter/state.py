@@ -14,10 +14,12 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeAlias, TypeVar
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame
+from modelserver.estimation.filter.consistency_monitor import ConsistencyMonitor
 from modelserver.estimation.filter.eskf import ZERO, Earth, NavState
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.receiver_monitor import ReceiverMonitor
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
@@ -100,6 +102,7 @@ class Common(NamedTuple):
     moving_until: until when fixes show that the vehicle moves.
     warm_start: the persisted state of an earlier run, until it is used or rejected.
     receiver: which fields of its fixes the receiver fills.
+    mount: of the IMU, by the force that it measures.
     """
 
     mode: Mode = Mode.FULL
@@ -114,11 +117,12 @@ class Common(NamedTuple):
     moving_until: int = 0
     warm_start: WarmStart | None = None
     receiver: ReceiverMonitor = ReceiverMonitor()
+    mount: MountMonitor = MountMonitor()
 
     def restart(self) -> Common:
         """Return what a restarted filter continues with: origin, mode and good gyro biases, in a new epoch."""
         common = Common(self.mode, self.geodesy, self.capture, self.epoch + 1, self.gyro_biases)
-        return common._replace(receiver=self.receiver)
+        return common._replace(receiver=self.receiver, mount=self.mount)
 
     def measures_wheel_speed(self, utime: int) -> bool:
         """Return whether the wheels measure the speed of the vehicle at an instant."""
@@ -215,6 +219,7 @@ class Aligned(NamedTuple):
     earth: Earth
     site: LocalFrame
     gnss: GnssMonitor = GnssMonitor()
+    consistency: ConsistencyMonitor = ConsistencyMonitor()
     heading_check: HeadingCheck | None = None
 
     @property

@@ -267,7 +267,7 @@ class StreamCorrelation(NamedTuple):
         if seconds < STEP:
             return self
         displacement = abs(position - last.position)
-        white, correlated = split_variance(fix.sigma**2, sample.fix_type, settings)
+        white, correlated = split_variance(fix.sigma**2, fix, sample.fix_type, settings)
         drift = correlated * math.sqrt(2.0 * min(seconds / settings.gps_correlation_time, 1.0))
         x, y, _ = setup.rig.pose(setup.rig.gps_frame).xyz
         least = max(MIN_DISPLACEMENT * math.hypot(1.5 * math.sqrt(white), drift), 2.0 * math.hypot(x, y))

@@ -312,7 +312,7 @@ def _restore_pose(
             offset=OutputOffset(pose.correlated_error, pose.correlated_error_variance),
             outlier_allowance=pose.allowance,
         ),
-        HeadingCheck(),
+        heading_check=HeadingCheck(),
     )
 
 

@@ -6,6 +6,7 @@ average out over a longer distance.
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import Final
 
@@ -27,14 +28,19 @@ from modelserver.estimation.filter.fusion import (
 )
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
+from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState, Leveling, N, PreviousSample
 from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
 from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
+from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
 
 SOURCE_TIMEOUT: Final = 2.0
 """Seconds of silence after which another source of wheels is used: the travel since a sample is that of one source."""
+
+FORCE_AGE_US: Final = 50_000
+"""Microseconds for which a measured force is that of a wheel sample."""
 
 UNKNOWN_SPEED_SIGMA: Final = 2.0
 """Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
@@ -105,12 +111,27 @@ def _fuse_speed(
     wheels = state.common.wheels
     if wheels.source != item.source:
         wheels = wheels._replace(source=item.source)
+    mount = state.common.mount
+    if has_gyro and item.utime - state.imu.used_utime < FORCE_AGE_US:
+        mount = _compare_force(setup, context.nav, innovation, mount, item.utime)
     if decision.verdict is Verdict.USED:
         turn_rate = 0.0
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
-    return state._replace(nav=nav, common=state.common._replace(wheels=wheels)), (decision,), is_first_speed
+    common = state.common._replace(wheels=wheels, mount=mount)
+    return state._replace(nav=nav, common=common), (decision,), is_first_speed
+
+
+def _compare_force(
+    setup: Setup, nav: NavState, innovation: Innovation, mount: MountMonitor, utime: int
+) -> MountMonitor:
+    """Return the mount monitor after a wheel sample and the force at that time."""
+    speed = nav.body_velocity(setup.rig.base)[0] + float(innovation.residual.mean())
+    (fx, fy, fz), (bx, by, bz) = nav.force, nav.accelerometer_bias
+    east, north, _ = so3.rotate(nav.attitude, (fx - bx, fy - by, fz - bz))
+    force = complex(east, north) * cmath.rect(1.0, -nav.yaw)
+    return mount.update(utime, speed, nav.angular_rate[2], force)
 
 
 def _fuse_stationary(setup: Setup, state: N, utime: int, is_stationary: bool) -> tuple[N, tuple[Decision, ...]]:

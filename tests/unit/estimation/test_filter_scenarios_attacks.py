@@ -13,7 +13,7 @@ from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Leveling
-from modelserver.messages import GpsSample, ImuSample, Phase, Verdict, WheelSample, WheelsSample
+from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
@@ -136,14 +136,18 @@ def create_swapped_wheels(names: set[str]) -> WheelsModel:
 
 
 @pytest.mark.parametrize("names", [{"left"}, {"left", "right"}])
-def test_given_wheels_with_the_wrong_sign_then_the_heading_is_found_without_them(names):
+def test_given_wheels_with_the_wrong_sign_then_the_heading_is_found_without_them_or_is_not_valid(names):
     found = drive(
         simulation(drive_straight(3.0, 1.0, 15.0, 4.0) + EIGHT, wheels_model=create_swapped_wheels(names)), 45.0
     )
 
     valid = [row for row in found.rows if row.valid]
-    assert len(valid) > 40
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in valid)
+    if len(names) == 1:
+        assert len(valid) > 40
+    else:
+        # forces and wheels contradict each other as they do with an IMU mounted backward
+        assert Invalid.MISMOUNTED in found.last.estimate.invalid
 
 
 def test_given_an_accelerometer_that_measures_in_g_then_gravity_is_not_found_and_the_pose_is_never_valid():

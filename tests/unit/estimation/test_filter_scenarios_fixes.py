@@ -39,36 +39,44 @@ def test_given_fixes_that_jump_for_ten_seconds_then_the_pose_does_not_follow(mod
 
     pairs = list(zip(found.between(40.0), plain.between(40.0), strict=True))
     assert max(math.dist(a.estimate.enu.xyz[:2], b.estimate.enu.xyz[:2]) for a, b in pairs) < 1.0
-    rejected = [found.seconds(word) for word in found.decisions("gps_position", Verdict.REJECTED, "gate")]
+    words = [found.decisions("gps_position", Verdict.REJECTED, word) for word in ("gate", "inconsistent")]
+    rejected = [found.seconds(decision) for decisions in words for decision in decisions]
     assert len([t for t in rejected if 40.0 <= t < 50.0]) >= 38
-    assert not [t for t in rejected if t >= 53.0]
+    # then they must agree for a while
+    assert not [t for t in rejected if t >= 62.0]
     assert len({row.estimate.pose_epoch for row in found.between(20.0)}) == 1
     assert max(found.odom_steps) < 0.05
 
 
-def test_given_a_permanent_jump_of_fixes_while_stationary_then_the_position_is_reset_only_once_it_drives():
+def test_given_a_permanent_jump_of_fixes_while_stationary_then_the_pose_follows_once_it_drives_and_is_not_trusted():
     stationary_until = 110.0
     ahead = figure_eight(speed=3.0, radius=8.0, stationary=4.0)
     driven = sum(phase.duration for phase in ahead)
     phases = (
         *ahead,
         DrivePhase(stationary_until - driven),
-        *figure_eight(speed=3.0, radius=8.0, stationary=1.0, laps=2),
+        *figure_eight(speed=3.0, radius=8.0, stationary=1.0, laps=5),
     )
     gps = replace(PLAIN_GPS, jumps=((driven + 3.0, FOREVER, 30.0, 0.0),))
 
-    found = drive(simulation(phases, gps_model=gps), stationary_until + 60.0, every=0.1)
+    found = drive(simulation(phases, gps_model=gps), stationary_until + 130.0, every=0.1)
 
     resting = found.between(driven + 3.0, stationary_until)
-    resets = [word for word in found.decisions("gps_position", Verdict.RESET) if found.seconds(word) > driven]
+    resets = [word for word in found.decisions("consistency", Verdict.RESET) if found.seconds(word) > driven]
     assert max(row.off for row in resting) < 1.5
     assert Invalid.GPS_REJECTED in resting[-1].estimate.invalid
-    assert len(resets) == 1
-    assert found.seconds(resets[0]) > stationary_until + 5.0
+    jumped, followed, trusted = resets
+    assert stationary_until < found.seconds(jumped) < stationary_until + 5.0
+    between = found.between(stationary_until + 20.0, found.seconds(trusted) - 0.2)
+    assert all(Invalid.GNSS_INCONSISTENT in row.estimate.invalid for row in between)
+    after = found.between(found.seconds(followed) + 10.0, found.seconds(trusted) - 0.2)
+    assert all(row.off < row.estimate.horizontal_protection_level for row in after)
+    # where it is now was never shown, but it has moved as the fixes for two minutes
+    assert found.seconds(trusted) > found.seconds(jumped) + 115.0
     assert found.last.valid
     assert abs(found.last.east - 30.0) < 2.0
     assert abs(found.last.north) < 2.0
-    assert found.last.estimate.pose_epoch == resting[-1].estimate.pose_epoch + 1
+    assert found.last.estimate.pose_epoch == resting[-1].estimate.pose_epoch + 2
     assert max(found.odom_steps) < 0.05
 
 

@@ -101,10 +101,11 @@ SPEEDOMETER_RIG = replace(RIG, wheel_frames={SPEEDOMETER: "Car:Base"}, speedomet
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "heading_deg"), [(Mode.FULL, 1.0), (Mode.NO_IMU, 12.0)])
+@pytest.mark.parametrize(("mode", "heading_deg"), [(Mode.FULL, 1.0), (Mode.NO_IMU, 14.0)])
 def test_given_the_speed_of_the_controller_then_it_is_used_like_a_wheel(mode, heading_deg):
     found = drive(drive_with_status(), SECONDS, on=SPEEDOMETER_RIG, mode=mode)
     assert_good(found, heading_deg)
+    assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.between(9.0))
     assert len(found.decisions("wheel_speed", Verdict.USED)) > 0.9 * len(found.decisions("wheel_speed")) > 0.0
     assert len(found.decisions("zero_velocity", Verdict.USED)) > 10
 

@@ -391,8 +391,8 @@ class ReplayCollector:
                     place = geodesy.to_relative_utm(utm)
             before = _latest(snapshots, times, t) if decision is not None and decision.dof == 2 else None
             if decision is not None and before is not None and math.isfinite(before.speed):
-                east = split_variance(fix.east_variance, sample.fix_type, settings)[1]
-                north = split_variance(fix.north_variance, sample.fix_type, settings)[1]
+                east = split_variance(fix.east_variance, fix, sample.fix_type, settings)[1]
+                north = split_variance(fix.north_variance, fix, sample.fix_type, settings)[1]
                 a, b = (before.values.get(name, 0.0) for name in CORRELATED_ERROR[:2])
                 residual = (decision.residual[0] + east * a, decision.residual[1] + north * b)
                 velocity = _velocity(before)

@@ -4,11 +4,12 @@ A fix measures the antenna at p + R l, l its lever arm, with two errors that are
 c (Gauss-Markov of standard deviation 1, in units of the sigma of the fix) and the latency t by which the fix is older
 than its stamp:
 
-    z = p + R l + sigma_c c - t v + white noise                                                                 (1)
+    z = p + R l + sigma_c c - t v + t^2 a / 2 + white noise                                                     (1)
 
-(P. Groves 2013, 14.3.1.) Receivers know their noise and not their reflections, so sigma_c has a lower limit, the range
-error of the type of fix. The products of two unknowns, latency and velocity, add their variances to the noise: to first
-order a speed that is still being found would pass for one that changes, and make the latency observable.
+(P. Groves 2013, 14.3.1), with a = w x v of the turn. Where a receiver states no covariance, sigma_c is at least the
+range error of the type of fix. The products of two unknowns, latency and velocity, or latency twice, add their
+variances to the noise: to first order a speed that is still being found would pass for one that changes, and make the
+latency observable.
 """
 
 from __future__ import annotations
@@ -56,14 +57,16 @@ def gnss_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
     )
 
 
-def split_variance(variance: float, fix_type: FixType, settings: FilterSettings) -> tuple[float, float]:
+def split_variance(
+    variance: float, fix: AcceptedFix, fix_type: FixType, settings: FilterSettings
+) -> tuple[float, float]:
     """Return the white variance of a fix (m2), and the standard deviation of its time-correlated error (m).
 
-    The latter is at least the range error of the type of fix at an HDOP of 1.
+    The latter is at least the range error of the type of fix at an HDOP of 1, where the receiver states no covariance.
     """
     variance = max(variance, settings.gps_sigma_floor**2)
     white = settings.gps_white_share**2
-    least = 0.5 * range_error(fix_type, settings) ** 2
+    least = 0.0 if fix.is_stated else 0.5 * range_error(fix_type, settings) ** 2
     return white * variance, math.sqrt(max((1.0 - white) * variance, least))
 
 
@@ -114,16 +117,17 @@ class GpsPosition(_AtAntenna):
         x, y, z = nav.point(self.lever)
         east, north, _ = locate_fix(fix, context.site, z)
         H = point_jacobian(nav, self.lever, layout.size)[:2]
-        e_white, e_sigma = split_variance(fix.east_variance, sample.fix_type, context.settings)
-        n_white, n_sigma = split_variance(fix.north_variance, sample.fix_type, context.settings)
+        e_white, e_sigma = split_variance(fix.east_variance, fix, sample.fix_type, context.settings)
+        n_white, n_sigma = split_variance(fix.north_variance, fix, sample.fix_type, context.settings)
         at = layout.index(CORRELATED_ERROR[0])
         H[0, at], H[1, at + 1] = e_sigma, n_sigma
         # the antenna at t - latency
         vx, vy, _ = nav.point_velocity(self.lever)
         latency = context.extra(LATENCY)
         latency_at = layout.index(LATENCY)
-        H[0, latency_at], H[1, latency_at] = -vx, -vy
-        x, y = x - vx * latency, y - vy * latency
+        ax, ay = -nav.angular_rate[2] * vy, nav.angular_rate[2] * vx
+        H[0, latency_at], H[1, latency_at] = ax * latency - vx, ay * latency - vy
+        x, y = x + (0.5 * ax * latency - vx) * latency, y + (0.5 * ay * latency - vy) * latency
         residual = np.array(
             (
                 east - x - e_sigma * context.extra(CORRELATED_ERROR[0]),
@@ -133,7 +137,9 @@ class GpsPosition(_AtAntenna):
         covariance = fix.cross * context.settings.gps_white_share**2
         # the product of two unknowns: see the module's theory
         P = nav.covariance
-        e_white, n_white = (white + P[latency_at, latency_at] * P[k, k] for white, k in ((e_white, 3), (n_white, 4)))
+        of_latency = P[latency_at, latency_at]
+        e_white += of_latency * (P[3, 3] + 0.5 * of_latency * ax * ax)
+        n_white += of_latency * (P[4, 4] + 0.5 * of_latency * ay * ay)
         R = np.array(((e_white, covariance), (covariance, n_white)))
         return Innovation(residual, H, R, inflation_limit=FIX_INFLATION_LIMIT)
 
@@ -158,7 +164,7 @@ class GpsHeight(_AtAntenna):
         _, _, z = context.nav.point(self.lever)
         _, _, up = locate_fix(fix, context.site, z)
         H = point_jacobian(context.nav, self.lever, context.layout.size)[2:]
-        white, sigma = split_variance(fix.up_variance, sample.fix_type, context.settings)
+        white, sigma = split_variance(fix.up_variance, fix, sample.fix_type, context.settings)
         H[0, context.layout.index(CORRELATED_ERROR[2])] = sigma
         residual = up - z - sigma * context.extra(CORRELATED_ERROR[2])
         # nothing else measures the height, so a large innovation is used with the weight of one at the gate

@@ -1,0 +1,661 @@
+"""Consistency monitor: fixes against the path of dead reckoning, over windows from seconds to minutes.
+
+The gate compares one fix with the state, which has followed the fixes before it. An error that grows slowly passes it:
+the state follows. So fixes are compared with what did not follow, the path of dead reckoning (solution separation, as
+in ARAIM: J. Blanch et al., "Baseline advanced RAIM user algorithm", IEEE Trans. AES, 2015). With z_k the fix at the
+start of a window, o the path in its own axes, which no fix corrects, and R_k its rotation to N at that time,
+
+    e = (z - z_k) - R_k (o - o_k),      cov(e) = 2 s_c^2 (1 - exp(-T / tau)) I + white noise + sum u u'              (1)
+
+over a window of T seconds. The vectors u are what one standard deviation of each parameter of dead reckoning at the
+start of the window adds: with d = R_k (o - o_k) as a complex number, i d s_heading, d s_scale, i m s_rate with the
+moment m = integral of (t - t_k) dd, and the noise of slip and of the gyros.
+
+Below the threshold, what is unexplained widens the protection levels: the position may have followed e, and the
+heading turned to explain it (`horizontal_allowance`, `heading_allowance`). Above it, one of the two is wrong, and the
+fits over all windows show which (`Cause`). A gyro whose bias has changed bends the path, e_j = i b m_j; wheels that
+slip scale it, e_j = s d_j; a latency that has changed displaces it, e_j = -l (v_j - v_k). None explains fixes that
+drift, e_j = v (t_j - t_k), in turns and changes of speed, or that jump.
+
+What is corrected leaves an allowance that decays. Fixes that jump are not used, and dead reckoning is right for a
+while. Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of
+the turn since the window's start, and the pose is invalid only where they are too large. Fixes are trusted again when
+they agree with the path from there, or when they have moved as the path for two minutes and a fit of a drift beside an
+offset, a rotation, a scale and a turn rate shows it to be small, which takes turns (`fit_drift`).
+
+Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
+gyro, as on a ferry (`Cause.HEADING`).
+
+Limits: a drift slower than the path is known (2 % of the speed with wheels, for minutes) is found in turns only.
+"""
+
+from __future__ import annotations
+
+import cmath
+import itertools
+import math
+from enum import Enum
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.settings import FilterSettings
+
+Vector: TypeAlias = npt.NDArray[Any]
+
+SPACING_US: Final = 900_000
+"""Microseconds between two nodes of the newest part of the path."""
+
+NEWEST_US: Final = 20_000_000
+"""Microseconds of that part."""
+
+OLDER_SPACING_US: Final = 4_500_000
+"""Microseconds between two nodes of the older part."""
+
+LONGEST_US: Final = 180_000_000
+"""Microseconds of the longest window."""
+
+MAX_GAP: Final = 5.0
+"""Seconds between two fixes beyond which the path starts again: its shape in between is not stored."""
+
+THRESHOLD: Final = 4.5
+"""Standard deviations of (1) beyond which path and fixes are inconsistent: 4e-5 of a normal error in the plane."""
+
+ALLOWED: Final = 1.5
+"""Standard deviations of (1) that are taken for the error that is modeled: what is beyond widens the bounds."""
+
+ALLOWANCE_TIME: Final = 10.0
+"""Seconds in which an allowance decays: about a turn, or as many fixes as show a heading."""
+
+SUSPICION_TIME: Final = 60.0
+"""Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes."""
+
+FEWEST_NODES: Final = 2
+"""Nodes that show the cause; until then the gate is enough."""
+
+JUMP_SIGMAS: Final = 9.0
+"""Standard deviations of (1) from one fix to the next that are a jump: a drift is slower."""
+
+CONFIRMATIONS: Final = 3
+"""Fixes in a row beyond the threshold that are no outliers."""
+
+HEADING_FLOOR: Final = 0.01
+"""Standard deviation of the course, rad, beside the heading: no vehicle drives straighter."""
+
+COURSE_FLOOR: Final = 0.03
+"""The same where only fixes show how the vehicle moves: it slips sideways in turns and crabs in wind and on slopes."""
+
+MIN_TURN_PATH: Final = 3.0
+"""Meters of a path, at least, that fixes show a heading along."""
+
+AGREEMENT: Final = 2.45
+"""Standard deviations of (1) within which a fix agrees: 95 % of good ones."""
+
+AGREEMENT_TIME: Final = 10.0
+JUMP_AGREEMENT_TIME: Final = 3.0
+"""Seconds for which fixes that drifted, or jumped, must agree with dead reckoning to be trusted again."""
+
+NEW_TRUST_TIME: Final = 120.0
+NEW_TRUST_DISTANCE: Final = 20.0
+"""Seconds, and meters, for which fixes must move as dead reckoning does to be trusted again wherever they are."""
+
+OWN_TURNS: Final = 3.0
+"""Radians that a vehicle turns by, while its heading follows the gyro, that drives by itself again."""
+
+STEADY_SIGMA: Final = 0.03
+"""Largest standard deviation of the drift of fixes, m/s, that are trusted again wherever they are."""
+
+LARGEST_REST: Final = 2.0
+"""Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes."""
+
+MODEL_ERROR: Final = 0.05
+"""Meters that no cause explains, as slip that comes and goes: with fixes of centimeters."""
+
+DECISION_TIME: Final = 20.0
+REPEAT: Final = 4
+"""Seconds for which the causes are compared again, and fixes from one comparison to the next."""
+
+MARGIN: Final = 5.0
+"""Squares that an error of dead reckoning must explain more than any other cause to be corrected."""
+
+MAX_INFLATION: Final = 4.0
+"""Largest inflation, in variance, of the error of fixes here: a drift must not excuse itself."""
+
+
+class Cause(Enum):
+    """What explains fixes that do not agree with the path."""
+
+    GNSS = "gnss"
+    HEADING = "heading"
+    GYRO = "gyro"
+    WHEELS = "wheels"
+    LATENCY = "latency"
+
+
+TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
+"""Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
+
+
+class PathNoise(NamedTuple):
+    """Noise along the path: density of the heading's random walk, rad2/s, and inflation of the fixes' errors."""
+
+    heading: float
+    inflation: float
+
+
+class PathNode(NamedTuple):
+    """Fix, path and state at an instant; vectors of the plane are complex, meters.
+
+    Attributes
+    ----------
+    fix, antenna: the antenna by the fix at its stamp, and by the state after it, along N.
+    velocity, turn_rate: of the antenna along N, m/s, and of the vehicle, rad/s.
+    path: the antenna by dead reckoning, along the path's own axes.
+    moment: integral of time along the path, m s, and `seconds` the time, both since the start of the path.
+    rotation: yaw from the path's axes to N, rad.
+    distance: travelled, m.
+    heading_variance, rate_variance, scale_variance: of the heading (rad2), the yaw gyro's bias ((rad/s)2) and the
+        wheels' scale.
+    has_gyro, is_measured: whether a gyro measures the turns, and wheels the path too.
+    own_heading: by the gyro alone, along the path's axes, rad.
+    latency, latency_variance: of fixes, s and s2.
+    lost: variance of the heading that was lost in gaps of the IMU since the start of the path, rad2.
+    white, correlated: standard deviations of the two errors of the fix, m.
+    position_covariance: of the state's position: east, north, cross, m2.
+    """
+
+    utime: int
+    fix: complex
+    antenna: complex
+    velocity: complex
+    turn_rate: float
+    path: complex
+    moment: complex
+    seconds: float
+    rotation: float
+    distance: float
+    heading_variance: float
+    rate_variance: float
+    scale_variance: float
+    has_gyro: bool
+    is_measured: bool
+    own_heading: float
+    latency: float
+    latency_variance: float
+    lost: float
+    white: float
+    correlated: float
+    position_covariance: tuple[float, float, float]
+
+
+class Discrepancy(NamedTuple):
+    """The newest fix against the path since a node.
+
+    Attributes
+    ----------
+    node: the start of the window.
+    error: e of (1) along N, m.
+    sigmas: its size in standard deviations.
+    sigma: standard deviation of e along its longest axis, m.
+    displacement: of the antenna by dead reckoning, along N, m.
+    covariance: of dead reckoning alone: east, north, cross, m2.
+    turn, turn_sigma: angle by which the heading would explain it, and the angle's standard deviation, rad.
+    """
+
+    node: PathNode
+    error: complex
+    sigmas: float
+    sigma: float
+    displacement: complex
+    covariance: tuple[float, float, float]
+    turn: float
+    turn_sigma: float
+
+
+class Inconsistency(NamedTuple):
+    """What explains fixes that do not agree with the path, over the window with the largest discrepancy.
+
+    `change` is that of the heading (rad), of the gyro's bias (rad/s), of the wheels' scale, of the latency (s), or the
+    drift (m/s); `explained` are the weighted squares that it explains. `is_jump`: the fixes left the path at once, as
+    no error of dead reckoning does.
+    """
+
+    cause: Cause
+    discrepancy: Discrepancy
+    change: float = 0.0
+    explained: float = 0.0
+    is_jump: bool = False
+
+
+class ConsistencyMonitor(NamedTuple):
+    """The path of dead reckoning with its fixes.
+
+    Attributes
+    ----------
+    utime: of the anchor; 0: the path has not begun.
+    anchor: the antenna by the state at the last fix and after what corrected it since, along N, m.
+    begin: start of the path.
+    path, moment, rotation, distance, lost: as in `PathNode`.
+    older, newest: the nodes, the oldest first.
+    num_exceeded: fixes in a row beyond the threshold.
+    compared_utime: of the last fix within it.
+    last: the last fix; `has_jumped`: whether one of those fixes jumped away from the one before.
+    moved_since: since when no window has exceeded it.
+    cause: of an inconsistency that lasts, since `since`; None: fixes and path agree.
+    suspect: the last node before it, while fixes are not trusted; `is_jump`: whether they have jumped then.
+    largest: discrepancy of the fixes since then, m.
+    agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
+    horizontal_allowance, heading_allowance: what is unexplained, m and rad.
+    suspicion: what was taken for an error of gyro or wheels, and may have been one of the fixes, m.
+    """
+
+    utime: int = 0
+    anchor: complex = 0j
+    begin: int = 0
+    path: complex = 0j
+    moment: complex = 0j
+    rotation: float = 0.0
+    distance: float = 0.0
+    lost: float = 0.0
+    older: tuple[PathNode, ...] = ()
+    newest: tuple[PathNode, ...] = ()
+    num_exceeded: int = 0
+    compared_utime: int = 0
+    last: PathNode | None = None
+    has_jumped: bool = False
+    moved_since: int = 0
+    cause: Cause | None = None
+    since: int = 0
+    suspect: PathNode | None = None
+    is_jump: bool = False
+    largest: float = 0.0
+    agreed_since: int = 0
+    horizontal_allowance: float = 0.0
+    heading_allowance: float = 0.0
+    suspicion: float = 0.0
+
+    @property
+    def excludes_fixes(self) -> bool:
+        """Whether fixes are not used: they have jumped away from dead reckoning."""
+        return self.suspect is not None and self.is_jump
+
+    @property
+    def may_reset(self) -> bool:
+        """Whether rejected fixes may show where the vehicle is: they are not suspect themselves."""
+        return self.suspect is None or self.cause is Cause.HEADING
+
+    def resolve(self, found: Inconsistency, utime: int) -> ConsistencyMonitor:
+        """Return the monitor after an inconsistency was found at `utime`: what is corrected begins again."""
+        if found.cause not in (Cause.GNSS, Cause.HEADING):
+            # the uncertainty of a latency that was corrected covers what is left
+            cause = None if found.cause is Cause.LATENCY else found.cause
+            suspicion = max(self.suspicion, abs(found.discrepancy.error))
+            path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None)
+            return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
+        suspect = found.discrepancy.node
+        return self._replace(
+            num_exceeded=0,
+            cause=found.cause,
+            since=utime,
+            suspect=suspect,
+            is_jump=found.is_jump,
+            largest=0.0,
+            agreed_since=0,
+        )
+
+    def extend(self, utime: int, antenna: complex) -> ConsistencyMonitor:
+        """Return the monitor with the path continued to the antenna by the state (along N, m) before a fix."""
+        gap = (utime - self.utime) * 1e-6
+        if not self.utime or (gap > MAX_GAP and self.suspect is None):
+            return ConsistencyMonitor(utime, antenna, utime, cause=self.cause, since=self.since)
+        step = (antenna - self.anchor) * cmath.rect(1.0, -self.rotation)
+        seconds = (0.5 * (utime + self.utime) - self.begin) * 1e-6
+        return self._replace(
+            utime=utime,
+            anchor=antenna,
+            path=self.path + step,
+            moment=self.moment + seconds * step,
+            distance=self.distance + abs(step),
+        )
+
+    def correct(self, shift: complex, turn: float) -> ConsistencyMonitor:
+        """Return the monitor after a fix moved the state by `shift`, m, and turned it by `turn`, rad: not the path."""
+        return self._replace(anchor=self.anchor + shift, rotation=self.rotation + turn)
+
+    def lose_heading(self, variance: float) -> ConsistencyMonitor:
+        """Return the monitor after a gap in which only wheels measured the turns: `variance` is theirs, rad2."""
+        return self._replace(lost=self.lost + variance)
+
+    def end_exclusion(self) -> ConsistencyMonitor:
+        """Return the monitor after the state was set to fixes that have jumped, and are not trusted."""
+        return self._replace(is_jump=False, horizontal_allowance=self.largest, heading_allowance=math.pi)
+
+    def append(self, node: PathNode) -> ConsistencyMonitor:
+        """Return the monitor with a node more, if the last one is old enough, and the fix no outlier."""
+        newest, older = self.newest, self.older
+        if newest and node.utime - newest[-1].utime < SPACING_US:
+            return self
+        if self.num_exceeded and self.suspect is None:
+            return self
+        while newest and node.utime - newest[0].utime > NEWEST_US:
+            if not older or newest[0].utime - older[-1].utime >= OLDER_SPACING_US:
+                older = (*older, newest[0])
+            newest = newest[1:]
+        while older and node.utime - older[0].utime > LONGEST_US:
+            older = older[1:]
+        return self._replace(older=older, newest=(*newest, node))
+
+    def compare(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> ConsistencyMonitor:
+        """Return the monitor after the comparison of a fix with the windows."""
+        worst = latest = horizontal = heading = 0.0
+        suspect = None if self.is_jump else self.suspect
+        if suspect is not None:
+            # the state has followed all of it, or the path has gone wrong by it
+            heading = abs(wrap_angle(self.rotation - suspect.rotation))
+            if self.cause is not Cause.HEADING:
+                found = compare_window(suspect, node, noise, settings)
+                horizontal, heading = abs(found.error), max(heading, abs(found.turn))
+        for each in self._compare_windows(node, noise, settings):
+            if not each.node.is_measured:
+                # without a measured speed the path follows the fixes, but the heading must not
+                sigmas = 0.0
+                if each.node.has_gyro and node.has_gyro:
+                    turned = abs(wrap_angle(self.rotation - each.node.rotation))
+                    sigma = get_turn_sigma(each.node, node, noise)
+                    sigmas = turned / sigma
+                    heading = max(heading, turned - ALLOWED * sigma)
+                worst = max(worst, sigmas)
+                if each.node.utime >= self.moved_since:
+                    latest = max(latest, sigmas)
+                continue
+            worst = max(worst, each.sigmas)
+            if each.node.utime >= self.moved_since:
+                latest = max(latest, each.sigmas)
+            if each.sigmas > ALLOWED:
+                horizontal = max(horizontal, abs(each.error) * (1.0 - ALLOWED / each.sigmas))
+            # the heading has changed during the window by twice the mean that the fixes show
+            if each.turn_sigma:
+                heading = max(heading, 2.0 * (abs(each.turn) - ALLOWED * each.turn_sigma))
+        moved_since = node.utime if latest > THRESHOLD else self.moved_since
+        if worst > THRESHOLD and suspect is None and self.num_exceeded < CONFIRMATIONS:
+            # outliers do not widen the bounds
+            step = 0.0
+            if self.last is not None and self.last.is_measured:
+                step = compare_window(self.last, node, noise, settings).sigmas
+            return self._replace(
+                last=node,
+                moved_since=moved_since,
+                num_exceeded=self.num_exceeded + 1,
+                has_jumped=self.has_jumped or step > JUMP_SIGMAS,
+            )
+        # noise of single fixes comes and goes, what is unexplained does not
+        seconds = (node.utime - self.compared_utime) * 1e-6
+        fade = math.exp(-seconds / ALLOWANCE_TIME)
+        suspicion = self.suspicion * math.exp(-seconds / SUSPICION_TIME)
+        return self._replace(
+            last=node,
+            suspicion=suspicion,
+            has_jumped=self.has_jumped and worst > THRESHOLD,
+            num_exceeded=self.num_exceeded + 1 if worst > THRESHOLD else 0,
+            compared_utime=node.utime,
+            horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
+            heading_allowance=max(min(heading, math.pi), fade * self.heading_allowance),
+        )
+
+    def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:
+        nodes = (*self.older, *self.newest)
+        # windows of about 1, 2, 4, 8 ... seconds are enough: each is half of the next
+        found, seconds = [], 1.0
+        for each in reversed(nodes):
+            age = (node.utime - each.utime) * 1e-6
+            if age >= seconds or each is nodes[0]:
+                found.append(compare_window(each, node, noise, settings))
+                seconds = 1.41 * age
+        return found
+
+    def check_trust(
+        self, node: PathNode, noise: PathNoise, settings: FilterSettings
+    ) -> tuple[ConsistencyMonitor, bool]:
+        """Return the monitor after a fix that is not trusted, and whether fixes agree with dead reckoning again."""
+        assert self.suspect is not None
+        if self.cause is Cause.HEADING:
+            size, sigma = (
+                abs(wrap_angle(self.rotation - self.suspect.rotation)),
+                get_turn_sigma(self.suspect, node, noise),
+            )
+            sigmas = size / sigma
+        else:
+            found = compare_window(self.suspect, node, noise, settings)
+            size, sigma, sigmas = abs(found.error), found.sigma, found.sigmas
+        largest = max(self.largest, size)
+        # where dead reckoning has become so uncertain that it would not contradict them any more, that is no agreement
+        agrees = sigmas <= AGREEMENT and largest > THRESHOLD * sigma
+        since = (self.agreed_since or node.utime) if agrees else 0
+        needed = JUMP_AGREEMENT_TIME if self.is_jump else AGREEMENT_TIME
+        return self._replace(agreed_since=since, largest=largest), agrees and (node.utime - since) * 1e-6 >= needed
+
+    def select_moved_alike(self, node: PathNode) -> tuple[PathNode, ...]:
+        """Return the nodes since which fixes, wherever they are, have moved as dead reckoning does; empty: too few."""
+        nodes = tuple(each for each in (*self.older, *self.newest) if each.utime >= self.moved_since)
+        if not nodes or node.seconds - nodes[0].seconds < NEW_TRUST_TIME:
+            return ()
+        return nodes if node.distance - nodes[0].distance > NEW_TRUST_DISTANCE else ()
+
+    @property
+    def has_turned(self) -> bool:
+        """Whether the vehicle has turned, since the heading has followed the gyro again, as one that drives does."""
+        own = [each.own_heading for each in (*self.older, *self.newest) if each.utime >= self.moved_since]
+        return sum(abs(wrap_angle(b - a)) for a, b in itertools.pairwise(own)) > OWN_TURNS
+
+    def find_cause(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
+        """Return what explains the discrepancies best, once enough fixes have exceeded the threshold.
+
+        That is the cause that leaves least of the squares of some window: a test of the likelihood ratio over cause and
+        time (GLR: M. Basseville and I. Nikiforov, "Detection of Abrupt Changes", 1993, 2.4.3). An error of the fixes is
+        assumed where no other cause explains clearly more; within DECISION_TIME one may still turn out to.
+        """
+        if self.num_exceeded < CONFIRMATIONS or (self.num_exceeded - CONFIRMATIONS) % REPEAT:
+            return None
+        if self.suspect is not None and (node.utime - self.since) * 1e-6 > DECISION_TIME:
+            return None
+        nodes = [each for each in (*self.older, *self.newest) if each.is_measured]
+        if not nodes:
+            return self._find_turned(node, noise, settings) if self.suspect is None else None
+        if len(nodes) < FEWEST_NODES:
+            return None
+        # every second of the older ones is enough
+        starts = [
+            *range(0, len(nodes) - len(self.newest), 2),
+            *range(max(len(nodes) - len(self.newest), 0), len(nodes)),
+        ]
+        explained: dict[Cause, Inconsistency] = {}
+        for k in starts:
+            for each in _explain(nodes[k], (*nodes[k + 1 :], node), noise, settings):
+                if each.cause not in explained or each.explained > explained[each.cause].explained:
+                    explained[each.cause] = each
+        best = max(explained.values(), key=lambda each: each.explained)
+        rest = max((each.explained for each in explained.values() if each is not best), default=0.0)
+        if best.cause is not Cause.GNSS and best.explained > rest + MARGIN:
+            return best
+        if self.suspect is not None:
+            return None
+        worst = max((compare_window(each, node, noise, settings) for each in nodes), key=lambda each: each.sigmas)
+        return explained[Cause.GNSS]._replace(discrepancy=worst, is_jump=self.has_jumped)
+
+    def _find_turned(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
+        """Return the window in which the heading has been turned most beside the gyro."""
+        nodes = [each for each in (*self.older, *self.newest) if each.has_gyro]
+        if not nodes:
+            return None
+
+        def count_sigmas(each: PathNode) -> float:
+            return abs(wrap_angle(self.rotation - each.rotation)) / get_turn_sigma(each, node, noise)
+
+        worst = max(nodes, key=count_sigmas)
+        change = wrap_angle(self.rotation - worst.rotation)
+        return Inconsistency(Cause.HEADING, compare_window(worst, node, noise, settings), change)
+
+
+def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:
+    """Return the standard deviation of what fixes may turn the heading by between two nodes, rad."""
+    seconds = end.seconds - start.seconds
+    variance = start.heading_variance + noise.heading * seconds + start.rate_variance * seconds**2
+    return math.sqrt(variance + end.lost - start.lost + COURSE_FLOOR**2)
+
+
+def _explain(
+    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
+) -> list[Inconsistency]:
+    """Return each cause of the discrepancies since a node, with the squares that it explains."""
+    rows = [compare_window(start, each._replace(latency=start.latency), noise, settings) for each in window]
+    errors = np.array([each.error for each in rows])
+    weights = np.sqrt([1.0 / (_get_fix_variance(start, each, noise, settings) + MODEL_ERROR**2) for each in window])
+    paths = np.array([each.displacement for each in rows])
+    seconds = np.array([each.seconds - start.seconds for each in window])
+    newest = rows[-1]
+    # the error of the first fix is in all differences
+    first = 1.0 / (start.white + 0.5 * start.correlated)
+    even = np.ones(len(window), dtype=complex)
+
+    def fit(*columns: Vector) -> tuple[Vector, float]:
+        """Return the factors of the columns beside an even error, and the weighted squares that remain."""
+        A = np.column_stack((even, 1j * even, *columns)) * weights[:, None]
+        prior = np.zeros((2, A.shape[1]))
+        prior[0, 0] = prior[1, 1] = first
+        full = np.vstack((A.real, A.imag, prior))
+        b = np.concatenate(((errors * weights).real, (errors * weights).imag, (0.0, 0.0)))
+        x, *_ = np.linalg.lstsq(full, b, rcond=None)
+        left = b - full @ x
+        return x[2:], float(left @ left)
+
+    _, everything = fit()
+    (vx, vy), by_drift = fit(seconds, 1j * seconds)
+    found = [Inconsistency(Cause.GNSS, newest, math.hypot(vx, vy), everything - by_drift)]
+    moments = np.array([_get_moment(start, each) for each in window])
+    velocities = np.array([each.velocity for each in window])
+    for cause, model in (
+        (Cause.GYRO, 1j * moments),
+        (Cause.WHEELS, paths),
+        # before the window too, and from its start on
+        (Cause.LATENCY, start.velocity - velocities),
+        (Cause.LATENCY, -velocities),
+    ):
+        (factor,), left = fit(model)
+        unlikely = (factor / TYPICAL_CHANGE[cause]) ** 2
+        if unlikely < 9.0 and left <= 2.0 * len(window) * LARGEST_REST:
+            found.append(Inconsistency(cause, newest, float(factor), everything - left - unlikely))
+    return found
+
+
+def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: FilterSettings) -> Discrepancy:
+    """Return the discrepancy (1) between two nodes."""
+    seconds = end.seconds - start.seconds
+    d = cmath.rect(1.0, start.rotation) * (end.path - start.path)
+    error = _shift_fix(end, end.latency) - _shift_fix(start, end.latency) - d
+    m = _get_moment(start, end)
+    driven = end.distance - start.distance
+    square = abs(d) ** 2
+    # white noises: slip and side slip that last slip_time, the gyros'
+    even = settings.slip_time * (
+        (settings.slip_ratio * driven) ** 2 / max(seconds, 1e-3) + settings.side_sigma**2 * seconds
+    )
+    across = start.heading_variance + noise.heading * seconds / 3.0 + end.lost - start.lost
+    x, y = d.real, d.imag
+    east = even + across * y * y + start.scale_variance * x * x + start.rate_variance * m.imag**2
+    north = even + across * x * x + start.scale_variance * y * y + start.rate_variance * m.real**2
+    cross = (start.scale_variance - across) * x * y - start.rate_variance * m.real * m.imag
+    fixes = _get_fix_variance(start, end, noise, settings)
+    fixes += end.latency_variance * abs(end.velocity - start.velocity) ** 2
+    a, b = east + fixes, north + fixes
+    ex, ey = error.real, error.imag
+    square_sum = (b * ex * ex - 2.0 * cross * ex * ey + a * ey * ey) / (a * b - cross * cross)
+    turn = turn_sigma = 0.0
+    if square > MIN_TURN_PATH**2:
+        turn = (error * d.conjugate()).imag / square
+        side = (a * y * y - 2.0 * cross * x * y + b * x * x) / square
+        turn_sigma = math.sqrt(side / square)
+    longest = math.sqrt(0.5 * (a + b) + math.hypot(0.5 * (a - b), cross))
+    return Discrepancy(
+        start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma
+    )
+
+
+class DriftFit(NamedTuple):
+    """How fixes have moved beside dead reckoning.
+
+    Attributes
+    ----------
+    turn, turn_sigma: rotation of the path to the fixes, rad.
+    drift, drift_sigma: of the fixes from the first to the last, and its largest standard deviation, m.
+    tolerance: standard deviation of the difference of two fixes at that interval, m.
+    seconds: from the first to the last.
+    """
+
+    turn: float
+    turn_sigma: float
+    drift: float
+    drift_sigma: float
+    tolerance: float
+    seconds: float
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether fixes are known to have moved as the path, whatever its heading."""
+        is_shown = self.drift_sigma <= STEADY_SIGMA * self.seconds
+        return is_shown and self.drift <= 2.0 * math.hypot(self.tolerance, self.drift_sigma)
+
+
+def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, settings: FilterSettings) -> DriftFit:
+    """Fit an offset, a drift, a rotation, a scale and a turn rate to the fixes of some nodes.
+
+    `rotation` is that from the path's axes to N now. A path that is straight does not show a drift: its standard
+    deviation is large then.
+    """
+    first, last = nodes[0], nodes[-1]
+    seconds = last.seconds - first.seconds
+    t = np.array([each.seconds - first.seconds for each in nodes]) / seconds
+    begin = _shift_fix(first, last.latency)
+    fixes = np.array([_shift_fix(each, last.latency) - begin for each in nodes])
+    paths = cmath.rect(1.0, rotation) * np.array([each.path - first.path for each in nodes])
+    moments = cmath.rect(1.0, rotation) * np.array(
+        [each.moment - first.moment - first.seconds * (each.path - first.path) for each in nodes]
+    )
+    # neighboring fixes share their time-correlated error
+    share = min((seconds / settings.gps_correlation_time + 1.0) / len(nodes), 1.0)
+    weights = np.sqrt([share / (each.white**2 + each.correlated**2) for each in nodes])
+    turn = cmath.phase(complex(np.vdot(paths - paths.mean(), fixes - fixes.mean())))
+    for _ in range(3):
+        spin = cmath.rect(1.0, turn)
+        columns = (np.ones(len(nodes)), 1j * np.ones(len(nodes)), t, 1j * t, 1j * spin * paths)
+        A = np.column_stack((*columns, spin * paths, 1j * spin * moments)) * weights[:, None]
+        b = (fixes - spin * paths) * weights
+        prior = np.diag((0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / first.scale_variance, 1.0 / first.rate_variance))
+        information = (A.conj().T @ A).real + prior
+        x = np.linalg.solve(information, (A.conj().T @ b).real)
+        turn += float(x[4])
+    P = np.linalg.inv(information)
+    longest = 0.5 * (P[2, 2] + P[3, 3]) + math.hypot(0.5 * (P[2, 2] - P[3, 3]), P[2, 3])
+    tolerance = math.sqrt(_get_fix_variance(first, last, noise._replace(inflation=1.0), settings))
+    return DriftFit(turn, math.sqrt(P[4, 4]), math.hypot(x[2], x[3]), math.sqrt(longest), tolerance, seconds)
+
+
+def _shift_fix(node: PathNode, latency: float) -> complex:
+    """Return the antenna by a fix of some latency at its stamp, along N, m: to the second order in turns."""
+    return node.fix + latency * node.velocity * (1.0 - 0.5j * latency * node.turn_rate)
+
+
+def _get_moment(start: PathNode, end: PathNode) -> complex:
+    """Return the integral of the time since a node along the path from there, along N, m s."""
+    turned = cmath.rect(1.0, start.rotation)
+    return turned * (end.moment - start.moment - start.seconds * (end.path - start.path))
+
+
+def _get_fix_variance(start: PathNode, end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
+    """Return the variance, along each axis, of the difference of two fixes, m2."""
+    seconds = end.seconds - start.seconds
+    changed = 2.0 * (1.0 - math.exp(-seconds / settings.gps_correlation_time))
+    variance = min(noise.inflation, MAX_INFLATION) * changed * start.correlated * end.correlated
+    return variance + start.white**2 + end.white**2

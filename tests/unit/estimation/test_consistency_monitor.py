@@ -1,0 +1,217 @@
+"""Consistency monitor: which fault it finds, and what it leaves alone, on paths with fixes that are made here."""
+
+from __future__ import annotations
+
+import cmath
+import math
+import random
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import pytest
+
+from modelserver.estimation.filter.consistency_monitor import (
+    AGREEMENT_TIME,
+    LONGEST_US,
+    Cause,
+    ConsistencyMonitor,
+    Inconsistency,
+    PathNode,
+    PathNoise,
+)
+from modelserver.estimation.filter.settings import FilterSettings
+
+SETTINGS = FilterSettings()
+NOISE = PathNoise(SETTINGS.gyro_noise**2, 1.0)
+PERIOD = 0.5
+WHITE, CORRELATED = 0.13, 0.9
+
+
+class Fault(NamedTuple):
+    """What is wrong from `begin` to `end`, seconds."""
+
+    begin: float = math.inf
+    end: float = math.inf
+    drift: complex = 0j
+    jump: complex = 0j
+    rate: float = 0.0
+    scale: float = 0.0
+    latency: float = 0.0
+
+
+class Step(NamedTuple):
+    """A fix in a drive."""
+
+    t: float
+    node: PathNode
+    monitor: ConsistencyMonitor
+    found: Inconsistency | None
+
+
+def drive(seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = True) -> Iterator[Step]:
+    """Yield the fixes of a vehicle at 2 to 6 m/s that turns now and then, and whose fixes no state follows."""
+    noise = random.Random(seed)
+    truth = antenna = wander = shift = 0j
+    yaw = error = 0.0
+    monitor = ConsistencyMonitor()
+    keep = math.exp(-PERIOD / SETTINGS.gps_correlation_time)
+    for n in range(round(seconds / PERIOD)):
+        t = n * PERIOD
+        is_wrong = fault.begin <= t < fault.end
+        speed = 4.0 + 2.0 * math.sin(t / 7.0)
+        velocity = cmath.rect(speed, yaw)
+        if is_wrong:
+            shift += fault.drift * PERIOD
+            error -= fault.rate * PERIOD
+        elif t >= fault.end:
+            shift = 0j
+        walk = complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
+        wander = keep * wander + CORRELATED * math.sqrt(1.0 - keep**2) * walk
+        white = WHITE * complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
+        late = fault.latency * velocity if is_wrong else 0j
+        fix = truth + wander + white + shift - late + (fault.jump if is_wrong else 0j)
+        utime = 1_000_000 + round(t * 1e6)
+        monitor = monitor.extend(utime, antenna)
+        node = PathNode(
+            utime=utime,
+            fix=fix,
+            antenna=antenna,
+            velocity=velocity,
+            turn_rate=0.0,
+            path=monitor.path,
+            moment=monitor.moment,
+            seconds=(utime - monitor.begin) * 1e-6,
+            rotation=monitor.rotation,
+            distance=monitor.distance,
+            heading_variance=0.01**2,
+            rate_variance=0.0003**2,
+            scale_variance=0.003**2,
+            has_gyro=True,
+            is_measured=is_measured,
+            own_heading=yaw + error,
+            latency=0.0,
+            latency_variance=0.02**2,
+            lost=monitor.lost,
+            white=WHITE,
+            correlated=CORRELATED,
+            position_covariance=(0.5, 0.5, 0.0),
+        )
+        monitor = monitor.compare(node, NOISE, SETTINGS)
+        found = monitor.find_cause(node, NOISE, SETTINGS)
+        monitor = monitor.append(node)
+        yield Step(t, node, monitor, found)
+        if found is not None:
+            monitor = monitor.resolve(found, utime)
+        truth += velocity * PERIOD
+        antenna += velocity * cmath.rect(PERIOD * (1.0 - (fault.scale if is_wrong else 0.0)), error)
+        yaw += PERIOD * (0.2 if math.sin(t / 15.0) > 0.5 else 0.0)
+
+
+def find(fault: Fault, seed: int = 1) -> Step:
+    """Return where an inconsistency is found, and its cause decided."""
+    found = [each for each in drive(fault.begin + 120.0, fault, seed) if each.found is not None]
+    return next((each for each in found[:2] if each.found and each.found.cause is not Cause.GNSS), found[0])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_given_fixes_as_the_model_has_them_then_nothing_is_found_and_the_bounds_hardly_grow(seed: int) -> None:
+    steps = list(drive(600.0, Fault(), seed))
+    assert all(each.found is None for each in steps)
+    allowances = sorted(each.monitor.horizontal_allowance for each in steps)
+    assert allowances[len(allowances) // 2] < CORRELATED
+
+
+@pytest.mark.parametrize("drift", [0.3, 0.5j, -1.0, 3.0j])
+@pytest.mark.parametrize("seed", range(3))
+def test_given_fixes_that_drift_then_gnss_is_the_cause_before_the_bound_is_exceeded(drift: complex, seed: int) -> None:
+    fault = Fault(200.0, drift=drift)
+    last = None
+    for each in drive(320.0, fault, seed):
+        if each.found is not None:
+            break
+        last = each
+    assert last is not None
+    assert each.found is not None
+    assert each.found.cause is Cause.GNSS
+    drifted = abs(drift) * (each.t - fault.begin)
+    # 5.6 sigma of a fix, and what the monitor allows for
+    assert drifted < 5.6 * CORRELATED + last.monitor.horizontal_allowance + 2.0 * abs(drift)
+
+
+@pytest.mark.parametrize("jump", [8.0, -30.0 + 40.0j])
+def test_given_fixes_that_jump_then_it_is_a_jump_of_gnss_within_seconds(jump: complex) -> None:
+    found = find(Fault(200.0, jump=jump))
+    assert found.found is not None
+    assert found.found.cause is Cause.GNSS
+    assert found.found.is_jump
+    assert found.t < 203.0
+    # dead reckoning goes on from before it
+    assert found.found.discrepancy.node.utime < 1_000_000 + 200_000_000
+
+
+@pytest.mark.parametrize("rate", [0.02, -0.02])
+def test_given_a_gyro_whose_bias_steps_then_it_is_mostly_found_to_be_the_cause_with_about_that_step(
+    rate: float,
+) -> None:
+    steps = [find(Fault(200.0, rate=rate), seed) for seed in range(6)]
+    assert all(each.t < 230.0 for each in steps)
+    changes = [each.found.change for each in steps if each.found and each.found.cause is Cause.GYRO]
+    # straight ahead a drift of the fixes explains as much: then it is assumed
+    assert len(changes) >= 4
+    assert all(each == pytest.approx(rate, rel=0.6) for each in changes)
+
+
+@pytest.mark.parametrize("scale", [0.15, -0.1])
+def test_given_wheels_that_slip_then_they_are_the_cause(scale: float) -> None:
+    found = find(Fault(200.0, scale=scale))
+    assert found.found is not None
+    assert found.found.cause is Cause.WHEELS
+    assert found.found.change == pytest.approx(scale, rel=0.4)
+
+
+def test_given_one_outlier_then_nothing_is_found() -> None:
+    fault = Fault(200.0, 200.9, jump=25.0)
+    assert all(each.found is None for each in drive(260.0, fault))
+
+
+def test_given_a_speed_that_nothing_measures_then_nothing_is_compared() -> None:
+    steps = list(drive(300.0, Fault(100.0, drift=1.0), is_measured=False))
+    assert all(each.found is None and each.monitor.horizontal_allowance == 0.0 for each in steps)
+
+
+def test_given_fixes_that_come_back_after_a_drift_then_they_are_trusted_after_the_time_of_agreement() -> None:
+    fault = Fault(200.0, 260.0, drift=0.5)
+    steps = iter(drive(330.0, fault))
+    found = next(each for each in steps if each.found is not None)
+    assert found.found is not None
+    trusted, since, largest = None, 0, 0.0
+    for each in steps:
+        monitor = each.monitor._replace(agreed_since=since, largest=largest)
+        monitor, agrees = monitor.check_trust(each.node, NOISE, SETTINGS)
+        since, largest = monitor.agreed_since, monitor.largest
+        if agrees:
+            trusted = each.t
+            break
+    assert trusted is not None
+    assert fault.end + AGREEMENT_TIME <= trusted < fault.end + 3.0 * AGREEMENT_TIME
+
+
+def test_given_hours_of_driving_then_the_nodes_are_few_and_none_is_too_old() -> None:
+    *_, last = drive(1200.0, Fault())
+    nodes = (*last.monitor.older, *last.monitor.newest)
+    assert len(nodes) < 70
+    assert last.node.utime - nodes[0].utime <= LONGEST_US
+    assert [each.utime for each in nodes] == sorted(each.utime for each in nodes)
+
+
+def test_given_a_correction_by_a_fix_then_the_path_does_not_move() -> None:
+    monitor = ConsistencyMonitor().extend(1_000_000, 0j).extend(2_000_000, 3 + 0j)
+    moved = monitor.correct(5 - 2j, 0.5).extend(3_000_000, 8 - 2j + cmath.rect(2.0, 0.5))
+    assert moved.path == pytest.approx(3 + 2 + 0j)
+    assert moved.distance == pytest.approx(5.0)
+
+
+def test_given_a_gap_in_the_fixes_then_the_path_begins_again() -> None:
+    monitor = ConsistencyMonitor().extend(1_000_000, 0j).extend(2_000_000, 3 + 0j).extend(9_000_000, 50 + 0j)
+    assert monitor.begin == 9_000_000
+    assert monitor.path == 0j
