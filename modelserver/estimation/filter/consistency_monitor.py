@@ -14,8 +14,12 @@ moment m = integral of (t - t_k) dd, and the noise of slip and of the gyros.
 Below the threshold, what is unexplained widens the protection levels: the position may have followed e, and the
 heading turned to explain it (`horizontal_allowance`, `heading_allowance`). Above it, one of the two is wrong, and the
 fits over all windows show which (`Cause`). A gyro whose bias has changed bends the path, e_j = i b m_j; wheels that
-slip scale it, e_j = s d_j; a latency that has changed displaces it, e_j = -l (v_j - v_k). None explains fixes that
-drift, e_j = v (t_j - t_k), in turns and changes of speed, or that jump.
+slip scale it, e_j = s d_j; a latency that has changed displaces it, e_j = -l (v_j - v_k); an antenna that is elsewhere
+turns with the vehicle, e_j = (exp(i psi_j) - exp(i psi_k)) a. None explains fixes that drift, e_j = v (t_j - t_k), in
+turns and changes of speed, or that jump. Each fit has the covariance of (1) over the window and the errors u of the
+state as parameters with their sigmas; what it explains is its evidence, so a cause with more parameters does not win by
+that. The path is replayed with bias and scale as they were (`replay_path`), since a state that follows the fixes hides
+what has changed.
 
 What is corrected leaves an allowance that decays. Fixes that jump are not used, and dead reckoning is right for a
 while. Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of
@@ -70,6 +74,10 @@ ALLOWED: Final = 1.5
 ALLOWANCE_TIME: Final = 10.0
 """Seconds in which an allowance decays: about a turn, or as many fixes as show a heading."""
 
+SHRINK_TIME: Final = 5.0
+"""Seconds in which the bound of the heading shrinks, at least: a single fix after an outage may err otherwise than
+modeled."""
+
 SUSPICION_TIME: Final = 60.0
 """Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes."""
 
@@ -102,6 +110,12 @@ NEW_TRUST_TIME: Final = 120.0
 NEW_TRUST_DISTANCE: Final = 20.0
 """Seconds, and meters, for which fixes must move as dead reckoning does to be trusted again wherever they are."""
 
+LARGEST_UNMEASURED: Final = 1.0
+"""Meters of that distance that wheels need not have measured."""
+
+LARGEST_LOST: Final = 0.05
+"""Standard deviation of the heading, rad, that gaps of the IMU may have cost in that time."""
+
 OWN_TURNS: Final = 3.0
 """Radians that a vehicle turns by, while its heading follows the gyro, that drives by itself again."""
 
@@ -114,7 +128,10 @@ LARGEST_REST: Final = 2.0
 MODEL_ERROR: Final = 0.05
 """Meters that no cause explains, as slip that comes and goes: with fixes of centimeters."""
 
-DECISION_TIME: Final = 20.0
+LARGEST_TURN_SIGMA: Final = 0.2
+"""Standard deviation of the path's turn since the start of a window, rad, beyond which a fit is no longer linear."""
+
+DECISION_TIME: Final = 90.0
 REPEAT: Final = 4
 """Seconds for which the causes are compared again, and fixes from one comparison to the next."""
 
@@ -133,10 +150,20 @@ class Cause(Enum):
     GYRO = "gyro"
     WHEELS = "wheels"
     LATENCY = "latency"
+    LEVER_ARM = "lever_arm"
 
 
 TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
 """Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
+
+
+LARGEST_FIX_SIGMA: Final = 0.2
+"""Standard deviation of fixes, m, that show an error of the lever arm."""
+
+TYPICAL_DRIFT: Final = 1.0
+TYPICAL_JUMP: Final = 10.0
+TYPICAL_LEVER_ARM: Final = 0.5
+"""Sigma of a drift of fixes, m/s, of a jump, m, and of an error of the lever arm, m, that are a fault."""
 
 
 class PathNoise(NamedTuple):
@@ -157,12 +184,13 @@ class PathNode(NamedTuple):
     moment: integral of time along the path, m s, and `seconds` the time, both since the start of the path.
     rotation: yaw from the path's axes to N, rad.
     distance: travelled, m.
-    heading_variance, rate_variance, scale_variance: of the heading (rad2), the yaw gyro's bias ((rad/s)2) and the
-        wheels' scale.
+    rate_bias, scale: of the yaw gyro, rad/s, and of the wheels, by the state.
+    heading_variance, rate_variance, scale_variance: of the heading (rad2), and of those.
     has_gyro, is_measured: whether a gyro measures the turns, and wheels the path too.
     own_heading: by the gyro alone, along the path's axes, rad.
     latency, latency_variance: of fixes, s and s2.
     lost: variance of the heading that was lost in gaps of the IMU since the start of the path, rad2.
+    unmeasured: the part of `distance` whose length nothing measured, m.
     white, correlated: standard deviations of the two errors of the fix, m.
     position_covariance: of the state's position: east, north, cross, m2.
     """
@@ -177,6 +205,8 @@ class PathNode(NamedTuple):
     seconds: float
     rotation: float
     distance: float
+    rate_bias: float
+    scale: float
     heading_variance: float
     rate_variance: float
     scale_variance: float
@@ -186,6 +216,7 @@ class PathNode(NamedTuple):
     latency: float
     latency_variance: float
     lost: float
+    unmeasured: float
     white: float
     correlated: float
     position_covariance: tuple[float, float, float]
@@ -219,14 +250,17 @@ class Inconsistency(NamedTuple):
     """What explains fixes that do not agree with the path, over the window with the largest discrepancy.
 
     `change` is that of the heading (rad), of the gyro's bias (rad/s), of the wheels' scale, of the latency (s), or the
-    drift (m/s); `explained` are the weighted squares that it explains. `is_jump`: the fixes left the path at once, as
-    no error of dead reckoning does.
+    drift (m/s); `explained` is twice the logarithm of its evidence beside that of no cause. `turned`: by which the
+    state has turned beside a gyro of the former bias, rad. `is_jump`: the fixes left the path at once, as no error of
+    dead reckoning does. `lever_arm`: the antenna beside its place in the geometry, forward + i left, m.
     """
 
     cause: Cause
     discrepancy: Discrepancy
     change: float = 0.0
     explained: float = 0.0
+    turned: float = 0.0
+    lever_arm: complex = 0j
     is_jump: bool = False
 
 
@@ -238,7 +272,7 @@ class ConsistencyMonitor(NamedTuple):
     utime: of the anchor; 0: the path has not begun.
     anchor: the antenna by the state at the last fix and after what corrected it since, along N, m.
     begin: start of the path.
-    path, moment, rotation, distance, lost: as in `PathNode`.
+    path, moment, rotation, distance, lost, unmeasured: as in `PathNode`.
     older, newest: the nodes, the oldest first.
     num_exceeded: fixes in a row beyond the threshold.
     compared_utime: of the last fix within it.
@@ -249,6 +283,8 @@ class ConsistencyMonitor(NamedTuple):
     largest: discrepancy of the fixes since then, m.
     agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
     horizontal_allowance, heading_allowance: what is unexplained, m and rad.
+    held: bound of the heading before the last fix, rad, at `held_utime`.
+    lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
     suspicion: what was taken for an error of gyro or wheels, and may have been one of the fixes, m.
     """
 
@@ -260,6 +296,7 @@ class ConsistencyMonitor(NamedTuple):
     rotation: float = 0.0
     distance: float = 0.0
     lost: float = 0.0
+    unmeasured: float = 0.0
     older: tuple[PathNode, ...] = ()
     newest: tuple[PathNode, ...] = ()
     num_exceeded: int = 0
@@ -275,6 +312,9 @@ class ConsistencyMonitor(NamedTuple):
     agreed_since: int = 0
     horizontal_allowance: float = 0.0
     heading_allowance: float = 0.0
+    held: float = 0.0
+    held_utime: int = 0
+    lever_arm: complex = 0j
     suspicion: float = 0.0
 
     @property
@@ -291,9 +331,11 @@ class ConsistencyMonitor(NamedTuple):
         """Return the monitor after an inconsistency was found at `utime`: what is corrected begins again."""
         if found.cause not in (Cause.GNSS, Cause.HEADING):
             # the uncertainty of a latency that was corrected covers what is left
-            cause = None if found.cause is Cause.LATENCY else found.cause
+            cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error))
             path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None)
+            if found.cause is Cause.LEVER_ARM:
+                path = path._replace(lever_arm=self.lever_arm + found.lever_arm)
             return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
         suspect = found.discrepancy.node
         return self._replace(
@@ -306,11 +348,14 @@ class ConsistencyMonitor(NamedTuple):
             agreed_since=0,
         )
 
-    def extend(self, utime: int, antenna: complex) -> ConsistencyMonitor:
-        """Return the monitor with the path continued to the antenna by the state (along N, m) before a fix."""
+    def extend(self, utime: int, antenna: complex, *, is_measured: bool) -> ConsistencyMonitor:
+        """Return the monitor with the path continued to the antenna by the state (along N, m) before a fix.
+
+        `is_measured`: whether wheels measure the speed.
+        """
         gap = (utime - self.utime) * 1e-6
         if not self.utime or (gap > MAX_GAP and self.suspect is None):
-            return ConsistencyMonitor(utime, antenna, utime, cause=self.cause, since=self.since)
+            return self.restart()._replace(utime=utime, anchor=antenna, begin=utime, cause=self.cause, since=self.since)
         step = (antenna - self.anchor) * cmath.rect(1.0, -self.rotation)
         seconds = (0.5 * (utime + self.utime) - self.begin) * 1e-6
         return self._replace(
@@ -319,15 +364,32 @@ class ConsistencyMonitor(NamedTuple):
             path=self.path + step,
             moment=self.moment + seconds * step,
             distance=self.distance + abs(step),
+            unmeasured=self.unmeasured + (0.0 if is_measured else abs(step)),
         )
+
+    def restart(self) -> ConsistencyMonitor:
+        """Return the monitor before a new path, with what lasts."""
+        return ConsistencyMonitor(held=self.held, held_utime=self.held_utime, lever_arm=self.lever_arm)
 
     def correct(self, shift: complex, turn: float) -> ConsistencyMonitor:
         """Return the monitor after a fix moved the state by `shift`, m, and turned it by `turn`, rad: not the path."""
         return self._replace(anchor=self.anchor + shift, rotation=self.rotation + turn)
 
-    def lose_heading(self, variance: float) -> ConsistencyMonitor:
-        """Return the monitor after a gap in which only wheels measured the turns: `variance` is theirs, rad2."""
-        return self._replace(lost=self.lost + variance)
+    def hold_heading(self, level: float, utime: int) -> ConsistencyMonitor:
+        """Return the monitor with the bound of the heading before a fix; `level`: the covariance's, rad."""
+        return self._replace(held=self.bound_heading(level, utime), held_utime=utime)
+
+    def bound_heading(self, level: float, utime: int) -> float:
+        """Return the bound of the heading, rad, with what is unexplained; `level`: the covariance's."""
+        held = self.held * math.exp(min(self.held_utime - utime, 0) * 1e-6 / SHRINK_TIME)
+        return min(max(level + self.heading_allowance, held), math.pi)
+
+    def lose(self, heading: float, distance: float) -> ConsistencyMonitor:
+        """Return the monitor after a gap of the IMU, with what the path lost: variance, rad2, and distance, m."""
+        after = self._replace(lost=self.lost + heading, unmeasured=self.unmeasured + distance)
+        if self.suspect is None and (heading > LARGEST_TURN_SIGMA**2 or distance > LARGEST_UNMEASURED):
+            return after._replace(older=(), newest=(), last=None, num_exceeded=0)
+        return after
 
     def end_exclusion(self) -> ConsistencyMonitor:
         """Return the monitor after the state was set to fixes that have jumped, and are not trusted."""
@@ -340,6 +402,8 @@ class ConsistencyMonitor(NamedTuple):
             return self
         if self.num_exceeded and self.suspect is None:
             return self
+        if node.heading_variance > LARGEST_TURN_SIGMA**2:
+            return self  # the path has no direction yet
         while newest and node.utime - newest[0].utime > NEWEST_US:
             if not older or newest[0].utime - older[-1].utime >= OLDER_SPACING_US:
                 older = (*older, newest[0])
@@ -439,7 +503,13 @@ class ConsistencyMonitor(NamedTuple):
 
     def select_moved_alike(self, node: PathNode) -> tuple[PathNode, ...]:
         """Return the nodes since which fixes, wherever they are, have moved as dead reckoning does; empty: too few."""
-        nodes = tuple(each for each in (*self.older, *self.newest) if each.utime >= self.moved_since)
+        nodes = tuple(
+            each
+            for each in (*self.older, *self.newest)
+            if each.utime >= self.moved_since
+            and node.unmeasured - each.unmeasured < LARGEST_UNMEASURED
+            and node.lost - each.lost < LARGEST_LOST**2
+        )
         if not nodes or node.seconds - nodes[0].seconds < NEW_TRUST_TIME:
             return ()
         return nodes if node.distance - nodes[0].distance > NEW_TRUST_DISTANCE else ()
@@ -453,9 +523,9 @@ class ConsistencyMonitor(NamedTuple):
     def find_cause(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
         """Return what explains the discrepancies best, once enough fixes have exceeded the threshold.
 
-        That is the cause that leaves least of the squares of some window: a test of the likelihood ratio over cause and
-        time (GLR: M. Basseville and I. Nikiforov, "Detection of Abrupt Changes", 1993, 2.4.3). An error of the fixes is
-        assumed where no other cause explains clearly more; within DECISION_TIME one may still turn out to.
+        That is the cause with the largest evidence over some window: a test of the likelihood ratio over cause and time
+        (GLR: M. Basseville and I. Nikiforov, "Detection of Abrupt Changes", 1993, 2.4.3), with priors. An error of the
+        fixes is assumed where no other cause explains clearly more; within DECISION_TIME one may still turn out to.
         """
         if self.num_exceeded < CONFIRMATIONS or (self.num_exceeded - CONFIRMATIONS) % REPEAT:
             return None
@@ -466,14 +536,13 @@ class ConsistencyMonitor(NamedTuple):
             return self._find_turned(node, noise, settings) if self.suspect is None else None
         if len(nodes) < FEWEST_NODES:
             return None
-        # every second of the older ones is enough
-        starts = [
-            *range(0, len(nodes) - len(self.newest), 2),
-            *range(max(len(nodes) - len(self.newest), 0), len(nodes)),
-        ]
-        explained: dict[Cause, Inconsistency] = {}
-        for k in starts:
-            for each in _explain(nodes[k], (*nodes[k + 1 :], node), noise, settings):
+        worst = max((compare_window(each, node, noise, settings) for each in nodes), key=lambda each: each.sigmas)
+        explained = {Cause.GNSS: Inconsistency(Cause.GNSS, worst)}
+        for k, start in enumerate(nodes):
+            turn = start.heading_variance + start.rate_variance * (node.seconds - start.seconds) ** 2
+            if turn > LARGEST_TURN_SIGMA**2:
+                continue
+            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings):
                 if each.cause not in explained or each.explained > explained[each.cause].explained:
                     explained[each.cause] = each
         best = max(explained.values(), key=lambda each: each.explained)
@@ -482,7 +551,6 @@ class ConsistencyMonitor(NamedTuple):
             return best
         if self.suspect is not None:
             return None
-        worst = max((compare_window(each, node, noise, settings) for each in nodes), key=lambda each: each.sigmas)
         return explained[Cause.GNSS]._replace(discrepancy=worst, is_jump=self.has_jumped)
 
     def _find_turned(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
@@ -510,32 +578,50 @@ def _explain(
     start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
 ) -> list[Inconsistency]:
     """Return each cause of the discrepancies since a node, with the squares that it explains."""
-    rows = [compare_window(start, each._replace(latency=start.latency), noise, settings) for each in window]
+    path = replay_path(start, window)
+    rows = [compare_window(start, each, noise, settings) for each in path]
     errors = np.array([each.error for each in rows])
-    weights = np.sqrt([1.0 / (_get_fix_variance(start, each, noise, settings) + MODEL_ERROR**2) for each in window])
+    whiten = np.linalg.inv(np.linalg.cholesky(_get_window_covariance(start, window, noise, settings)))
     paths = np.array([each.displacement for each in rows])
     seconds = np.array([each.seconds - start.seconds for each in window])
     newest = rows[-1]
-    # the error of the first fix is in all differences
-    first = 1.0 / (start.white + 0.5 * start.correlated)
     even = np.ones(len(window), dtype=complex)
-
-    def fit(*columns: Vector) -> tuple[Vector, float]:
-        """Return the factors of the columns beside an even error, and the weighted squares that remain."""
-        A = np.column_stack((even, 1j * even, *columns)) * weights[:, None]
-        prior = np.zeros((2, A.shape[1]))
-        prior[0, 0] = prior[1, 1] = first
-        full = np.vstack((A.real, A.imag, prior))
-        b = np.concatenate(((errors * weights).real, (errors * weights).imag, (0.0, 0.0)))
-        x, *_ = np.linalg.lstsq(full, b, rcond=None)
-        left = b - full @ x
-        return x[2:], float(left @ left)
-
-    _, everything = fit()
-    (vx, vy), by_drift = fit(seconds, 1j * seconds)
-    found = [Inconsistency(Cause.GNSS, newest, math.hypot(vx, vy), everything - by_drift)]
-    moments = np.array([_get_moment(start, each) for each in window])
+    moments = np.array([_get_moment(start, each) for each in path])
     velocities = np.array([each.velocity for each in window])
+    # the errors of the path as the state knows them
+    usual = (
+        (1j * paths, math.sqrt(start.heading_variance)),
+        (paths, math.sqrt(start.scale_variance)),
+        (1j * moments, math.sqrt(start.rate_variance)),
+    )
+
+    def fit(*unusual: tuple[Vector, float]) -> tuple[Vector, float, float]:
+        """Return the factors of columns, with their sigmas, the squares that remain, and -2 log of the evidence."""
+        columns, sigmas = zip(*usual, *unusual, strict=True)
+        A = whiten @ np.column_stack(columns)
+        full = np.vstack((A.real, A.imag, np.diag([1.0 / each for each in sigmas])))
+        e = whiten @ errors
+        b = np.concatenate((e.real, e.imag, np.zeros(len(sigmas))))
+        information = full.T @ full
+        x = np.linalg.solve(information, full.T @ b)
+        rest = b - full @ x
+        left = float(rest @ rest)
+        size = float(np.linalg.slogdet(information)[1]) + 2.0 * sum(map(math.log, sigmas))
+        return x[len(usual) :], left, left + size
+
+    _, _, none = fit()
+    yaws = np.array([each.rotation + each.own_heading for each in (start, *window)])
+    turns = np.exp(1j * yaws[1:]) - cmath.rect(1.0, yaws[0])
+    found = []
+    for cause, model, sigma in (
+        (Cause.GNSS, seconds, TYPICAL_DRIFT),
+        (Cause.GNSS, even, TYPICAL_JUMP),
+        # other fixes err by more than any lever arm
+        *(((Cause.LEVER_ARM, turns, TYPICAL_LEVER_ARM),) if start.correlated < LARGEST_FIX_SIGMA else ()),
+    ):
+        (a, b), left, evidence = fit((model, sigma), (1j * model, sigma))
+        if cause is Cause.GNSS or left <= 2.0 * len(window) * LARGEST_REST:
+            found.append(Inconsistency(cause, newest, math.hypot(a, b), none - evidence, lever_arm=complex(a, b)))
     for cause, model in (
         (Cause.GYRO, 1j * moments),
         (Cause.WHEELS, paths),
@@ -543,10 +629,48 @@ def _explain(
         (Cause.LATENCY, start.velocity - velocities),
         (Cause.LATENCY, -velocities),
     ):
-        (factor,), left = fit(model)
-        unlikely = (factor / TYPICAL_CHANGE[cause]) ** 2
-        if unlikely < 9.0 and left <= 2.0 * len(window) * LARGEST_REST:
-            found.append(Inconsistency(cause, newest, float(factor), everything - left - unlikely))
+        (factor,), left, evidence = fit((model, TYPICAL_CHANGE[cause]))
+        if left <= 2.0 * len(window) * LARGEST_REST:
+            turned = path[-1].rotation - start.rotation
+            found.append(Inconsistency(cause, newest, float(factor), none - evidence, turned=turned))
+    return found
+
+
+def _get_window_covariance(
+    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
+) -> Vector:
+    """Return the covariance of the discrepancies since a node along one axis, m2: of the fixes and of slip."""
+    t = np.array([each.seconds - start.seconds for each in window])
+    tau = settings.gps_correlation_time
+    near = np.exp(-np.abs(t[:, None] - t) / tau)
+    first = np.exp(-t / tau)
+    correlated = min(noise.inflation, MAX_INFLATION) * start.correlated * window[-1].correlated
+    C = correlated * (near - first[:, None] - first + 1.0) + start.white**2
+    speed = (window[-1].distance - start.distance) / t[-1]
+    slip = settings.slip_time * ((settings.slip_ratio * speed) ** 2 + settings.side_sigma**2)
+    C += slip * np.minimum(t[:, None], t)
+    unmeasured = np.array([each.unmeasured - start.unmeasured for each in window])
+    C += np.outer(unmeasured, unmeasured)
+    return np.asarray(C + np.diag([each.white**2 + MODEL_ERROR**2 for each in window]))
+
+
+def replay_path(start: PathNode, window: tuple[PathNode, ...]) -> list[PathNode]:
+    """Return the nodes of a window as they are with the gyro's bias, the wheels' scale and the latency of its start.
+
+    A state that follows the fixes changes all three, and so hides what has changed.
+    """
+    found, before, turned = [], start, 0.0
+    path, moment = start.path, start.moment
+    for each in window:
+        seconds = each.seconds - before.seconds
+        turn = (0.5 * (each.rate_bias + before.rate_bias) - start.rate_bias) * seconds
+        factor = cmath.rect(1.0 + 0.5 * (each.scale + before.scale) - start.scale, turned + 0.5 * turn)
+        turned += turn
+        path += factor * (each.path - before.path)
+        moment += factor * (each.moment - before.moment)
+        rotation = each.rotation - turned
+        found.append(each._replace(path=path, moment=moment, rotation=rotation, latency=start.latency))
+        before = each
     return found
 
 
@@ -562,11 +686,14 @@ def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: F
     even = settings.slip_time * (
         (settings.slip_ratio * driven) ** 2 / max(seconds, 1e-3) + settings.side_sigma**2 * seconds
     )
+    even += (end.unmeasured - start.unmeasured) ** 2
     across = start.heading_variance + noise.heading * seconds / 3.0 + end.lost - start.lost
+    # a turn shortens the path along itself: to the second order, E (1 - cos)^2
+    along = start.scale_variance + 0.75 * across * across
     x, y = d.real, d.imag
-    east = even + across * y * y + start.scale_variance * x * x + start.rate_variance * m.imag**2
-    north = even + across * x * x + start.scale_variance * y * y + start.rate_variance * m.real**2
-    cross = (start.scale_variance - across) * x * y - start.rate_variance * m.real * m.imag
+    east = even + across * y * y + along * x * x + start.rate_variance * m.imag**2
+    north = even + across * x * x + along * y * y + start.rate_variance * m.real**2
+    cross = (along - across) * x * y - start.rate_variance * m.real * m.imag
     fixes = _get_fix_variance(start, end, noise, settings)
     fixes += end.latency_variance * abs(end.velocity - start.velocity) ** 2
     a, b = east + fixes, north + fixes

@@ -6,12 +6,13 @@ or wheels that err are corrected by the fit, and then by the fixes.
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, heading_alignment
+from modelserver.estimation.filter import eskf, heading_alignment, protection_levels
 from modelserver.estimation.filter.consistency_monitor import (
     CONFIRMATIONS,
     Cause,
@@ -55,7 +56,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
     has_gyro = setup.uses_imu(state.common.mode)
     return PathNode(
         nav.utime,
-        newest.position,
+        newest.position - cmath.rect(1.0, nav.yaw) * monitor.lever_arm,
         newest.path,
         velocity,
         nav.angular_rate[2],
@@ -64,6 +65,8 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
         (nav.utime - monitor.begin) * 1e-6,
         monitor.rotation,
         monitor.distance,
+        nav.gyro_bias[2],
+        nav.extras[layout.extra_index(SCALE)] if SCALE in layout else 0.0,
         float(P[8, 8]),
         float(P[11, 11]),
         float(P[layout.index(SCALE), layout.index(SCALE)]) if SCALE in layout else 1e-4,
@@ -73,6 +76,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
         nav.extras[layout.extra_index(LATENCY)],
         float(P[layout.index(LATENCY), layout.index(LATENCY)]),
         monitor.lost,
+        monitor.unmeasured,
         newest.white,
         newest.correlated,
         (float(P[0, 0]), float(P[1, 1]), float(P[0, 1])),
@@ -89,7 +93,8 @@ def compare_path(
     settings, P = setup.settings, state.nav.covariance
     if not math.isfinite(P[0, 0] + P[8, 8] + P[11, 11]):
         return state, ()  # it has diverged
-    monitor = state.consistency.extend(newest.utime, newest.path)
+    is_measured = state.common.measures_wheel_speed(newest.utime)
+    monitor = state.consistency.extend(newest.utime, newest.path, is_measured=is_measured)
     is_gap = setup.uses_imu(state.common.mode) and newest.utime - state.imu.used_utime > 1e6 * settings.rate_hold
     if is_gap or not is_compared:
         return state._replace(consistency=monitor), ()
@@ -111,7 +116,7 @@ def compare_path(
                 # what is rejected cannot turn the heading
                 return state._replace(consistency=monitor._replace(moved_since=node.utime)), ()
             if alike and monitor.has_turned:
-                state = state._replace(consistency=ConsistencyMonitor())
+                state = state._replace(consistency=monitor.restart())
                 return state, (report_event(state, KIND, Verdict.USED, "the vehicle moves as its heading turns again"),)
             return state, ()
         if alike and (realigned := _realign(setup, state, newest, alike, noise)) is not None:
@@ -147,10 +152,10 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
     text = "fixes are trusted again: they agree with dead reckoning"
     if monitor.cause is Cause.HEADING:
         text = "the vehicle moves along its own axis again"
-    after = state._replace(consistency=ConsistencyMonitor())
     if monitor.excludes_fixes:
-        after = after._replace(gnss=state.gnss.restart(newest.utime))
+        after = state._replace(consistency=monitor.restart(), gnss=state.gnss.restart(newest.utime))
         return after, (report_event(after, KIND, Verdict.USED, text),)
+    after = state._replace(consistency=_hold(setup, state).restart())
     # the fixes have turned the state since
     P = state.nav.covariance.copy()
     P[8, 8] += (monitor.rotation - monitor.suspect.rotation) ** 2
@@ -162,19 +167,31 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 
+def _hold(setup: Setup, state: Aligned) -> ConsistencyMonitor:
+    """Return the monitor with the bound of the heading before a correction."""
+    level = protection_levels.compute_heading(float(state.nav.covariance[8, 8]), setup.settings)
+    return state.consistency.hold_heading(level, state.nav.utime)
+
+
 def _realign(
     setup: Setup, state: Aligned, newest: PathFix, alike: tuple[PathNode, ...], noise: PathNoise
 ) -> Aligned | None:
-    """Return the state at a fix, in a new epoch, with the heading that fixes and path show; None if they do not."""
-    nav = state.nav
+    """Return the state in a new epoch with the heading that fixes and path show; None if they do not show it."""
+    nav, held = state.nav, _hold(setup, state)
     fit = fit_drift(alike, state.consistency.rotation, noise, setup.settings)
     if not fit.is_steady or fit.turn_sigma > setup.settings.align_sigma:
         return None
-    P = nav.covariance.copy()
-    P[8, :] = P[:, 8] = 0.0
-    nav = heading_alignment.rotate(nav._replace(covariance=P), Rotation(fit.turn, fit.turn_sigma), setup.layout)
-    state = _place(setup, state._replace(nav=nav._replace(position=state.nav.position)), newest)
-    return state._replace(consistency=ConsistencyMonitor())
+    sigma = math.sqrt(float(nav.covariance[8, 8]))
+    if abs(fit.turn) > 2.0 * math.hypot(sigma, fit.turn_sigma):
+        P = nav.covariance.copy()
+        P[8, :] = P[:, 8] = 0.0
+        nav = _turn(nav._replace(covariance=P), fit.turn, fit.turn_sigma, setup.layout)
+    state = state._replace(nav=nav)
+    if state.gnss.num_rejected:
+        state = _place(setup, state, newest)
+    else:
+        state = state._replace(common=state.common._replace(epoch=state.common.epoch + 1))
+    return state._replace(consistency=held.restart())
 
 
 def _place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
@@ -191,20 +208,23 @@ def _resolve(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[NavSta
     layout, nav, start = setup.layout, state.nav, found.discrepancy.node
     seconds = (nav.utime - start.utime) * 1e-6
     text = f"fixes are {abs(found.discrepancy.error):.1f} m off the path of the last {seconds:.0f} s: "
-    # the fixes have turned the state by a part of it already
-    turned = state.consistency.rotation - start.rotation
+    # the state has followed the fixes by a part of it already
     if found.cause is Cause.GYRO:
         whole = found.change * seconds
-        nav = _turn(nav, whole - turned, FIT_SHARE * abs(whole), layout)
-        nav = _correct(nav, 11, -found.change, layout)
+        nav = _turn(nav, whole - found.turned, FIT_SHARE * abs(whole), layout)
+        nav = _correct(nav, 11, start.rate_bias - found.change - nav.gyro_bias[2], layout)
         return nav, text + f"the gyro's bias has changed by {math.degrees(found.change):.2f} deg/s"
     if found.cause is Cause.WHEELS and SCALE in layout:
-        nav = _correct(nav, layout.index(SCALE), -found.change, layout)
+        followed = nav.extras[layout.extra_index(SCALE)] - start.scale
+        nav = _correct(nav, layout.index(SCALE), -found.change - followed, layout)
         return nav, text + f"the wheels' scale has changed by {-100.0 * found.change:.1f} %"
     if found.cause is Cause.LATENCY:
         followed = nav.extras[layout.extra_index(LATENCY)] - start.latency
         nav = _correct(nav, layout.index(LATENCY), found.change - followed, layout)
         return nav, text + f"they are {found.change:.2f} s later than before"
+    if found.cause is Cause.LEVER_ARM:
+        x, y = found.lever_arm.real, found.lever_arm.imag
+        return nav, text + f"the antenna is {x:.2f} m forward and {y:.2f} m left of where the geometry states it"
     if found.cause is Cause.HEADING:
         return nav, f"the vehicle moves {math.degrees(abs(found.change)):.0f} deg beside its own axis"
     if found.is_jump:

@@ -35,6 +35,11 @@ from modelserver.messages import (
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
 
+HELD_SPEED: Final = 1.5
+HELD_TURN: Final = 0.05
+HELD_RATE: Final = 0.01
+"""Sigma of the speed (m/s), the turn (rad) and the gyro's bias (rad/s) after a mistaken rest of seconds."""
+
 ZUPT_PERIOD: Final = 0.2
 """Seconds between two zero-velocity updates."""
 
@@ -207,6 +212,14 @@ def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
     (x, y, _), (a, b, _) = nav.point(lever), before.point(lever)
     turn = wrap_angle(nav.yaw - before.yaw)
     return state._replace(consistency=state.consistency.correct(complex(x - a, y - b), turn))
+
+
+def release_motion(state: N) -> N:
+    """Return the state with the uncertainty of a vehicle that was held to be stationary, and is not."""
+    P = state.nav.covariance.copy()
+    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (8, HELD_TURN), (11, HELD_RATE)):
+        P[axis, axis] += sigma * sigma
+    return state._replace(nav=state.nav._replace(covariance=P))
 
 
 def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:

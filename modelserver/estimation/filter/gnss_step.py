@@ -22,6 +22,7 @@ from modelserver.estimation.filter import (
     latency_estimator,
     leveling,
     propagation,
+    protection_levels,
 )
 from modelserver.estimation.filter.eskf import Earth, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
@@ -204,6 +205,8 @@ def _fuse_aligned(
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
         state = correct_path(setup, state, uncorrected)
+        level = protection_levels.compute_heading(float(nav.covariance[8, 8]), settings)
+        state = state._replace(consistency=state.consistency.hold_heading(level, nav.utime))
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)
         nav = latency_estimator.inflate_latency(

@@ -24,6 +24,8 @@ from modelserver.estimation.filter.fusion import (
     fuse_constraint,
     fuse_non_holonomic,
     reject,
+    release_motion,
+    report_event,
     report_reset,
 )
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
@@ -31,11 +33,19 @@ from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Decision, ImuSample, Mode, Verdict
 
 BIAS_AGE: Final = 600.0
 """Seconds for which gyro biases that a restart continues with may have drifted: few vehicles drive longer without a
 stop."""
+
+LARGEST_CONTRADICTION: Final = 0.4
+CONTRADICTION_GAIN: Final = 0.1
+"""Mean NIS of ZUPT, relative to its gate, of a vehicle that is not stationary, and the weight of one; usual is 0.1."""
+
+LARGEST_RATIO: Final = 10.0
+"""Largest share of one, relative to its gate."""
 
 LOST_ATTITUDE_SIGMA: Final = 0.7
 """Sigma of the attitude, rad, beyond which a gap in the IMU makes the filter level again."""
@@ -84,8 +94,10 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
             restarted = Leveling(state.common.restart())
             return restarted, (report_reset(item, "leveling again after a gap in the IMU samples"),)
         if isinstance(state, Aligned):
-            lost = setup.coasting.gyro * (utime - state.imu.used_utime) * 1e-6
-            state = state._replace(consistency=state.consistency.lose_heading(lost))
+            gap = (utime - state.imu.used_utime) * 1e-6
+            silent = min(gap, (utime - state.common.wheels.used_utime) * 1e-6)
+            turned, moved = setup.coasting.gyro * gap, 0.5 * settings.gap_acceleration * silent**2
+            state = state._replace(consistency=state.consistency.lose(turned, moved))
         decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
     state, more = _fuse_constraints(setup, state, utime)
@@ -164,6 +176,15 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
     innovation = constraints.zero_velocity(create_context(setup, state), dt)
     state, decision = fuse_constraint(setup, state, constraints.ZERO_VELOCITY, innovation)
     decisions: tuple[Decision, ...] = (decision,)
+    contradiction = state.constraints.contradiction
+    contradiction += CONTRADICTION_GAIN * (min(decision.statistic / decision.limit, LARGEST_RATIO) - contradiction)
+    state = state._replace(constraints=state.constraints._replace(contradiction=contradiction))
+    if contradiction > LARGEST_CONTRADICTION and state.stationary.is_confirmed_by_wheels(utime):
+        # wheels that are stuck, and it moves so smoothly that it seems stationary
+        common = state.common._replace(moving_until=utime + round(MOVING_TIME * 1e6))
+        state = release_motion(state)._replace(stationary=StationaryDetector(), common=common)
+        state = state._replace(constraints=state.constraints._replace(contradiction=0.0))
+        return state, (*decisions, report_event(state, constraints.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
     detector = state.stationary
     if detector.sum_time > 0.0:
         if detector.get_quiet_time(utime) >= setup.settings.recapture_time:

@@ -74,9 +74,10 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     monitor = state.consistency
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
+    horizontal += abs(monitor.lever_arm)
     if not monitor.excludes_fixes:
         horizontal += monitor.horizontal_allowance
-        heading = min(heading + monitor.heading_allowance, math.pi)
+        heading = monitor.bound_heading(heading, utime)
     if heading > settings.heading_limit:
         invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
     if horizontal > settings.horizontal_limit:
@@ -167,9 +168,12 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
         left = min(left, settings.gps_timeout - (utime - state.gnss.used_utime) * 1e-6)
     left = max(left, 0.0)
     k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
-    limit = settings.horizontal_limit - state.gnss.outlier_allowance
+    monitor = state.consistency
+    limit = settings.horizontal_limit - state.gnss.outlier_allowance - abs(monitor.lever_arm)
+    if not monitor.excludes_fixes:
+        limit -= monitor.horizontal_allowance
     C = nav.covariance
-    p = protection_levels.compute_longest_variance(C)
+    p = protection_levels.compute_longest_variance(C) + settings.lever_arm_sigma**2
     v, c = float(max(C[3, 3], C[4, 4])), float(max(C[0, 3], C[1, 4], 0.0))
     q = setup.coasting.accelerometer
 

@@ -42,9 +42,12 @@ def compute_longest_axis(east: float, north: float, cross: float) -> float:
 
 
 def compute_horizontal(P: Array, outlier_allowance: float, settings: FilterSettings) -> float:
-    """Return the horizontal protection level, m: of the covariance, plus the allowance for one outlier."""
+    """Return the horizontal protection level, m: of the covariance, plus the allowance for one outlier.
+
+    An error of the antenna's lever arm displaces the pose, and no fix shows it.
+    """
     k, _ = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
-    return k * math.sqrt(compute_longest_variance(P)) + outlier_allowance
+    return k * math.sqrt(compute_longest_variance(P) + settings.lever_arm_sigma**2) + outlier_allowance
 
 
 def compute_heading(variance: float, settings: FilterSettings) -> float:

@@ -27,6 +27,8 @@ class FilterSettings(FixSettings):
     """Bias before it was captured, rad/s: 3DM-GX1 data sheet, 0.7 deg/s over temperature."""
     gyro_bias_walk: float = 3.5e-5
     """Random walk of the bias, rad/s/sqrt(s): the data sheet's 0.02 deg/s short-term, reached in 100 s."""
+    lever_arm_sigma: float = 0.1
+    """Error of the antenna's place on the vehicle, m, in the protection level: measured with a tape."""
     gyro_scale_sigma: float = 0.01
     """Error of the scale of the gyros: typical of an uncalibrated MEMS unit."""
     accelerometer_noise: float = 0.02

@@ -130,11 +130,15 @@ class Common(NamedTuple):
 
 
 class MotionConstraints(NamedTuple):
-    """Whether the vehicle is stationary, and when the constraints were last used (utime)."""
+    """Whether the vehicle is stationary, and when the constraints were last used (utime).
+
+    `contradiction` is the running mean of the NIS of ZUPT, relative to its gate.
+    """
 
     is_stationary: bool = False
     zupt_utime: int = 0
     non_holonomic_utime: int = 0
+    contradiction: float = 0.0
 
 
 class Leveling(NamedTuple):

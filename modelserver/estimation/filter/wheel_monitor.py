@@ -1,4 +1,9 @@
-"""Wheel monitor: which source of wheels is used, whether it measures the speed now, and the steering angle."""
+"""Wheel monitor: which source of wheels is used, whether it measures the speed now, and the steering angle.
+
+Encoders that are stuck measure no speed, and each sample outside its gate is used with inflated noise: for long enough
+they hold the state. So wheels that are stationary while the state is not, by the mean of their NIS, are suspect, and
+not used until they measure the speed of a vehicle that is known to move.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,18 @@ from typing import Final, NamedTuple
 SPEED_TIMEOUT_US: Final = 1_000_000
 """Microseconds for which the wheels used last measure the speed of the vehicle."""
 
+
+SUSPECT_MEAN: Final = 1.0
+"""Running mean of the NIS, relative to its gate, beyond which stationary wheels are suspect; usual is 0.1."""
+
+TRUSTED_MEAN: Final = 0.3
+"""The same below which the wheels of a vehicle that moves are not."""
+
+GAIN: Final = 0.1
+"""Weight of a sample in that mean."""
+
+LARGEST_RATIO: Final = 10.0
+"""Largest share of one sample, relative to its gate."""
 
 RECEIVED: Final = "seen"
 """Kind under which the last wheel sample received is stored as a previous sample, beside the last one compared."""
@@ -29,13 +46,26 @@ class WheelMonitor(NamedTuple):
     used_utime: last sample that passed its gate; 0: none yet.
     turn_rate: by the wheels, rad/s; 0 if a gyro measures it.
     steering: of the vehicle controller.
+    mean_ratio: running mean of the NIS relative to its gate.
+    is_suspect: whether they are stuck.
     """
 
     source: str = ""
     used_utime: int = 0
     turn_rate: float = 0.0
     steering: SteeringAngle = SteeringAngle()
+    mean_ratio: float = 0.0
+    is_suspect: bool = False
+
+    def compare(self, ratio: float, *, are_stationary: bool, is_moving: bool) -> WheelMonitor:
+        """Return the monitor after a sample with a NIS of `ratio` times its gate; `is_moving`: known without it."""
+        if not are_stationary and not self.is_suspect:
+            ratio = 0.0
+        mean = self.mean_ratio + GAIN * (min(ratio, LARGEST_RATIO) - self.mean_ratio)
+        if self.is_suspect:
+            return self._replace(mean_ratio=mean, is_suspect=not (is_moving and mean < TRUSTED_MEAN))
+        return self._replace(mean_ratio=mean, is_suspect=mean > SUSPECT_MEAN)
 
     def measures_speed(self, utime: int) -> bool:
         """Return whether the wheels measure the speed at an instant."""
-        return self.used_utime > 0 and utime - self.used_utime < SPEED_TIMEOUT_US
+        return not self.is_suspect and self.used_utime > 0 and utime - self.used_utime < SPEED_TIMEOUT_US

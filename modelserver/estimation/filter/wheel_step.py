@@ -24,7 +24,9 @@ from modelserver.estimation.filter.fusion import (
     fuse_constraint,
     fuse_non_holonomic,
     reject,
+    release_motion,
     remember,
+    report_event,
 )
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
@@ -41,6 +43,9 @@ SOURCE_TIMEOUT: Final = 2.0
 
 FORCE_AGE_US: Final = 50_000
 """Microseconds for which a measured force is that of a wheel sample."""
+
+UNSTUCK_SPEED: Final = 0.3
+"""Speed, m/s, at least, at which wheels that were stuck show that they are not."""
 
 UNKNOWN_SPEED_SIGMA: Final = 2.0
 """Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
@@ -61,7 +66,9 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     previous = _get_wheels(compared)
     received = _get_wheels(common.previous.get((item.source, RECEIVED)))
     are_stationary = are_wheels_stationary(sample, received, measurement.contacts, settings)
-    detector = state.stationary.update_wheels(item.utime, are_stationary)
+    detector = state.stationary
+    if not common.wheels.is_suspect:
+        detector = detector.update_wheels(item.utime, are_stationary)
     state = state._replace(stationary=detector, common=remember(common, (item.source, RECEIVED), item))
     has_imu = setup.uses_imu(common.mode)
     if isinstance(state, Leveling):
@@ -71,6 +78,9 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, NOTHING
     state = propagation.advance(setup, state, item.utime)
     state, decisions, is_first_speed = _fuse_speed(setup, state, item, measurement, sample, age, previous)
+    if decisions and decisions[0].limit > 0.0:
+        state, more = _judge(setup, state, item, decisions[0], are_stationary=are_stationary is True)
+        decisions += more
     nav = state.nav._replace(travel=ZERO, rotation=ZERO)
     state = state._replace(nav=nav, common=remember(state.common, (item.source, item.kind), item))
     if not has_imu:
@@ -99,7 +109,9 @@ def _fuse_speed(
     innovation = measurement.evaluate(context, sample)
     if isinstance(innovation, str):
         return state, ((reject(item, innovation),) if innovation else NOTHING), False
-    is_first_speed = _is_speed_unknown(context.nav)
+    if state.common.wheels.is_suspect:
+        innovation = innovation._replace(monitored="stuck")
+    is_first_speed = not innovation.monitored and _is_speed_unknown(context.nav)
     if is_first_speed:
         # the wheels' error is a share of speed: linearize at the speed that they measure, not at 0
         nav = _set_speed(context.nav, innovation, setup.rig.base, min(age, settings.wheel_period))
@@ -121,6 +133,26 @@ def _fuse_speed(
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
     common = state.common._replace(wheels=wheels, mount=mount)
     return state._replace(nav=nav, common=common), (decision,), is_first_speed
+
+
+def _judge(
+    setup: Setup, state: N, item: Item, decision: Decision, *, are_stationary: bool
+) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state with what a sample shows of the wheels themselves."""
+    nav, wheels = state.nav, state.common.wheels
+    P = nav.covariance
+    sigma = math.sqrt(max(P[3, 3], P[4, 4]))
+    is_moving = math.hypot(*nav.velocity[:2]) > 4.0 * sigma + UNSTUCK_SPEED
+    ratio = decision.statistic / decision.limit
+    judged = wheels.compare(ratio, are_stationary=are_stationary, is_moving=is_moving)
+    state = state._replace(common=state.common._replace(wheels=judged))
+    if judged.is_suspect == wheels.is_suspect:
+        return state, NOTHING
+    if not judged.is_suspect:
+        return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
+    # they have held the state
+    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None))
+    return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 
 
 def _compare_force(

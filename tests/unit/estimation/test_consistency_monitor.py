@@ -18,6 +18,7 @@ from modelserver.estimation.filter.consistency_monitor import (
     Inconsistency,
     PathNode,
     PathNoise,
+    replay_path,
 )
 from modelserver.estimation.filter.settings import FilterSettings
 
@@ -37,6 +38,7 @@ class Fault(NamedTuple):
     rate: float = 0.0
     scale: float = 0.0
     latency: float = 0.0
+    lever_arm: complex = 0j
 
 
 class Step(NamedTuple):
@@ -48,7 +50,9 @@ class Step(NamedTuple):
     found: Inconsistency | None
 
 
-def drive(seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = True) -> Iterator[Step]:
+def drive(
+    seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = True, correlated: float = CORRELATED
+) -> Iterator[Step]:
     """Yield the fixes of a vehicle at 2 to 6 m/s that turns now and then, and whose fixes no state follows."""
     noise = random.Random(seed)
     truth = antenna = wander = shift = 0j
@@ -66,12 +70,13 @@ def drive(seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = Tr
         elif t >= fault.end:
             shift = 0j
         walk = complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
-        wander = keep * wander + CORRELATED * math.sqrt(1.0 - keep**2) * walk
-        white = WHITE * complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
+        wander = keep * wander + correlated * math.sqrt(1.0 - keep**2) * walk
+        white = WHITE / CORRELATED * correlated * complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
         late = fault.latency * velocity if is_wrong else 0j
-        fix = truth + wander + white + shift - late + (fault.jump if is_wrong else 0j)
+        arm = fault.lever_arm * cmath.rect(1.0, yaw) if is_wrong else 0j
+        fix = truth + arm + wander + white + shift - late + (fault.jump if is_wrong else 0j)
         utime = 1_000_000 + round(t * 1e6)
-        monitor = monitor.extend(utime, antenna)
+        monitor = monitor.extend(utime, antenna, is_measured=is_measured)
         node = PathNode(
             utime=utime,
             fix=fix,
@@ -83,6 +88,8 @@ def drive(seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = Tr
             seconds=(utime - monitor.begin) * 1e-6,
             rotation=monitor.rotation,
             distance=monitor.distance,
+            rate_bias=0.0,
+            scale=0.0,
             heading_variance=0.01**2,
             rate_variance=0.0003**2,
             scale_variance=0.003**2,
@@ -92,8 +99,9 @@ def drive(seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = Tr
             latency=0.0,
             latency_variance=0.02**2,
             lost=monitor.lost,
-            white=WHITE,
-            correlated=CORRELATED,
+            unmeasured=monitor.unmeasured,
+            white=WHITE / CORRELATED * correlated,
+            correlated=correlated,
             position_covariance=(0.5, 0.5, 0.0),
         )
         monitor = monitor.compare(node, NOISE, SETTINGS)
@@ -169,6 +177,45 @@ def test_given_wheels_that_slip_then_they_are_the_cause(scale: float) -> None:
     assert found.found.change == pytest.approx(scale, rel=0.4)
 
 
+def test_given_an_antenna_that_is_elsewhere_then_precise_fixes_show_where() -> None:
+    fault = Fault(0.0, lever_arm=-0.4 + 0.3j)
+    steps = [each for each in drive(300.0, fault, correlated=0.03) if each.found is not None]
+    assert steps[0].found is not None
+    assert steps[0].found.cause is Cause.LEVER_ARM
+    assert abs(steps[0].found.lever_arm - fault.lever_arm) < 0.15
+    assert all(each.found.cause is Cause.LEVER_ARM for each in steps if each.found)
+
+
+def test_given_a_bias_that_the_state_has_followed_then_the_replayed_path_is_that_of_the_former_bias() -> None:
+    template = next(drive(1.0, Fault())).node
+    path = moment = 0j
+    turned = bias = 0.0
+    nodes = [template._replace(path=0j, moment=0j, seconds=0.0, rate_bias=0.0)]
+    for n in range(1, 301):
+        # straight ahead at 4 m/s, while the bias of the state rises to 0.02 rad/s
+        bias = 0.02 * n / 300
+        turned -= bias * 0.1
+        path += cmath.rect(0.4, turned)
+        moment += n * 0.1 * cmath.rect(0.4, turned)
+        if not n % 10:
+            nodes.append(template._replace(path=path, moment=moment, seconds=0.1 * n, rate_bias=bias))
+    assert abs(path - 120.0) > 10.0
+    replayed = replay_path(nodes[0], tuple(nodes[1:]))[-1]
+    assert abs(replayed.path - 120.0) < 0.5
+    assert abs(replayed.moment - 4.0 * 0.5 * 30.0**2) < 20.0
+    # by which the state has turned beside the former bias
+    assert replayed.rotation - nodes[-1].rotation == pytest.approx(turned, abs=0.005)
+
+
+def test_given_a_bound_that_shrinks_at_a_fix_then_it_takes_seconds() -> None:
+    monitor = ConsistencyMonitor().hold_heading(0.5, 1_000_000)
+    assert monitor.bound_heading(0.1, 1_000_000) == pytest.approx(0.5)
+    assert 0.1 < monitor.bound_heading(0.1, 3_000_000) < 0.5
+    assert monitor.bound_heading(0.1, 60_000_000) == pytest.approx(0.1)
+    # a clock that was set back
+    assert monitor.bound_heading(0.1, 0) == pytest.approx(0.5)
+
+
 def test_given_one_outlier_then_nothing_is_found() -> None:
     fault = Fault(200.0, 200.9, jump=25.0)
     assert all(each.found is None for each in drive(260.0, fault))
@@ -205,13 +252,18 @@ def test_given_hours_of_driving_then_the_nodes_are_few_and_none_is_too_old() -> 
 
 
 def test_given_a_correction_by_a_fix_then_the_path_does_not_move() -> None:
-    monitor = ConsistencyMonitor().extend(1_000_000, 0j).extend(2_000_000, 3 + 0j)
-    moved = monitor.correct(5 - 2j, 0.5).extend(3_000_000, 8 - 2j + cmath.rect(2.0, 0.5))
+    monitor = ConsistencyMonitor().extend(1_000_000, 0j, is_measured=True).extend(2_000_000, 3 + 0j, is_measured=True)
+    moved = monitor.correct(5 - 2j, 0.5).extend(3_000_000, 8 - 2j + cmath.rect(2.0, 0.5), is_measured=True)
     assert moved.path == pytest.approx(3 + 2 + 0j)
     assert moved.distance == pytest.approx(5.0)
 
 
 def test_given_a_gap_in_the_fixes_then_the_path_begins_again() -> None:
-    monitor = ConsistencyMonitor().extend(1_000_000, 0j).extend(2_000_000, 3 + 0j).extend(9_000_000, 50 + 0j)
+    monitor = (
+        ConsistencyMonitor()
+        .extend(1_000_000, 0j, is_measured=True)
+        .extend(2_000_000, 3 + 0j, is_measured=True)
+        .extend(9_000_000, 50 + 0j, is_measured=True)
+    )
     assert monitor.begin == 9_000_000
     assert monitor.path == 0j
