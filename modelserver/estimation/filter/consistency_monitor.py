@@ -46,6 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.filter.settings import FilterSettings
 
 Vector: TypeAlias = npt.NDArray[Any]
@@ -68,24 +69,42 @@ MAX_GAP: Final = 5.0
 THRESHOLD: Final = 4.5
 """Standard deviations of (1) beyond which path and fixes are inconsistent: 4e-5 of a normal error in the plane."""
 
-ALLOWED: Final = 1.5
-"""Standard deviations of (1) that are taken for the error that is modeled: what is beyond widens the bounds."""
+ALLOWED: Final = 1.25
+ALLOWED_TURN: Final = 1.5
+"""Standard deviations of (1), and of the turn that would explain it, that are taken for the error that is modeled: what
+is beyond widens the bounds."""
 
 ALLOWANCE_TIME: Final = 10.0
-"""Seconds in which an allowance decays: about a turn, or as many fixes as show a heading."""
+ALLOWANCE_PATH: Final = 10.0
+"""Seconds in which, and meters along which an allowance decays: about a turn, or as many fixes as show a heading."""
 
 SHRINK_TIME: Final = 5.0
-"""Seconds in which the bound of the heading shrinks, at least: a single fix after an outage may err otherwise than
-modeled."""
+SHRINK_PATH: Final = 5.0
+"""Seconds in which, and meters along which the bound of the heading shrinks, at least: a single fix after an outage may
+err otherwise than modeled, and at rest fixes show no heading."""
 
 SUSPICION_TIME: Final = 60.0
 """Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes."""
 
+STRAIGHT: Final = 0.9
+"""Length of a path between its ends, relative to that along it, which shows a course."""
+
+START_ERROR: Final = 3.0
+UNMEASURED_START_ERROR: Final = 6.0
+"""Standard deviations by which multipath may displace one end of the first path beside the other: with a measured
+speed, whose length they agree with, and without."""
+
 FEWEST_NODES: Final = 2
 """Nodes that show the cause; until then the gate is enough."""
 
+PATH_SIGMAS: Final = 2.0
+"""Standard deviations of dead reckoning that the bound has beside the distance of suspect fixes from it."""
+
 JUMP_SIGMAS: Final = 9.0
 """Standard deviations of (1) from one fix to the next that are a jump: a drift is slower."""
+
+LEAST_JUMP: Final = 6.0
+"""Standard deviations of a fix that a jump has, at least, for which fixes are not used: a bound covers less."""
 
 CONFIRMATIONS: Final = 3
 """Fixes in a row beyond the threshold that are no outliers."""
@@ -135,9 +154,6 @@ DECISION_TIME: Final = 90.0
 REPEAT: Final = 4
 """Seconds for which the causes are compared again, and fixes from one comparison to the next."""
 
-MARGIN: Final = 5.0
-"""Squares that an error of dead reckoning must explain more than any other cause to be corrected."""
-
 MAX_INFLATION: Final = 4.0
 """Largest inflation, in variance, of the error of fixes here: a drift must not excuse itself."""
 
@@ -153,6 +169,9 @@ class Cause(Enum):
     LEVER_ARM = "lever_arm"
 
 
+MARGIN: Final = MappingProxyType({Cause.GYRO: 8.0, Cause.WHEELS: 8.0, Cause.LATENCY: 5.0, Cause.LEVER_ARM: 5.0})
+"""Evidence by which an error must exceed any other cause to be corrected."""
+
 TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
 """Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
 
@@ -160,7 +179,7 @@ TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, C
 LARGEST_FIX_SIGMA: Final = 0.2
 """Standard deviation of fixes, m, that show an error of the lever arm."""
 
-TYPICAL_DRIFT: Final = 1.0
+TYPICAL_DRIFT: Final = 0.3
 TYPICAL_JUMP: Final = 10.0
 TYPICAL_LEVER_ARM: Final = 0.5
 """Sigma of a drift of fixes, m/s, of a jump, m, and of an error of the lever arm, m, that are a fault."""
@@ -275,7 +294,7 @@ class ConsistencyMonitor(NamedTuple):
     path, moment, rotation, distance, lost, unmeasured: as in `PathNode`.
     older, newest: the nodes, the oldest first.
     num_exceeded: fixes in a row beyond the threshold.
-    compared_utime: of the last fix within it.
+    compared_utime, compared_distance: of the last fix within it, and `distance` then.
     last: the last fix; `has_jumped`: whether one of those fixes jumped away from the one before.
     moved_since: since when no window has exceeded it.
     cause: of an inconsistency that lasts, since `since`; None: fixes and path agree.
@@ -283,7 +302,7 @@ class ConsistencyMonitor(NamedTuple):
     largest: discrepancy of the fixes since then, m.
     agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
     horizontal_allowance, heading_allowance: what is unexplained, m and rad.
-    held: bound of the heading before the last fix, rad, at `held_utime`.
+    held: bound of the heading before the last fix, rad, at `held_utime` and `held_distance`.
     lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
     suspicion: what was taken for an error of gyro or wheels, and may have been one of the fixes, m.
     """
@@ -301,6 +320,7 @@ class ConsistencyMonitor(NamedTuple):
     newest: tuple[PathNode, ...] = ()
     num_exceeded: int = 0
     compared_utime: int = 0
+    compared_distance: float = 0.0
     last: PathNode | None = None
     has_jumped: bool = False
     moved_since: int = 0
@@ -314,6 +334,7 @@ class ConsistencyMonitor(NamedTuple):
     heading_allowance: float = 0.0
     held: float = 0.0
     held_utime: int = 0
+    held_distance: float = 0.0
     lever_arm: complex = 0j
     suspicion: float = 0.0
 
@@ -355,7 +376,17 @@ class ConsistencyMonitor(NamedTuple):
         """
         gap = (utime - self.utime) * 1e-6
         if not self.utime or (gap > MAX_GAP and self.suspect is None):
-            return self.restart()._replace(utime=utime, anchor=antenna, begin=utime, cause=self.cause, since=self.since)
+            return self.restart()._replace(
+                utime=utime,
+                anchor=antenna,
+                begin=utime,
+                cause=self.cause,
+                since=self.since,
+                compared_utime=utime,
+                horizontal_allowance=self.horizontal_allowance,
+                heading_allowance=self.heading_allowance,
+                suspicion=self.suspicion,
+            )
         step = (antenna - self.anchor) * cmath.rect(1.0, -self.rotation)
         seconds = (0.5 * (utime + self.utime) - self.begin) * 1e-6
         return self._replace(
@@ -369,7 +400,46 @@ class ConsistencyMonitor(NamedTuple):
 
     def restart(self) -> ConsistencyMonitor:
         """Return the monitor before a new path, with what lasts."""
-        return ConsistencyMonitor(held=self.held, held_utime=self.held_utime, lever_arm=self.lever_arm)
+        return ConsistencyMonitor(
+            held=self.held,
+            held_utime=self.held_utime,
+            held_distance=self.held_distance - self.distance,
+            lever_arm=self.lever_arm,
+        )
+
+    def trust(self) -> ConsistencyMonitor:
+        """Return the monitor after fixes have agreed with the path since the suspect node again: it continues."""
+        assert self.suspect is not None
+        since = self.suspect.utime
+        return self._replace(
+            older=tuple(each for each in self.older if each.utime <= since),
+            newest=tuple(each for each in self.newest if each.utime <= since),
+            num_exceeded=0,
+            cause=None,
+            suspect=None,
+            is_jump=False,
+            agreed_since=0,
+        )
+
+    def start_heading(self, fix_sigma: float, distance: float, *, is_measured: bool) -> ConsistencyMonitor:
+        """Return the monitor after fixes along a first path of some `distance`, m, have shown the heading.
+
+        `fix_sigma`: standard deviation of such a fix, m; `is_measured`: whether wheels measured the path's length.
+        Further fixes confirm it, and the allowance decays.
+        """
+        error = START_ERROR if is_measured else UNMEASURED_START_ERROR
+        allowance = math.atan2(error * fix_sigma, distance)
+        return self._replace(heading_allowance=max(self.heading_allowance, allowance))
+
+    def relearn(self, change: float, utime: int) -> ConsistencyMonitor:
+        """Return the monitor after a stationary vehicle has shown that the gyro's bias has changed, rad/s.
+
+        Fixes that did not agree with the path since may have been right.
+        """
+        if self.suspect is not None and abs(change) < 0.5 * TYPICAL_CHANGE[Cause.GYRO]:
+            return self
+        path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False)
+        return path._replace(cause=Cause.GYRO, since=utime, suspect=None, is_jump=False)
 
     def correct(self, shift: complex, turn: float) -> ConsistencyMonitor:
         """Return the monitor after a fix moved the state by `shift`, m, and turned it by `turn`, rad: not the path."""
@@ -377,11 +447,15 @@ class ConsistencyMonitor(NamedTuple):
 
     def hold_heading(self, level: float, utime: int) -> ConsistencyMonitor:
         """Return the monitor with the bound of the heading before a fix; `level`: the covariance's, rad."""
-        return self._replace(held=self.bound_heading(level, utime), held_utime=utime)
+        return self._replace(held=self.bound_heading(level, utime), held_utime=utime, held_distance=self.distance)
 
     def bound_heading(self, level: float, utime: int) -> float:
         """Return the bound of the heading, rad, with what is unexplained; `level`: the covariance's."""
-        held = self.held * math.exp(min(self.held_utime - utime, 0) * 1e-6 / SHRINK_TIME)
+        held = self.held * math.exp(
+            -min(
+                max(utime - self.held_utime, 0) * 1e-6 / SHRINK_TIME, (self.distance - self.held_distance) / SHRINK_PATH
+            )
+        )
         return min(max(level + self.heading_allowance, held), math.pi)
 
     def lose(self, heading: float, distance: float) -> ConsistencyMonitor:
@@ -421,7 +495,9 @@ class ConsistencyMonitor(NamedTuple):
             heading = abs(wrap_angle(self.rotation - suspect.rotation))
             if self.cause is not Cause.HEADING:
                 found = compare_window(suspect, node, noise, settings)
-                horizontal, heading = abs(found.error), max(heading, abs(found.turn))
+                # the fixes are as far off as they seem, and as dead reckoning may be
+                horizontal = abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
+                heading = max(heading, abs(found.turn))
         for each in self._compare_windows(node, noise, settings):
             if not each.node.is_measured:
                 # without a measured speed the path follows the fixes, but the heading must not
@@ -430,7 +506,7 @@ class ConsistencyMonitor(NamedTuple):
                     turned = abs(wrap_angle(self.rotation - each.node.rotation))
                     sigma = get_turn_sigma(each.node, node, noise)
                     sigmas = turned / sigma
-                    heading = max(heading, turned - ALLOWED * sigma)
+                    heading = max(heading, turned - ALLOWED_TURN * sigma, _compare_course(each, node, noise, settings))
                 worst = max(worst, sigmas)
                 if each.node.utime >= self.moved_since:
                     latest = max(latest, sigmas)
@@ -442,7 +518,7 @@ class ConsistencyMonitor(NamedTuple):
                 horizontal = max(horizontal, abs(each.error) * (1.0 - ALLOWED / each.sigmas))
             # the heading has changed during the window by twice the mean that the fixes show
             if each.turn_sigma:
-                heading = max(heading, 2.0 * (abs(each.turn) - ALLOWED * each.turn_sigma))
+                heading = max(heading, 2.0 * (abs(each.turn) - ALLOWED_TURN * each.turn_sigma))
         moved_since = node.utime if latest > THRESHOLD else self.moved_since
         if worst > THRESHOLD and suspect is None and self.num_exceeded < CONFIRMATIONS:
             # outliers do not widen the bounds
@@ -457,7 +533,13 @@ class ConsistencyMonitor(NamedTuple):
             )
         # noise of single fixes comes and goes, what is unexplained does not
         seconds = (node.utime - self.compared_utime) * 1e-6
+        driven = node.distance - self.compared_distance
         fade = math.exp(-seconds / ALLOWANCE_TIME)
+        heading_fade = math.exp(-min(seconds / ALLOWANCE_TIME, driven / ALLOWANCE_PATH))
+        if self.is_jump:
+            # what is not used moves nothing, and shows nothing
+            horizontal = heading = 0.0
+            fade = heading_fade = 1.0
         suspicion = self.suspicion * math.exp(-seconds / SUSPICION_TIME)
         return self._replace(
             last=node,
@@ -465,8 +547,9 @@ class ConsistencyMonitor(NamedTuple):
             has_jumped=self.has_jumped and worst > THRESHOLD,
             num_exceeded=self.num_exceeded + 1 if worst > THRESHOLD else 0,
             compared_utime=node.utime,
+            compared_distance=node.distance,
             horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
-            heading_allowance=max(min(heading, math.pi), fade * self.heading_allowance),
+            heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:
@@ -485,18 +568,18 @@ class ConsistencyMonitor(NamedTuple):
     ) -> tuple[ConsistencyMonitor, bool]:
         """Return the monitor after a fix that is not trusted, and whether fixes agree with dead reckoning again."""
         assert self.suspect is not None
+        is_known = False
         if self.cause is Cause.HEADING:
-            size, sigma = (
-                abs(wrap_angle(self.rotation - self.suspect.rotation)),
-                get_turn_sigma(self.suspect, node, noise),
-            )
+            size = abs(wrap_angle(self.rotation - self.suspect.rotation))
+            sigma = get_turn_sigma(self.suspect, node, noise)
             sigmas = size / sigma
         else:
             found = compare_window(self.suspect, node, noise, settings)
             size, sigma, sigmas = abs(found.error), found.sigma, found.sigmas
+            is_known = compute_longest_axis(*found.covariance) < node.white**2 + node.correlated**2
         largest = max(self.largest, size)
         # where dead reckoning has become so uncertain that it would not contradict them any more, that is no agreement
-        agrees = sigmas <= AGREEMENT and largest > THRESHOLD * sigma
+        agrees = sigmas <= AGREEMENT and (is_known or largest > THRESHOLD * sigma)
         since = (self.agreed_since or node.utime) if agrees else 0
         needed = JUMP_AGREEMENT_TIME if self.is_jump else AGREEMENT_TIME
         return self._replace(agreed_since=since, largest=largest), agrees and (node.utime - since) * 1e-6 >= needed
@@ -547,11 +630,12 @@ class ConsistencyMonitor(NamedTuple):
                     explained[each.cause] = each
         best = max(explained.values(), key=lambda each: each.explained)
         rest = max((each.explained for each in explained.values() if each is not best), default=0.0)
-        if best.cause is not Cause.GNSS and best.explained > rest + MARGIN:
+        if best.cause is not Cause.GNSS and best.explained > rest + MARGIN[best.cause]:
             return best
         if self.suspect is not None:
             return None
-        return explained[Cause.GNSS]._replace(discrepancy=worst, is_jump=self.has_jumped)
+        is_jump = self.has_jumped and abs(worst.error) > LEAST_JUMP * math.hypot(node.white, node.correlated)
+        return explained[Cause.GNSS]._replace(discrepancy=worst, is_jump=is_jump)
 
     def _find_turned(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
         """Return the window in which the heading has been turned most beside the gyro."""
@@ -704,10 +788,21 @@ def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: F
         turn = (error * d.conjugate()).imag / square
         side = (a * y * y - 2.0 * cross * x * y + b * x * x) / square
         turn_sigma = math.sqrt(side / square)
-    longest = math.sqrt(0.5 * (a + b) + math.hypot(0.5 * (a - b), cross))
+    longest = math.sqrt(compute_longest_axis(a, b, cross))
     return Discrepancy(
         start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma
     )
+
+
+def _compare_course(found: Discrepancy, end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
+    """Return the angle from the path to the course of the fixes, beyond what is allowed, rad; 0 where none is shown."""
+    start, path, course = found.node, found.displacement, found.displacement + found.error
+    # only its direction means something, and only while it is straight
+    if not STRAIGHT * (end.distance - start.distance) < abs(path) or min(abs(path), abs(course)) < MIN_TURN_PATH:
+        return 0.0
+    fixes = math.sqrt(_get_fix_variance(start, end, noise, settings)) / abs(course)
+    sigma = math.hypot(get_turn_sigma(start, end, noise), fixes)
+    return abs(cmath.phase(course / path)) - ALLOWED_TURN * sigma
 
 
 class DriftFit(NamedTuple):
@@ -729,10 +824,14 @@ class DriftFit(NamedTuple):
     seconds: float
 
     @property
+    def largest(self) -> float:
+        """Largest drift that is not excluded by the noise, m."""
+        return 2.0 * math.hypot(self.tolerance, self.drift_sigma)
+
+    @property
     def is_steady(self) -> bool:
         """Whether fixes are known to have moved as the path, whatever its heading."""
-        is_shown = self.drift_sigma <= STEADY_SIGMA * self.seconds
-        return is_shown and self.drift <= 2.0 * math.hypot(self.tolerance, self.drift_sigma)
+        return self.drift_sigma <= STEADY_SIGMA * self.seconds and self.drift <= self.largest
 
 
 def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, settings: FilterSettings) -> DriftFit:

@@ -43,6 +43,9 @@ FIT_SHARE: Final = 0.3
 EXCLUSION: Final = 1.5
 """Times `recovery_time` for which fixes that have jumped are not used: then the pose follows them, and is not valid."""
 
+LARGEST_CORRELATED: Final = 3.0
+"""Standard deviations of the time-correlated error beyond which a drift was taken for it."""
+
 HEALING_TIME: Final = 5.0
 """Seconds of agreement after a gyro or the wheels were corrected."""
 
@@ -153,17 +156,13 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
     if monitor.cause is Cause.HEADING:
         text = "the vehicle moves along its own axis again"
     if monitor.excludes_fixes:
-        after = state._replace(consistency=monitor.restart(), gnss=state.gnss.restart(newest.utime))
+        after = state._replace(consistency=monitor.trust(), gnss=state.gnss.restart(newest.utime))
         return after, (report_event(after, KIND, Verdict.USED, text),)
-    after = state._replace(consistency=_hold(setup, state).restart())
+    after = state._replace(consistency=_hold(setup, state).trust())
     # the fixes have turned the state since
     P = state.nav.covariance.copy()
     P[8, 8] += (monitor.rotation - monitor.suspect.rotation) ** 2
-    after = after._replace(nav=state.nav._replace(covariance=P))
-    if state.gnss.num_rejected:
-        after = _place(setup, after, newest)
-    else:
-        after = after._replace(common=state.common._replace(epoch=state.common.epoch + 1))
+    after = _start_epoch(setup, after._replace(nav=state.nav._replace(covariance=P)), newest)
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 
@@ -186,12 +185,17 @@ def _realign(
         P = nav.covariance.copy()
         P[8, :] = P[:, 8] = 0.0
         nav = _turn(nav._replace(covariance=P), fit.turn, fit.turn_sigma, setup.layout)
-    state = state._replace(nav=nav)
-    if state.gnss.num_rejected:
-        state = _place(setup, state, newest)
-    else:
-        state = state._replace(common=state.common._replace(epoch=state.common.epoch + 1))
-    return state._replace(consistency=held.restart())
+    monitor = held.restart()._replace(suspicion=fit.largest, horizontal_allowance=fit.largest)
+    return _start_epoch(setup, state._replace(nav=nav), newest)._replace(consistency=monitor)
+
+
+def _start_epoch(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state in a new epoch; at the fix, if the state has not followed the fixes."""
+    at = setup.layout.extra_index(CORRELATED_ERROR[0])
+    has_followed = abs(complex(*state.nav.extras[at : at + 2])) < LARGEST_CORRELATED
+    if has_followed and not state.gnss.num_rejected:
+        return state._replace(common=state.common._replace(epoch=state.common.epoch + 1))
+    return _place(setup, state, newest)
 
 
 def _place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:

@@ -215,10 +215,12 @@ def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
 
 
 def release_motion(state: N) -> N:
-    """Return the state with the uncertainty of a vehicle that was held to be stationary, and is not."""
+    """Return the state with the uncertainty of a vehicle whose wheels are stationary, and that is not."""
     P = state.nav.covariance.copy()
-    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (8, HELD_TURN), (11, HELD_RATE)):
+    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (8, HELD_TURN)):
         P[axis, axis] += sigma * sigma
+    if state.is_stationary:
+        P[11, 11] += HELD_RATE * HELD_RATE  # ZARU
     return state._replace(nav=state.nav._replace(covariance=P))
 
 

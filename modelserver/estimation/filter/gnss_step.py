@@ -154,6 +154,7 @@ def _fuse_unaligned(
         return state, NOTHING
     nav = state.nav if is_known else heading_alignment.set_speed(state.nav, fit.travel * fit.factor, fit.factor_sigma)
     aligned = heading_step.initialize(setup, state, nav, fit.rotation, newest)
+    aligned = _allow_start(aligned, newest, fit.distance)
     text = f"heading to {math.degrees(fit.rotation.sigma):.1f} deg by {fit.distance:.1f} m driven"
     return aligned, (report_reset(item, text),)
 
@@ -382,11 +383,22 @@ def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | No
         return state, None
     sigma = math.hypot(fit.rotation.sigma, math.sqrt(nav.covariance[8, 8]))
     rotation = fit.rotation if abs(fit.rotation.angle) > 3.0 * sigma else Rotation(0.0, 0.0)
-    state = heading_step.initialize(setup, state, nav, rotation, state.gnss.rejected[-1])
+    newest = state.gnss.rejected[-1]
+    state = heading_step.initialize(setup, state, nav, rotation, newest)
+    if rotation is fit.rotation:
+        state = _allow_start(state, newest, fit.distance)
     decision = Decision(
         nav.utime, "filter", 0, "gps_position", Verdict.RESET, "fixes agree with the path driven, the state does not"
     )
     return start_epoch(state), decision
+
+
+def _allow_start(state: Aligned, newest: PathFix, distance: float) -> Aligned:
+    """Return the state after fixes along a path of some length, m, have shown its heading."""
+    fix_sigma = math.hypot(newest.white, newest.correlated)
+    is_measured = state.common.measures_wheel_speed(newest.utime)
+    monitor = state.consistency.start_heading(fix_sigma, distance, is_measured=is_measured)
+    return state._replace(consistency=monitor)
 
 
 def start_epoch(state: Aligned) -> Aligned:

@@ -35,6 +35,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Decision, ImuSample, Mode, Verdict
+from modelserver.transforms.so3 import to_vector3
 
 BIAS_AGE: Final = 600.0
 """Seconds for which gyro biases that a restart continues with may have drifted: few vehicles drive longer without a
@@ -46,6 +47,15 @@ CONTRADICTION_GAIN: Final = 0.1
 
 LARGEST_RATIO: Final = 10.0
 """Largest share of one, relative to its gate."""
+
+CHANGED_SIGMAS: Final = 5.0
+"""Standard deviations by which the mean rate of a stationary vehicle shows that a gyro's bias has changed."""
+
+CHANGED_TIME: Final = 2.0
+"""Seconds of that mean, at least."""
+
+UNNOTICED_TIME: Final = 10.0
+"""Seconds for which the heading may have turned by that change unnoticed: then fixes hold it."""
 
 LOST_ATTITUDE_SIGMA: Final = 0.7
 """Sigma of the attitude, rad, beyond which a gap in the IMU makes the filter level again."""
@@ -141,6 +151,9 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
     context, mean_rate = create_context(setup, state), detector.mean_stationary_rate
     whole = constraints.zero_rate(context, mean_rate, state.earth.rotation, detector.sum_time)
     turn = Innovation(whole.residual[2:], whole.jacobian[2:], whole.noise[2:, 2:])
+    state, more = _check_biases(setup, state, whole, detector.sum_time)
+    if more:
+        return state._replace(stationary=detector.restart_mean()), more
     state, decision = fuse_constraint(setup, state, constraints.ZERO_RATE, turn)
     return state._replace(stationary=detector.restart_mean()), (decision,)
 
@@ -153,7 +166,9 @@ def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Deci
     )
     if is_stationary != state.constraints.is_stationary:
         state = propagation.propagate_covariance(setup, state)
-        constraints_ = state.constraints._replace(is_stationary=is_stationary, zupt_utime=utime)
+        constraints_ = state.constraints._replace(
+            is_stationary=is_stationary, zupt_utime=utime, rest_turn=ZERO, rest_time=0.0
+        )
         state = state._replace(constraints=constraints_)
     if is_stationary:
         if (utime - state.constraints.zupt_utime) * 1e-6 < ZUPT_PERIOD:
@@ -192,12 +207,46 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
             innovation = constraints.zero_rate(
                 context, detector.mean_stationary_rate, state.earth.rotation, detector.sum_time
             )
+            state, more = _check_biases(setup, state, innovation, detector.sum_time)
+            if more:
+                return state._replace(stationary=detector.restart_mean()), decisions + more
             state, decision = fuse_constraint(setup, state, constraints.ZERO_RATE, innovation)
             decisions = (*decisions, decision)
             if decision.verdict is Verdict.USED:
                 state = _store_biases(setup, state)
         state = state._replace(stationary=detector.restart_mean())
     return state, decisions
+
+
+def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state with new gyro biases where the mean rate at rest shows that they have changed.
+
+    `innovation` is that of ZARU over the last `seconds`. The gate refuses a large change and follows a small one too
+    slowly; wheels that are stationary exclude a ship that turns.
+    """
+    nav, rest = state.nav, state.constraints
+    if not state.stationary.is_confirmed_by_wheels(nav.utime):
+        return state._replace(constraints=rest._replace(rest_turn=ZERO, rest_time=0.0)), NOTHING
+    rate = innovation.residual + np.array(nav.gyro_bias)
+    turn, time = rest.rest_turn + rate * seconds, rest.rest_time + seconds
+    state = state._replace(constraints=rest._replace(rest_turn=to_vector3(turn), rest_time=time))
+    change = turn / time - np.array(nav.gyro_bias)
+    variance = setup.settings.gyro_noise**2 / time
+    P = nav.covariance
+    if time < CHANGED_TIME or np.all(change**2 < CHANGED_SIGMAS**2 * (np.diagonal(P)[9:12] + variance)):
+        return state, NOTHING
+    P = P.copy()
+    P[9:12, :] = P[:, 9:12] = 0.0
+    # the mean may be from before it too
+    P[[9, 10, 11], [9, 10, 11]] = change**2 + variance
+    if isinstance(state, Aligned):
+        monitor = state.consistency
+        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), monitor.heading_allowance) ** 2
+        state = state._replace(consistency=monitor.relearn(float(change[2]), nav.utime))
+    nav = nav._replace(gyro_bias=to_vector3(turn / time), covariance=P)
+    state = state._replace(nav=nav, constraints=rest._replace(rest_turn=ZERO, rest_time=0.0))
+    text = f"the bias of a gyro has changed by {math.degrees(np.abs(change).max()):.2f} deg/s"
+    return state, (report_event(state, constraints.ZERO_RATE, Verdict.RESET, text),)
 
 
 def _store_biases(setup: Setup, state: N) -> N:

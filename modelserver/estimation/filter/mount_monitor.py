@@ -57,7 +57,7 @@ class MountMonitor(NamedTuple):
     product: sum of df times the conjugate of dv, (m/s)^2.
     power, force_power: sums of |dv|^2 and |df|^2.
     windows: how many, as far as they are not forgotten.
-    is_confirmed: whether the mount was once seen to be right.
+    is_confirmed, is_wrong: whether the mount was once seen to be right, and is seen to be another than the geometry's.
     """
 
     begin: int = 0
@@ -72,6 +72,7 @@ class MountMonitor(NamedTuple):
     force_power: float = 0.0
     windows: float = 0.0
     is_confirmed: bool = False
+    is_wrong: bool = False
 
     def update(self, utime: int, speed: float, rate: float, force: complex) -> MountMonitor:
         """Return the monitor after a wheel sample.
@@ -97,7 +98,7 @@ class MountMonitor(NamedTuple):
                 force_power=keep * self.force_power + abs(df) ** 2,
                 windows=keep * self.windows + 1.0,
             )
-            ._confirm()
+            ._judge()
         )
 
     def _restart(self, utime: int, speed: float, rate: float, force: complex) -> MountMonitor:
@@ -114,17 +115,14 @@ class MountMonitor(NamedTuple):
         residual = max(self.force_power - abs(self.product) ** 2 / self.power, 0.0)
         return cmath.phase(c), math.sqrt(residual / (self.windows - 1.0) / self.power) / abs(c)
 
-    @property
-    def is_wrong(self) -> bool:
-        """Whether the IMU is mounted otherwise than the geometry states; at first a smaller certainty is enough."""
+    def _judge(self) -> MountMonitor:
+        """Return the monitor with its verdict, which lasts until the motion shows the contrary."""
         found = self.find_angle()
         if found is None:
-            return False
-        angle, sigma = found
-        return abs(angle) > max(LARGEST_ANGLE, (SIGMAS if self.is_confirmed else FIRST_SIGMAS) * sigma)
-
-    def _confirm(self) -> MountMonitor:
-        found = self.find_angle()
-        if found is None or self.is_confirmed or abs(found[0]) + FIRST_SIGMAS * found[1] > LARGEST_ANGLE:
             return self
-        return self._replace(is_confirmed=True)
+        angle, sigma = abs(found[0]), found[1]
+        if angle + FIRST_SIGMAS * sigma <= LARGEST_ANGLE:
+            return self._replace(is_confirmed=True, is_wrong=False)
+        # at first a smaller certainty is enough
+        is_wrong = angle > max(LARGEST_ANGLE, (SIGMAS if self.is_confirmed else FIRST_SIGMAS) * sigma)
+        return self._replace(is_wrong=self.is_wrong or is_wrong)

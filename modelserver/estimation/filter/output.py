@@ -74,10 +74,8 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     monitor = state.consistency
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
-    horizontal += abs(monitor.lever_arm)
-    if not monitor.excludes_fixes:
-        horizontal += monitor.horizontal_allowance
-        heading = monitor.bound_heading(heading, utime)
+    horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
+    heading = monitor.bound_heading(heading, utime)
     if heading > settings.heading_limit:
         invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
     if horizontal > settings.horizontal_limit:

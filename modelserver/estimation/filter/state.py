@@ -132,13 +132,16 @@ class Common(NamedTuple):
 class MotionConstraints(NamedTuple):
     """Whether the vehicle is stationary, and when the constraints were last used (utime).
 
-    `contradiction` is the running mean of the NIS of ZUPT, relative to its gate.
+    `contradiction` is the running mean of the NIS of ZUPT, relative to its gate; `rest_turn` the integral of the rate
+    over the `rest_time` that the vehicle has been stationary for, rad and s.
     """
 
     is_stationary: bool = False
     zupt_utime: int = 0
     non_holonomic_utime: int = 0
     contradiction: float = 0.0
+    rest_turn: Vector3 = ZERO
+    rest_time: float = 0.0
 
 
 class Leveling(NamedTuple):

@@ -18,6 +18,9 @@ from modelserver.transforms.so3 import Vector3
 AVERAGING_TIME: Final = 0.3
 """Time constant of the running mean and variance, seconds: a few strokes of an idling engine."""
 
+CONFIRMED_RATE: Final = 0.06
+"""Largest mean rate beyond the bias, rad/s, of a vehicle whose wheels are stationary: the bias may have changed."""
+
 WHEELS_TIMEOUT: Final = 1.0
 """Seconds for which a wheel sample counts."""
 
@@ -76,6 +79,8 @@ class StationaryDetector(NamedTuple):
         mean_force = (fx + gain * ex, fy + gain * ey, fz + gain * ez)
         a, b, c = mean_rate[0] - bias[0], mean_rate[1] - bias[1], mean_rate[2] - bias[2]
         most = settings.stationary_rate + 4.0 * bias_sigma
+        if self.is_confirmed_by_wheels(utime):
+            most = max(most, CONFIRMED_RATE)
         is_quiet = (
             rate_variance < 3.0 * settings.stationary_rate**2
             and force_variance < 3.0 * settings.stationary_force**2

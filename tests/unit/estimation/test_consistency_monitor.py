@@ -26,6 +26,7 @@ SETTINGS = FilterSettings()
 NOISE = PathNoise(SETTINGS.gyro_noise**2, 1.0)
 PERIOD = 0.5
 WHITE, CORRELATED = 0.13, 0.9
+FRESH = ConsistencyMonitor()
 
 
 class Fault(NamedTuple):
@@ -51,13 +52,19 @@ class Step(NamedTuple):
 
 
 def drive(
-    seconds: float, fault: Fault, seed: int = 1, *, is_measured: bool = True, correlated: float = CORRELATED
+    seconds: float,
+    fault: Fault,
+    seed: int = 1,
+    *,
+    is_measured: bool = True,
+    correlated: float = CORRELATED,
+    start: ConsistencyMonitor = FRESH,
 ) -> Iterator[Step]:
     """Yield the fixes of a vehicle at 2 to 6 m/s that turns now and then, and whose fixes no state follows."""
     noise = random.Random(seed)
     truth = antenna = wander = shift = 0j
     yaw = error = 0.0
-    monitor = ConsistencyMonitor()
+    monitor = start
     keep = math.exp(-PERIOD / SETTINGS.gps_correlation_time)
     for n in range(round(seconds / PERIOD)):
         t = n * PERIOD
@@ -166,7 +173,7 @@ def test_given_a_gyro_whose_bias_steps_then_it_is_mostly_found_to_be_the_cause_w
     changes = [each.found.change for each in steps if each.found and each.found.cause is Cause.GYRO]
     # straight ahead a drift of the fixes explains as much: then it is assumed
     assert len(changes) >= 4
-    assert all(each == pytest.approx(rate, rel=0.6) for each in changes)
+    assert all(each == pytest.approx(rate, rel=0.7) for each in changes)
 
 
 @pytest.mark.parametrize("scale", [0.15, -0.1])
@@ -207,13 +214,78 @@ def test_given_a_bias_that_the_state_has_followed_then_the_replayed_path_is_that
     assert replayed.rotation - nodes[-1].rotation == pytest.approx(turned, abs=0.005)
 
 
-def test_given_a_bound_that_shrinks_at_a_fix_then_it_takes_seconds() -> None:
+def test_given_a_bound_that_shrinks_at_a_fix_then_it_takes_seconds_and_meters() -> None:
     monitor = ConsistencyMonitor().hold_heading(0.5, 1_000_000)
-    assert monitor.bound_heading(0.1, 1_000_000) == pytest.approx(0.5)
-    assert 0.1 < monitor.bound_heading(0.1, 3_000_000) < 0.5
-    assert monitor.bound_heading(0.1, 60_000_000) == pytest.approx(0.1)
+    driven = monitor._replace(distance=100.0)
+    assert driven.bound_heading(0.1, 1_000_000) == pytest.approx(0.5)
+    assert 0.1 < driven.bound_heading(0.1, 3_000_000) < 0.5
+    assert driven.bound_heading(0.1, 60_000_000) == pytest.approx(0.1)
+    # at rest fixes show no heading
+    assert monitor.bound_heading(0.1, 60_000_000) == pytest.approx(0.5)
+    assert 0.1 < monitor._replace(distance=2.0).bound_heading(0.1, 60_000_000) < 0.5
     # a clock that was set back
-    assert monitor.bound_heading(0.1, 0) == pytest.approx(0.5)
+    assert driven.bound_heading(0.1, 0) == pytest.approx(0.5)
+
+
+def test_given_a_speed_that_nothing_measures_then_the_bound_covers_the_course_of_fixes_beside_the_heading() -> None:
+    # within a second the heading turns by 60 deg, and the vehicle does not
+    steps = list(drive(200.0, Fault(100.0, 101.0, rate=1.0), is_measured=False))
+    assert all(each.monitor.heading_allowance < 0.2 for each in steps if each.t < 100.0)
+    straight = [each.monitor.heading_allowance for each in steps if 110.0 < each.t < 120.0]
+    assert min(straight) > 0.5
+
+
+def test_given_a_first_path_then_its_heading_is_confirmed_by_the_next_meters() -> None:
+    first = ConsistencyMonitor().start_heading(CORRELATED, 4.0, is_measured=True)
+    unmeasured = ConsistencyMonitor().start_heading(CORRELATED, 4.0, is_measured=False)
+    assert math.radians(30.0) < first.heading_allowance < unmeasured.heading_allowance < math.radians(60.0)
+    precise = ConsistencyMonitor().start_heading(0.02, 4.0, is_measured=False)
+    assert precise.heading_allowance < math.radians(2.0)
+    # at rest nothing confirms it
+    assert first.extend(1_000_000, 0j, is_measured=True).heading_allowance == first.heading_allowance
+    driven = list(drive(60.0, Fault(), start=first))
+    assert driven[1].monitor.heading_allowance > 0.9 * first.heading_allowance
+    assert driven[-1].monitor.heading_allowance < 0.1
+
+
+def test_given_a_gyro_that_has_changed_at_rest_then_fixes_that_contradicted_its_path_are_not_suspect() -> None:
+    found = find(Fault(200.0, drift=1.0))
+    assert found.found is not None
+    suspect = found.monitor.resolve(found.found, found.node.utime)
+    assert suspect.suspect is not None
+    relearned = suspect.relearn(0.02, found.node.utime)
+    assert relearned.suspect is None
+    assert relearned.cause is Cause.GYRO
+    # what drifts in its temperature does not explain it
+    assert suspect.relearn(0.001, found.node.utime) is suspect
+
+
+def test_given_fixes_that_jump_then_what_is_not_used_widens_no_bound() -> None:
+    fault = Fault(200.0, 230.0, jump=40.0)
+    found = next(each for each in drive(230.0, fault) if each.found is not None)
+    assert found.found is not None
+    monitor = found.monitor.resolve(found.found, found.node.utime)
+    assert monitor.excludes_fixes
+    later = monitor.compare(found.node._replace(utime=found.node.utime + 500_000), NOISE, SETTINGS)
+    assert later.horizontal_allowance == monitor.horizontal_allowance
+    assert later.heading_allowance == monitor.heading_allowance
+
+
+def test_given_fixes_that_were_off_for_seconds_then_they_are_trusted_again_soon() -> None:
+    fault = Fault(200.0, 203.0, jump=4.0)
+    steps = drive(260.0, fault)
+    found = next(each for each in steps if each.found is not None)
+    assert found.found is not None
+    assert found.found.cause is Cause.GNSS
+    assert not found.found.is_jump
+    monitor = found.monitor.resolve(found.found, found.node.utime)
+    for each in drive(260.0, fault):
+        if each.t > found.t:
+            monitor, agrees = monitor.check_trust(each.node, NOISE, SETTINGS)
+            if agrees:
+                break
+    assert agrees
+    assert each.t < 203.0 + AGREEMENT_TIME + 5.0
 
 
 def test_given_one_outlier_then_nothing_is_found() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from modelserver.messages import Invalid, Quality, Verdict
+from modelserver.messages import ImuSample, Invalid, Quality, Verdict
 from modelserver.simulation import (
+    Event,
     GpsModel,
     SideSlip,
     Terrain,
@@ -19,7 +21,9 @@ from modelserver.simulation import (
     reverse_eight,
     stationary,
 )
-from tests.support_filter import IMU, PLAIN_GPS, drive, rig, simulation
+from modelserver.simulation.scenario import START_UTIME
+from modelserver.transforms import so3
+from tests.support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
 
 pytestmark = pytest.mark.slow
 
@@ -46,6 +50,35 @@ def test_given_drifting_fixes_when_stationary_for_ten_minutes_after_a_drive_then
     assert all(row.valid for row in rest)
     assert all(row.off < row.estimate.horizontal_protection_level for row in rest)
     assert math.dist(rest[0].estimate.odom.xyz, rest[-1].estimate.odom.xyz) < 0.01
+
+
+@pytest.mark.parametrize("step", [0.004, -0.02, 0.04])
+def test_given_a_gyro_whose_bias_changes_at_rest_then_it_is_measured_again_and_the_next_drive_is_good(step):
+    eight = figure_eight(speed=2.5, radius=8.0, stationary=4.0, ramp=3.0)
+    driven = sum(phase.duration for phase in eight)
+    changed = START_UTIME + round(1e6 * (driven + 5.0))
+
+    def add_bias(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, ImuSample) and event.header.utime >= changed:
+                turn = so3.rotate(so3.conjugate(MOUNT.wxyz), (0.0, 0.0, step))
+                event = replace(event, angular_velocity=so3.add(event.angular_velocity, turn))
+            yield event
+
+    run = simulation((*eight, *stationary(30.0), *eight))
+    found = drive(run, 2.0 * driven + 30.0, transform=add_bias)
+
+    # the sensor's own bias is 0.002
+    assert found.localizer.head.nav.gyro_bias[2] == pytest.approx(step, abs=0.004)
+    if abs(step) > 0.01:
+        resets = found.decisions("zero_rate", Verdict.RESET)
+        assert 1 <= len(resets) <= 2
+        assert all("bias of a gyro has changed" in each.reason for each in resets)
+        assert found.seconds(resets[-1]) < driven + 10.0
+    after = found.between(driven + 5.0)
+    assert all(row.off < row.estimate.horizontal_protection_level for row in after)
+    assert all(abs(row.heading) < row.estimate.heading_protection_level for row in after)
+    assert max(abs(row.heading) for row in found.between(driven + 50.0)) < math.radians(5.0)
 
 
 def test_given_two_antennas_when_stationary_for_ten_minutes_from_the_start_then_pose_and_heading_are_known_and_stay():

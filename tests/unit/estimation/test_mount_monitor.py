@@ -68,3 +68,11 @@ def test_given_a_mount_once_confirmed_then_a_disturbance_that_would_do_at_first_
     turned = drive(3.0, math.pi / 2.0, good)
     assert not turned.is_wrong
     assert drive(3.0 + FEWEST, math.pi / 2.0, MountMonitor()).is_wrong
+
+
+def test_given_a_mount_once_found_wrong_then_it_stays_so_until_the_motion_shows_the_contrary() -> None:
+    turned = drive(60.0, math.pi, MountMonitor())
+    assert turned.is_wrong
+    # a hill makes it uncertain
+    assert drive(20.0, math.pi, turned, lean=3.0 + 0j).is_wrong
+    assert not drive(1500.0, 0.0, turned).is_wrong
