@@ -118,7 +118,7 @@ def estimate(seconds: float, sigma: float = 0.05) -> Estimate:
         numbers,
         drift,
         origin=ORIGIN,
-        motion=VehicleMotion(v, w, acceleration(seconds), covariance=lambda: twist_covariance),
+        motion=VehicleMotion(v, w, acceleration(seconds), covariance=lambda: twist_covariance, acceleration_sigma=0.02),
     )
 
 

@@ -259,6 +259,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             MotionAnswer(
                 answer(), "Raptor:CG", (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), (4.0, 5.0, 6.0), (0.4, 0.5, 0.6),
                 tuple(float(each) for each in range(36)),
+                tuple(float(each) for each in range(36, 72)),
             ),
         ),
         MotionReply(_OK, MotionAnswer(bare_answer(), "", (1.0, 2.0, 3.0), *(((math.nan,) * 3,) * 3))),

@@ -16,11 +16,11 @@ class get_motion_reply_t(object):
     @answer MotionAnswer Pose and motion of a frame relative to another one, along the axes of `expressed_in`.
     """
 
-    __slots__ = ["header", "transform", "expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "covariance"]
+    __slots__ = ["header", "transform", "expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "covariance", "acceleration_covariance"]
 
-    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_transform_t", "string", "double", "double", "double", "double", "double"]
+    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_transform_t", "string", "double", "double", "double", "double", "double", "double"]
 
-    __dimensions__ = [None, None, None, [3], [3], [3], [3], [36]]
+    __dimensions__ = [None, None, None, [3], [3], [3], [3], [36], [36]]
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
@@ -73,6 +73,13 @@ class get_motion_reply_t(object):
         LCM Type: double[36]
         """
 
+        self.acceleration_covariance = [ 0.0 for dim0 in range(36) ]
+        """
+        Covariance of acceleration and angular acceleration, row-major, (m/s2)2 and (rad/s2)2. nan = not known.
+        @optional
+        LCM Type: double[36]
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -94,6 +101,7 @@ class get_motion_reply_t(object):
         buf.write(struct.pack('>3d', *self.acceleration[:3]))
         buf.write(struct.pack('>3d', *self.angular_acceleration[:3]))
         buf.write(struct.pack('>36d', *self.covariance[:36]))
+        buf.write(struct.pack('>36d', *self.acceleration_covariance[:36]))
 
     @staticmethod
     def decode(data: bytes):
@@ -117,13 +125,14 @@ class get_motion_reply_t(object):
         self.acceleration = struct.unpack('>3d', buf.read(24))
         self.angular_acceleration = struct.unpack('>3d', buf.read(24))
         self.covariance = struct.unpack('>36d', buf.read(288))
+        self.acceleration_covariance = struct.unpack('>36d', buf.read(288))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_motion_reply_t in parents: return 0
         newparents = parents + [get_motion_reply_t]
-        tmphash = (0xed36430f04a151ca+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xea679ae14aa57664+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -7,6 +7,7 @@ earlier one is held. Estimates may be deferred: they are computed when first rea
 
 from __future__ import annotations
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Generator
@@ -18,11 +19,18 @@ import numpy.typing as npt
 from modelserver.errors import TooNewError, TooOldError
 from modelserver.messages import VALID, Estimate, Invalid, Quality, VehicleMotion
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Vector3
+from modelserver.transforms.so3 import Vector3, to_vector3
 
 MAX_DIFFERENCE_SPAN_S: Final = 0.5
 """Estimates farther apart give no angular acceleration."""
 
+
+SLOPE_WINDOW_US: Final = 300_000
+"""Microseconds of turn rates whose slope is the angular acceleration: vehicles turn in slower than in a third of it."""
+
+SLOPE_POINTS: Final = 7
+SLOPE_LEAST_POINTS: Final = 5
+"""Estimates that are used in it, at most and at least: each may have to be computed first."""
 
 MIN_STEP_US: Final = 4000
 """Microseconds between stored estimates, at least: bounds the memory against a flood."""
@@ -148,8 +156,13 @@ class History:
             return before
         return interpolate(before, self._at(after), utime)
 
-    def angular_acceleration(self, utime: int) -> Vector3 | None:
-        """Return the vehicle's angular acceleration around a time, rad/s2 along its axes; None where unknown."""
+    def angular_acceleration(self, utime: int) -> tuple[Vector3, float] | None:
+        """Return the vehicle's angular acceleration at a time, rad/s2 along its axes, and the variance along each.
+
+        It is the slope of a parabola that is fitted to the turn rates of SLOPE_WINDOW_US around the time (A. Savitzky
+        and M. Golay, 1964), or at the ends of the history of as long before or after it; the variance is that of the
+        residuals. Of too few estimates for that it is their difference, with variance nan. None where unknown.
+        """
         after = min(max(bisect_left(self._times, utime, self._start, self._end), self._start + 1), self._end - 1)
         if after <= self._start:
             return None
@@ -157,8 +170,18 @@ class History:
         span = (b.utime - a.utime) * 1e-6
         if a.motion is None or b.motion is None or a.pose_epoch != b.pose_epoch or not span <= MAX_DIFFERENCE_SPAN_S:
             return None
+        begin = max(min(utime - SLOPE_WINDOW_US // 2, self.last - SLOPE_WINDOW_US), self.first)
+        first = bisect_left(self._times, begin, self._start, self._end)
+        last = bisect_right(self._times, begin + SLOPE_WINDOW_US, self._start, self._end) - 1
+        count = min(last - first + 1, SLOPE_POINTS)
+        if count >= SLOPE_LEAST_POINTS:
+            near = [self._at(first + (last - first) * k // (count - 1)) for k in range(count)]
+            rows = [(each.utime, each.motion) for each in near if each.pose_epoch == a.pose_epoch]
+            known = [(at, motion.angular_velocity) for at, motion in rows if motion is not None]
+            if len(known) >= SLOPE_LEAST_POINTS:
+                return _fit_slope(known, utime)
         (x, y, z), (u, v, w) = a.motion.angular_velocity, b.motion.angular_velocity
-        return ((u - x) / span, (v - y) / span, (w - z) / span)
+        return ((u - x) / span, (v - y) / span, (w - z) / span), math.nan
 
     def hold(self, utime: int) -> Estimate:
         """Return the newest estimate not after a time (hold-last-value). Raises TooOldError."""
@@ -244,6 +267,18 @@ def interpolate(a: Estimate, b: Estimate, utime: int) -> Estimate:
     )
 
 
+def _fit_slope(rates: list[tuple[int, Vector3]], utime: int) -> tuple[Vector3, float]:
+    """Return the slope at a time of the parabola through turn rates, with the variance along each axis."""
+    t = np.array([(at - utime) * 1e-6 for at, _ in rates])
+    A = np.column_stack((np.ones(len(t)), t, t * t))
+    values = np.array([rate for _, rate in rates])
+    inverse = np.linalg.inv(A.T @ A)
+    x = inverse @ A.T @ values
+    rest = values - A @ x
+    variance = float((rest * rest).sum()) / (3 * (len(t) - 3)) * float(inverse[1, 1])
+    return to_vector3(x[1]), variance
+
+
 def _interpolate_motion(a: VehicleMotion | None, b: VehicleMotion | None, fraction: float) -> VehicleMotion | None:
     """Return the motion between two instants: each number linear in time."""
     if a is None or b is None:
@@ -259,6 +294,7 @@ def _interpolate_motion(a: VehicleMotion | None, b: VehicleMotion | None, fracti
         interpolate_vector(a.acceleration, b.acceleration),
         b.imu_position,
         b.covariance,
+        b.acceleration_sigma,
     )
 
 

@@ -45,7 +45,8 @@ class VehicleMotion(NamedTuple):
     """Motion of the vehicle relative to the ground, along the axes of the estimated frame.
 
     `velocity` (m/s) is that of the frame's origin, `angular_velocity` in rad/s. `acceleration` (m/s2) is that of the
-    IMU at `imu_position` (m, from the frame's origin), nan = not known. `covariance` is None where it is not known.
+    IMU at `imu_position` (m, from the frame's origin), with `acceleration_sigma` along each axis; nan = not known.
+    `covariance` is None where it is not known.
     """
 
     velocity: Vector3
@@ -53,6 +54,7 @@ class VehicleMotion(NamedTuple):
     acceleration: Vector3 = (NAN, NAN, NAN)
     imu_position: Vector3 = (0.0, 0.0, 0.0)
     covariance: MotionCovariance | None = None
+    acceleration_sigma: float = NAN
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -547,6 +547,8 @@ class MotionAnswer(NamedTuple):
         Angular acceleration, rad/s2.
     covariance
         Covariance of velocity and rate, row-major, (m/s)2 and (rad/s)2. nan = not known.
+    acceleration_covariance
+        Covariance of acceleration and angular acceleration, row-major, (m/s2)2 and (rad/s2)2. nan = not known.
     """
 
     pose: PoseAnswer
@@ -556,6 +558,7 @@ class MotionAnswer(NamedTuple):
     acceleration: Vector3
     angular_acceleration: Vector3
     covariance: tuple[float, ...] | None = None
+    acceleration_covariance: tuple[float, ...] | None = None
 
 
 class MotionReply(NamedTuple):

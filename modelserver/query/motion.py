@@ -3,9 +3,13 @@
 The rigid motion of each edge is composed along the path (`transforms.kinematics`). A joint moves by J q' and
 J q'' + J' q', with its Jacobian J differenced along q'. The vehicle's acceleration is measured at the inertial unit and
 transferred by the lever arm: a + dw x r + w x (w x r). The covariance of the velocities is first order in the chain.
+Accelerations are linear in those of the vehicle, which gives their covariance; that of a measured joint is not known.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +22,7 @@ from modelserver.query.path import PathStep, lookup_path
 from modelserver.query.view import PlatformView
 from modelserver.transforms import chain, so3
 from modelserver.transforms.chain import ChainLink
-from modelserver.transforms.kinematics import UNKNOWN, RigidMotion
+from modelserver.transforms.kinematics import UNKNOWN, ZERO, RigidMotion
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, add, cross, to_vector3
 
@@ -36,14 +40,16 @@ def compute_motion(
     """
     answer = view.transformation(interest, reference, time, now)
     path = lookup_path(view, interest, reference, time, now)
-    moved = RigidMotion(Pose.identity())
+    motions: list[RigidMotion] = []
     uncertain: list[ChainLink] = []
     for step in path.steps:
         each, factor = _step_motion(view, step)
-        moved = moved.compose(each if step.edge.forward else each.inverse())
+        motions.append(each)
         # the vehicle has one motion, in whichever world it is expressed
         source = step.source if step.estimate is None else (EdgeKind.VEHICLE,)
         uncertain.append(ChainLink(step.X_FT, step.edge.forward, factor, source))
+    moved = _compose(path.steps, motions)
+    second = _get_acceleration_covariance(view, path.steps, motions)
     R = so3.IDENTITY
     axes = expressed_in or reference
     if axes != reference:
@@ -60,6 +66,9 @@ def compute_motion(
     if covariance is not None and axes != reference:
         turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
         covariance = turn @ covariance @ turn.T
+    if second is not None and axes != reference:
+        turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
+        second = turn @ second @ turn.T
     return MotionAnswer(
         answer,
         axes,
@@ -68,7 +77,57 @@ def compute_motion(
         so3.rotate(R, moved.acceleration),
         so3.rotate(R, moved.angular_acceleration),
         None if covariance is None else tuple(covariance.ravel().tolist()),
+        None if second is None else tuple(second.ravel().tolist()),
     )
+
+
+def _compose(steps: Sequence[PathStep], motions: list[RigidMotion]) -> RigidMotion:
+    """Return the motion along a path."""
+    moved = RigidMotion(Pose.identity())
+    for step, each in zip(steps, motions, strict=True):
+        moved = moved.compose(each if step.edge.forward else each.inverse())
+    return moved
+
+
+def _get_acceleration_covariance(
+    view: PlatformView, steps: Sequence[PathStep], motions: list[RigidMotion]
+) -> Array | None:
+    """Return the covariance (6, 6) of the accelerations along a path; None where it is not known."""
+    if any(reading.provenance is not Provenance.DEFAULT for step in steps for reading in step.readings):
+        return None
+    at = [n for n, step in enumerate(steps) if step.estimate is not None]
+    if not at:
+        return np.zeros((6, 6))
+    if len(at) > 1:
+        return None
+    (n,) = at
+    estimate = steps[n].estimate
+    assert estimate is not None
+    own = _get_vehicle_covariance(view, steps[n].X_FT, estimate)
+    if own is None:
+        return None
+    columns = []
+    for axis in np.eye(6):
+        each = motions[n]._replace(acceleration=to_vector3(axis[:3]), angular_acceleration=to_vector3(axis[3:]))
+        columns.append(_compose(steps, [*motions[:n], each, *motions[n + 1 :]]))
+    none = motions[n]._replace(acceleration=ZERO, angular_acceleration=ZERO)
+    rest = _compose(steps, [*motions[:n], none, *motions[n + 1 :]])
+    J = np.array([(*each.acceleration, *each.angular_acceleration) for each in columns])
+    J -= np.array((*rest.acceleration, *rest.angular_acceleration))
+    return np.asarray(J.T @ own @ J)
+
+
+def _get_vehicle_covariance(view: PlatformView, X_WB: Pose, estimate: Estimate) -> Array | None:
+    """Return the covariance of the vehicle's own accelerations along the world's axes; None where it is not known."""
+    own, turning = estimate.motion, view.history.angular_acceleration(estimate.utime)
+    if own is None or turning is None or math.isnan(own.acceleration_sigma + turning[1]):
+        return None
+    # a = a_imu + dw x r: an error of dw moves it by -[r]x
+    arm = np.array(so3.skew((-own.imu_position[0], -own.imu_position[1], -own.imu_position[2])))
+    J = np.block([[np.eye(3), -arm], [np.zeros((3, 3)), np.eye(3)]])
+    C = np.diag([own.acceleration_sigma**2] * 3 + [turning[1]] * 3)
+    turn = np.kron(np.eye(2), np.array(so3.matrix_rows(X_WB.wxyz))) @ J
+    return np.asarray(turn @ C @ turn.T)
 
 
 def _step_motion(view: PlatformView, step: PathStep) -> tuple[RigidMotion, Array | None]:
@@ -126,11 +185,11 @@ def _vehicle_motion(view: PlatformView, X_WB: Pose, estimate: Estimate) -> tuple
     q = X_WB.wxyz
     turning = view.history.angular_acceleration(estimate.utime)
     w = own.angular_velocity
-    acceleration, change = UNKNOWN, UNKNOWN if turning is None else turning
+    acceleration, change = UNKNOWN, UNKNOWN if turning is None else turning[0]
     if turning is not None:
         x, y, z = own.imu_position
         arm = (-x, -y, -z)
-        acceleration = add(own.acceleration, cross(turning, arm), cross(w, cross(w, arm)))
+        acceleration = add(own.acceleration, cross(change, arm), cross(w, cross(w, arm)))
     factor = None
     if own.covariance is not None:
         turn = np.kron(np.eye(2), np.array(so3.matrix_rows(q)))

@@ -142,7 +142,7 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "get_h_transform_request_t": bytes.fromhex("7e7a9479fd1d6d9b"),
     "get_history_reply_t": bytes.fromhex("179fc49727116ccf"),
     "get_history_request_t": bytes.fromhex("6e2a16f04ed99393"),
-    "get_motion_reply_t": bytes.fromhex("3743f00523352e6f"),
+    "get_motion_reply_t": bytes.fromhex("31a69fa9af3d77a3"),
     "get_motion_request_t": bytes.fromhex("cfb4f4d1e8b42938"),
     "get_state_vector_reply_t": bytes.fromhex("790a52685036e932"),
     "get_state_vector_request_t": bytes.fromhex("7a15c48e4bece939"),
@@ -192,27 +192,31 @@ _S8 = struct.Struct(">iqqdddddqi")
 _S9 = struct.Struct(">qbi")
 _S10 = struct.Struct(">bqbi")
 _S11 = struct.Struct(">qqd")
-_S12 = struct.Struct(">3d3d3d3d36d")
-_S13 = struct.Struct(">qb")
-_S14 = struct.Struct(">bhdddddddd9d3d9dddddddd")
-_S15 = struct.Struct(">qd")
-_S16 = struct.Struct(">biiqqqiqqdddd")
-_S17 = struct.Struct(">iiqdbbbddddi")
-_S18 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S19 = struct.Struct(">bbbdddd")
-_S20 = struct.Struct(">iii")
-_S21 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
-_S22 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
-_S23 = struct.Struct(">b7dbqd")
-_S24 = struct.Struct(">3d")
-_S25 = struct.Struct(">qq")
-_S26 = struct.Struct(">32s")
-_S27 = struct.Struct(">qdq")
-_S28 = struct.Struct(">bddddiq")
+_S12 = struct.Struct(">3d3d3d3d36d36d")
+_S13 = struct.Struct(">3d3d3d3d36d")
+_S14 = struct.Struct(">36d")
+_S15 = struct.Struct(">qb")
+_S16 = struct.Struct(">bhdddddddd9d3d9dddddddd")
+_S17 = struct.Struct(">qd")
+_S18 = struct.Struct(">biiqqqiqqdddd")
+_S19 = struct.Struct(">iiqdbbbddddi")
+_S20 = struct.Struct(">3d9d3d9d3dbb4d9dd")
+_S21 = struct.Struct(">bbbdddd")
+_S22 = struct.Struct(">iii")
+_S23 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
+_S24 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
+_S25 = struct.Struct(">b7dbqd")
+_S26 = struct.Struct(">3d")
+_S27 = struct.Struct(">qq")
+_S28 = struct.Struct(">32s")
+_S29 = struct.Struct(">qdq")
+_S30 = struct.Struct(">bddddiq")
 
 
 NO_GET_EXPLANATION_REPLY = NO_POSE_TRANSFORM + bytes(4)
-NO_GET_MOTION_REPLY = NO_POSE_TRANSFORM + pack_text("") + bytes(24) + bytes(24) + bytes(24) + bytes(24) + bytes(288)
+NO_GET_MOTION_REPLY = (
+    NO_POSE_TRANSFORM + pack_text("") + bytes(24) + bytes(24) + bytes(24) + bytes(24) + bytes(288) + bytes(288)
+)
 KIND_WORDS = ("frame", "constraint", "joint", "vehicle")
 PROVENANCE_WORDS = ("fixed", "measured", "interpolated", "held", "predicted", "default")
 
@@ -571,6 +575,7 @@ def pack_get_motion_reply(value: MotionReply) -> bytes:
             *value.answer.acceleration,
             *value.answer.angular_acceleration,
             *(value.answer.covariance or NAN36),
+            *(value.answer.acceleration_covariance or NAN36),
         ),
     )
 
@@ -596,7 +601,8 @@ def unpack_get_motion_reply(data: bytes, at: int) -> tuple[MotionReply, int]:
         angular_acceleration_1,
         angular_acceleration_2,
         *covariance,
-    ) = _S12.unpack_from(data, at)
+    ) = _S13.unpack_from(data, at)
+    (*acceleration_covariance,) = _S14.unpack_from(data, at + 384)
     return MotionReply(
         header,
         MotionAnswer(
@@ -607,8 +613,9 @@ def unpack_get_motion_reply(data: bytes, at: int) -> tuple[MotionReply, int]:
             (acceleration_0, acceleration_1, acceleration_2),
             (angular_acceleration_0, angular_acceleration_1, angular_acceleration_2),
             None if covariance[0] != covariance[0] else tuple(covariance),
+            None if acceleration_covariance[0] != acceleration_covariance[0] else tuple(acceleration_covariance),
         ),
-    ), at + 384
+    ), at + 672
 
 
 def pack_get_motion_request(value: GetMotion) -> bytes:
@@ -746,7 +753,7 @@ def pack_get_transformations_request(value: GetTransformations) -> bytes:
             _S5.pack(len(value.at)),
             pack_numbers("q", value.at),
             pack_text(value.fixed_frame),
-            _S13.pack(value.reference_at, value.with_covariance),
+            _S15.pack(value.reference_at, value.with_covariance),
         )
     )
 
@@ -763,7 +770,7 @@ def unpack_get_transformations_request(data: bytes, at: int) -> tuple[GetTransfo
     check_count(num_instants, "num_instants", MAX_MESSAGE_INSTANTS)
     at_, at = read_numbers("q", data, at + 4, num_instants)
     fixed_frame, at = read_text(data, at)
-    reference_at, with_covariance = _S13.unpack_from(data, at)
+    reference_at, with_covariance = _S15.unpack_from(data, at)
     return GetTransformations(
         RequestHeader(header_request_id, header_reply_channel),
         tuple(
@@ -791,7 +798,7 @@ def pack_gps(value: GpsSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S14.pack(
+        _S16.pack(
             value.fix_type,
             value.satellites,
             value.hdop,
@@ -859,7 +866,7 @@ def unpack_gps(data: bytes, at: int) -> tuple[GpsSample, int]:
         course_sigma,
         baseline_yaw,
         baseline_yaw_sigma,
-    ) = _S14.unpack_from(data, at)
+    ) = _S16.unpack_from(data, at)
     return GpsSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -920,11 +927,11 @@ def pack_health(value: Health) -> bytes:
     """Return the bytes of a health_t without the fingerprint."""
     return b"".join(
         (
-            _S15.pack(value.utime, value.uptime),
+            _S17.pack(value.utime, value.uptime),
             pack_text(value.version),
             pack_text(value.vehicle),
             pack_text(value.model_revision),
-            _S16.pack(
+            _S18.pack(
                 value.state,
                 value.invalid_reasons,
                 value.pose_epoch,
@@ -941,7 +948,7 @@ def pack_health(value: Health) -> bytes:
             ),
             pack_text(value.invalid_text),
             pack_text(value.host),
-            _S17.pack(
+            _S19.pack(
                 value.pid,
                 value.requests_queued,
                 value.memory,
@@ -967,7 +974,7 @@ def pack_health(value: Health) -> bytes:
 
 def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
     """Return the health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, uptime = _S15.unpack_from(data, at)
+    utime, uptime = _S17.unpack_from(data, at)
     version, at = read_text(data, at + 16)
     vehicle, at = read_text(data, at)
     model_revision, at = read_text(data, at)
@@ -985,7 +992,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         tick_latency_p90,
         tick_latency_p99,
         tick_latency_max,
-    ) = _S16.unpack_from(data, at)
+    ) = _S18.unpack_from(data, at)
     invalid_text, at = read_text(data, at + 85)
     host, at = read_text(data, at)
     (
@@ -1001,7 +1008,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         localization_seconds_to_limit,
         localization_fix_age,
         num_channels,
-    ) = _S17.unpack_from(data, at)
+    ) = _S19.unpack_from(data, at)
     check_count(num_channels, "num_channels")
     channels, at = read_each(unpack_channel_health, data, at + 63, num_channels)
     (num_rejected,) = _S5.unpack_from(data, at)
@@ -1062,7 +1069,7 @@ def pack_imu(value: ImuSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S18.pack(
+        _S20.pack(
             *(value.angular_velocity or NAN3),
             *(value.angular_velocity_covariance or NAN9),
             *(value.specific_force or NAN3),
@@ -1125,7 +1132,7 @@ def unpack_imu(data: bytes, at: int) -> tuple[ImuSample, int]:
         orientation_covariance_7,
         orientation_covariance_8,
         temperature_celsius,
-    ) = _S18.unpack_from(data, at)
+    ) = _S20.unpack_from(data, at)
     return ImuSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -1232,7 +1239,7 @@ def unpack_joints(data: bytes, at: int) -> tuple[JointsSample, int]:
 
 def pack_localization_health(value: LocalizationHealth) -> bytes:
     """Return the bytes of a localization_health_t without the fingerprint."""
-    return _S19.pack(
+    return _S21.pack(
         -1 if value.mode is None else value.mode,
         -1 if value.phase is None else value.phase,
         value.stationary,
@@ -1246,7 +1253,7 @@ def pack_localization_health(value: LocalizationHealth) -> bytes:
 def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth, int]:
     """Return the localization_health_t that begins at `at`, and its end. Raises WireError, struct.error."""
     mode, phase, stationary, horizontal_protection_level, heading_protection_level, seconds_to_limit, fix_age = (
-        _S19.unpack_from(data, at)
+        _S21.unpack_from(data, at)
     )
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
@@ -1297,7 +1304,7 @@ def pack_model_snapshot(value: SnapshotPart) -> bytes:
     return b"%b%b%b%b" % (
         _S3.pack(value.utime),
         pack_text(value.model_revision),
-        _S20.pack(value.part, value.parts, len(value.data)),
+        _S22.pack(value.part, value.parts, len(value.data)),
         value.data,
     )
 
@@ -1306,7 +1313,7 @@ def unpack_model_snapshot(data: bytes, at: int) -> tuple[SnapshotPart, int]:
     """Return the model_snapshot_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (utime,) = _S3.unpack_from(data, at)
     model_revision, at = read_text(data, at + 8)
-    part, num_parts, size = _S20.unpack_from(data, at)
+    part, num_parts, size = _S22.unpack_from(data, at)
     check_count(size, "size")
     data_, at = read_bytes(data, at + 12, size)
     return verify_model_snapshot(
@@ -1341,7 +1348,7 @@ def pack_navigation_state(value: NavigationState) -> bytes:
     check_outgoing(len(value.names), MAX_STATES, "n")
     return b"".join(
         (
-            _S21.pack(
+            _S23.pack(
                 value.utime,
                 value.mode,
                 value.phase,
@@ -1392,7 +1399,7 @@ def unpack_navigation_state(data: bytes, at: int) -> tuple[NavigationState, int]
         angular_velocity_1,
         angular_velocity_2,
         *twist_covariance,
-    ) = _S22.unpack_from(data, at)
+    ) = _S24.unpack_from(data, at)
     (n,) = _S5.unpack_from(data, at + 435)
     check_count(n, "n", MAX_STATES)
     names, at = read_each(read_text, data, at + 439, n)
@@ -1430,7 +1437,7 @@ def pack_path_edge(value: EdgeReport) -> bytes:
         pack_text(value.name),
         pack_text(value.ends[0]),
         pack_text(value.ends[1]),
-        _S23.pack(
+        _S25.pack(
             value.forward,
             *value.pose.xyz,
             *value.pose.wxyz,
@@ -1453,7 +1460,7 @@ def unpack_path_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
     from_end, at = read_text(data, at)
     to_end, at = read_text(data, at)
     forward, vector_0, vector_1, vector_2, vector_3, vector_4, vector_5, vector_6, provenance, stamp, age = (
-        _S23.unpack_from(data, at)
+        _S25.unpack_from(data, at)
     )
     source, at = read_text(data, at + 74)
     (num_coordinates,) = _S5.unpack_from(data, at)
@@ -1491,7 +1498,7 @@ def pack_range(value: RangeSample) -> bytes:
         pack_text(value.header.source),
         pack_text(value.frame),
         pack_text(value.beacon),
-        _S24.pack(*value.beacon_position),
+        _S26.pack(*value.beacon_position),
         pack_text(value.frame_of_reference),
         _S6.pack(value.distance, value.sigma),
     )
@@ -1503,7 +1510,7 @@ def unpack_range(data: bytes, at: int) -> tuple[RangeSample, int]:
     header_source, at = read_text(data, at + 40)
     frame, at = read_text(data, at)
     beacon, at = read_text(data, at)
-    beacon_position_0, beacon_position_1, beacon_position_2 = _S24.unpack_from(data, at)
+    beacon_position_0, beacon_position_1, beacon_position_2 = _S26.unpack_from(data, at)
     frame_of_reference, at = read_text(data, at + 24)
     distance, sigma = _S6.unpack_from(data, at)
     return RangeSample(
@@ -1694,11 +1701,11 @@ def pack_signed(value: Envelope) -> bytes:
     return b"%b%b%b%b%b%b%b" % (
         pack_text(value.key_name),
         pack_text(value.sender),
-        _S25.pack(value.utime, value.counter),
+        _S27.pack(value.utime, value.counter),
         pack_text(value.channel),
         _S5.pack(len(value.payload)),
         value.payload,
-        _S26.pack(value.mac),
+        _S28.pack(value.mac),
     )
 
 
@@ -1706,12 +1713,12 @@ def unpack_signed(data: bytes, at: int) -> tuple[Envelope, int]:
     """Return the signed_t that begins at `at`, and its end. Raises WireError, struct.error."""
     key_name, at = read_text(data, at)
     sender, at = read_text(data, at)
-    utime, counter = _S25.unpack_from(data, at)
+    utime, counter = _S27.unpack_from(data, at)
     channel, at = read_text(data, at + 16)
     (size,) = _S5.unpack_from(data, at)
     check_count(size, "size", 4096)
     payload, at = read_bytes(data, at + 4, size)
-    (mac,) = _S26.unpack_from(data, at)
+    (mac,) = _S28.unpack_from(data, at)
     return Envelope(
         check_name(key_name, "key_name"),
         check_name(sender, "sender"),
@@ -1739,7 +1746,7 @@ def unpack_time_query(data: bytes, at: int) -> tuple[TimeQuery, int]:
 def pack_vehicle_command(value: VehicleCommand) -> bytes:
     """Return the bytes of a vehicle_command_t without the fingerprint."""
     return b"%b%b%b" % (
-        _S27.pack(value.utime, value.valid_for, value.seq),
+        _S29.pack(value.utime, value.valid_for, value.seq),
         pack_text(value.source),
         _S6.pack(value.forward_speed, value.steering_angle),
     )
@@ -1747,7 +1754,7 @@ def pack_vehicle_command(value: VehicleCommand) -> bytes:
 
 def unpack_vehicle_command(data: bytes, at: int) -> tuple[VehicleCommand, int]:
     """Return the vehicle_command_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, valid_for, seq = _S27.unpack_from(data, at)
+    utime, valid_for, seq = _S29.unpack_from(data, at)
     source, at = read_text(data, at + 24)
     forward_speed, steering_angle = _S6.unpack_from(data, at)
     return VehicleCommand(
@@ -1771,7 +1778,7 @@ def pack_vehicle_status(value: VehicleStatusSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S28.pack(
+        _S30.pack(
             value.mode,
             value.forward_speed,
             value.steering_angle,
@@ -1787,7 +1794,7 @@ def unpack_vehicle_status(data: bytes, at: int) -> tuple[VehicleStatusSample, in
     """Return the vehicle_status_t that begins at `at`, and its end. Raises WireError, struct.error."""
     header_utime, header_utime_sigma, header_host_utime, header_device_utime, header_seq = _S0.unpack_from(data, at)
     header_source, at = read_text(data, at + 40)
-    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S28.unpack_from(
+    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S30.unpack_from(
         data, at
     )
     return VehicleStatusSample(

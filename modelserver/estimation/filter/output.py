@@ -291,13 +291,17 @@ def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMot
     lever = (-base[0], -base[1], -base[2])
     covariance = TwistCovariance(setup, nav)
     if state.is_stationary:
-        return VehicleMotion(ZERO, ZERO, ZERO, lever, covariance)
-    acceleration = (NAN, NAN, NAN)
+        return VehicleMotion(ZERO, ZERO, ZERO, lever, covariance, 0.0)
+    acceleration, sigma = (NAN, NAN, NAN), NAN
     if setup.uses_imu(state.common.mode):
         g = state.earth.gravity
         (fx, fy, fz), (bx, by, bz), (ux, uy, uz) = nav.force, nav.accelerometer_bias, nav.up
         acceleration = (fx - bx - g * ux, fy - by - g * uy, fz - bz - g * uz)
-    return VehicleMotion(nav.body_velocity(base), nav.angular_rate, acceleration, lever, covariance)
+        P = nav.covariance
+        tilt = g * g * max(P.item(6, 6), P.item(7, 7))
+        bias = max(P.item(12, 12), P.item(13, 13), P.item(14, 14))
+        sigma = math.sqrt(setup.settings.accelerometer_noise**2 / IMU_AVERAGING + bias + tilt)
+    return VehicleMotion(nav.body_velocity(base), nav.angular_rate, acceleration, lever, covariance, sigma)
 
 
 class TwistCovariance(NamedTuple):

@@ -208,3 +208,98 @@ def test_given_axes_that_there_are_not_then_the_error_names_the_nearest() -> Non
     with pytest.raises(UnknownFrameError) as caught:
         compute_motion(dense(), SCAN, BASE, "Rover:Bse", TimeQuery(utime(AT)))
     assert BASE in caught.value.nearest
+
+
+GYRO_SIGMA = 0.01
+
+
+def add_gyro_noise(seed: int) -> History:
+    """Return a history at 100 Hz whose turn rates have the noise of a MEMS gyro."""
+    noise = np.random.default_rng(seed)
+    history = History(60.0)
+    for n in range(160):
+        exact = estimate(n / 100.0)
+        assert exact.motion is not None
+        rate = np.array(exact.motion.angular_velocity) + noise.normal(0.0, GYRO_SIGMA, 3)
+        history = history.append(replace(exact, motion=exact.motion._replace(angular_velocity=so3.to_vector3(rate))))
+    return history
+
+
+@pytest.mark.parametrize(("at", "largest"), [(AT, 0.1), (1.59, 0.6)], ids=["within", "newest"])
+def test_given_noisy_turn_rates_then_accelerations_away_from_the_imu_are_usable_and_their_covariance_is_right(
+    at: float, largest: float
+) -> None:
+    time, far = TimeQuery(utime(at)), "Rover:Mast"
+    true = compute_motion(view(2.0, 200.0, 200.0), far, UTM, "", time, utime(1.6))
+    errors, normalized = [], []
+    for seed in range(60):
+        platform = dense()._replace(history=add_gyro_noise(seed))
+        found = compute_motion(platform, far, UTM, "", time, utime(1.6))
+        assert found.acceleration_covariance is not None
+        P = np.array(found.acceleration_covariance).reshape(6, 6)
+        assert np.allclose(P, P.T)
+        turning = np.subtract(found.angular_acceleration, true.angular_acceleration)
+        errors.append(turning)
+        normalized.append(turning @ np.linalg.solve(P[3:, 3:], turning))
+    # from one estimate to the next the noise alone would be sqrt(2) sigma / dt
+    difference = math.sqrt(2.0) * GYRO_SIGMA * 100.0
+    assert np.sqrt(np.mean(np.square(errors))) < largest * difference
+    # 3 degrees of freedom, and the variance is an estimate of 12
+    assert 1.5 < np.mean(normalized) < 7.0
+
+
+def test_given_few_estimates_then_the_turn_rate_is_differenced_and_its_covariance_is_unknown() -> None:
+    history = History(60.0)
+    for n in range(4):
+        history = history.append(estimate(AT - 0.15 + 0.1 * n))
+    found = compute_motion(dense()._replace(history=history), "Rover:Mast", UTM, "", TimeQuery(utime(AT)), utime(1.6))
+    assert not any(map(math.isnan, found.angular_acceleration))
+    assert found.acceleration_covariance is None
+
+
+def test_given_a_new_epoch_then_no_turn_rate_from_before_it_is_used() -> None:
+    history = History(60.0)
+    for n in range(160):
+        each = estimate(n / 100.0)
+        assert each.motion is not None
+        if n >= 120:
+            each = replace(each, pose_epoch=each.pose_epoch + 1)
+        else:
+            each = replace(each, motion=each.motion._replace(angular_velocity=(9.0, 9.0, 9.0)))
+        history = history.append(each)
+    exact = compute_motion(dense(), "Rover:Mast", UTM, "", TimeQuery(utime(AT)), utime(1.6))
+    found = compute_motion(dense()._replace(history=history), "Rover:Mast", UTM, "", TimeQuery(utime(AT)), utime(1.6))
+    assert found.angular_acceleration == pytest.approx(exact.angular_acceleration, abs=0.1)
+
+
+def test_given_a_measured_joint_then_the_covariance_of_its_acceleration_is_unknown_and_of_bolted_frames_zero() -> None:
+    at = TimeQuery(utime(AT))
+    assert compute_motion(dense(), SCAN, UTM, "", at, utime(1.6)).acceleration_covariance is None
+    bolted = compute_motion(dense(), "Rover:Mast", BASE, SCAN, at, utime(1.6)).acceleration_covariance
+    assert bolted is not None
+    assert np.abs(bolted).max() == 0.0
+
+
+@pytest.mark.parametrize(("interest", "reference"), [("Rover:Mast", UTM), (UTM, "Rover:Mast")])
+def test_given_errors_of_the_vehicles_accelerations_then_their_covariance_follows_the_path(
+    interest: str, reference: str
+) -> None:
+    """Against samples of both errors, through the whole composition."""
+    at, noise = TimeQuery(utime(AT)), np.random.default_rng(1)
+    exact = compute_motion(dense(), interest, reference, "", at, utime(1.6))
+    assert exact.acceleration_covariance is not None
+    P = np.array(exact.acceleration_covariance).reshape(6, 6)
+    history, samples = dense().history, []
+    near = [n / 200.0 for n in range(240, 252)]
+    for _ in range(300):
+        error = noise.normal(0.0, 0.02, 3)
+        changed = History(60.0)
+        for seconds in near:
+            each = history.at(utime(seconds))
+            assert each.motion is not None
+            a = so3.to_vector3(np.array(each.motion.acceleration) + error)
+            changed = changed.append(replace(each, motion=each.motion._replace(acceleration=a)))
+        found = compute_motion(dense()._replace(history=changed), interest, reference, "", at, utime(1.6))
+        samples.append(found.acceleration)
+    spread = np.cov(np.array(samples).T)
+    assert np.allclose(np.diag(spread), np.diag(P)[:3], rtol=0.35)

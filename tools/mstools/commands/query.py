@@ -124,12 +124,15 @@ def edges_as_data(explanation: Explanation) -> list[dict[str, Any]]:
 def describe_motion(motion: MotionAnswer) -> str:
     """Format a motion in meters, degrees and seconds, along the axes of `expressed_in`."""
     transformation = motion.pose.transformation
-    sigmas = () if motion.covariance is None else tuple(math.sqrt(max(motion.covariance[7 * n], 0.0)) for n in range(6))
+    sigmas, changes = (
+        () if covariance is None else tuple(math.sqrt(max(covariance[7 * n], 0.0)) for n in range(6))
+        for covariance in (motion.covariance, motion.acceleration_covariance)
+    )
     rows = [
         ("velocity", motion.velocity, 1.0, "m/s", sigmas[:3]),
         ("turn rate", motion.angular_velocity, math.degrees(1.0), "deg/s", sigmas[3:]),
-        ("acceleration", motion.acceleration, 1.0, "m/s2", ()),
-        ("angular acceleration", motion.angular_acceleration, math.degrees(1.0), "deg/s2", ()),
+        ("acceleration", motion.acceleration, 1.0, "m/s2", changes[:3]),
+        ("angular acceleration", motion.angular_acceleration, math.degrees(1.0), "deg/s2", changes[3:]),
     ]
     where = f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}"
     lines = [escape(f"{where}, along the axes of {motion.expressed_in}")]
@@ -145,8 +148,11 @@ def motion_as_data(motion: MotionAnswer) -> dict[str, Any]:
     """Return a motion as JSON data in SI units; unknown values are null."""
     names = ("expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration")
     data = {name: to_json(getattr(motion, name)) for name in names}
-    covariance = None if motion.covariance is None else np.array(motion.covariance).reshape(6, 6).tolist()
-    return data | {"motion_covariance": covariance}
+    first, second = (
+        None if covariance is None else np.array(covariance).reshape(6, 6).tolist()
+        for covariance in (motion.covariance, motion.acceleration_covariance)
+    )
+    return data | {"motion_covariance": first, "acceleration_covariance": second}
 
 
 def _format_vector(values: Iterable[float], scale: float, unit: str) -> str:
