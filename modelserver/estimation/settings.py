@@ -65,7 +65,7 @@ class FixSettings:
         problems = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, bool) and (not math.isfinite(value) or value <= 0):
+            if not isinstance(value, bool | None) and (not math.isfinite(value) or value <= 0):
                 problems.append(f"{field.name} must be finite and above 0, got {value}")
         if self.minimum_fix_type > 5:
             problems.append(f"minimum_fix_type is 1 to 5, got {self.minimum_fix_type}")

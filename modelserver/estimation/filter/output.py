@@ -78,7 +78,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     heading = monitor.bound_heading(heading, utime)
     if heading > settings.heading_limit:
         invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
-    if horizontal > settings.horizontal_limit:
+    if horizontal > _get_horizontal_limit(setup, state):
         invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
         if gnss.num_rejected:
             invalid |= Invalid.GPS_REJECTED
@@ -154,6 +154,12 @@ def _base_buffer(n: int) -> eskf.MatrixBuffer:
     return eskf.MatrixBuffer(J, places)
 
 
+def _get_horizontal_limit(setup: Setup, state: Aligned) -> float:
+    """Return the horizontal protection level of the least valid pose, m: configured, or by the receiver's class."""
+    limit = setup.settings.horizontal_limit
+    return state.common.receiver.horizontal_limit if limit is None else limit
+
+
 def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime: int) -> float:
     """Return the seconds until a limit is exceeded without further samples.
 
@@ -167,7 +173,7 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
     left = max(left, 0.0)
     k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     monitor = state.consistency
-    limit = settings.horizontal_limit - state.gnss.outlier_allowance - abs(monitor.lever_arm)
+    limit = _get_horizontal_limit(setup, state) - state.gnss.outlier_allowance - abs(monitor.lever_arm)
     if not monitor.excludes_fixes:
         limit -= monitor.horizontal_allowance
     C = nav.covariance

@@ -205,8 +205,9 @@ class FilterSettings(FixSettings):
     """Age of the last inertial sample past which a pose is stale, seconds."""
     risk_per_hour: float = 1e-5
     """Probability in an hour that the true position, or heading, is outside its bound."""
-    horizontal_limit: float = 20.0
-    """Horizontal protection level beyond which a pose is not valid, meters."""
+    horizontal_limit: float | None = None
+    """Horizontal protection level beyond which a pose is not valid, meters. If not given it is by the receiver's class:
+    10 m with carrier corrections, 20 m with code corrections, 36 m without."""
     heading_limit: float = 0.6
     """Heading protection level beyond which a pose is not valid, radians."""
     maximum_tilt: float = 1.05

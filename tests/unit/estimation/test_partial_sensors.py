@@ -9,7 +9,14 @@ from functools import cache
 
 import pytest
 
-from modelserver.estimation.filter.receiver_monitor import MIN_UNFILLED, ReceiverMonitor
+from modelserver.estimation.filter.receiver_monitor import (
+    CARRIER_LIMIT,
+    CLASS_FIXES,
+    CORRECTED_LIMIT,
+    MIN_UNFILLED,
+    PLAIN_LIMIT,
+    ReceiverMonitor,
+)
 from modelserver.estimation.findings import find_unusable
 from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal
@@ -256,3 +263,25 @@ def test_given_zeros_of_a_velocity_then_they_are_unfilled_until_another_number_c
     monitor = monitor.update(moving)
     assert not monitor.lacks_velocity
     assert not monitor.is_unfilled(zero)
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "limit"),
+    [
+        (FixType.FIX_3D, PLAIN_LIMIT),
+        (FixType.DIFFERENTIAL, CORRECTED_LIMIT),
+        (FixType.RTK_FLOAT, CARRIER_LIMIT),
+        (FixType.RTK_FIXED, CARRIER_LIMIT),
+        (FixType.DEAD_RECKONING, PLAIN_LIMIT),
+    ],
+)
+def test_given_many_fixes_of_a_type_in_a_row_then_the_limit_is_that_of_the_class(fix_type, limit):
+    monitor = ReceiverMonitor()
+    for _ in range(CLASS_FIXES - 1):
+        assert monitor.horizontal_limit == PLAIN_LIMIT
+        monitor = monitor.update(create_fix(fix_type))
+    interrupted = monitor.update(create_fix(FixType.FIX_3D)).update(create_fix(fix_type))
+    assert interrupted.horizontal_limit == PLAIN_LIMIT
+    monitor = monitor.update(create_fix(fix_type))
+    assert monitor.horizontal_limit == limit
+    assert monitor.update(create_fix(FixType.FIX_3D)).horizontal_limit == limit
