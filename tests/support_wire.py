@@ -302,7 +302,9 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
         Health(
             UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 5e-4, 1e-3, 2e-3,
             "no GPS", "raptor-pc", 4711, 3, 150_000_000, 0.125,
-            LocalizationHealth(Mode.NO_GPS, Phase.ALIGNED, True, 1.5, 0.05, 12.0, 0.3),
+            LocalizationHealth(
+                Mode.NO_GPS, Phase.ALIGNED, True, 1.5, 0.05, 12.0, 0.3, 50.27, -111.18, 700.0, 39.7, 0.5, 99.0
+            ),
             (ChannelHealth("sensor:gps", 99, 1.0, 0.4, 2e-3), ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True)),
             (RejectedCount("GPS", "truncated", 4), RejectedCount("sensor:gps", "stale", 1)),
             (("journal", "the disk is full"),),

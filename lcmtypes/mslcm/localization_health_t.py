@@ -14,11 +14,11 @@ class localization_health_t(object):
     @part
     """
 
-    __slots__ = ["mode", "phase", "stationary", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "fix_age"]
+    __slots__ = ["mode", "phase", "stationary", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "fix_age", "latitude_deg", "longitude_deg", "height", "heading_deg", "sigma_horizontal", "sigma_up"]
 
-    __typenames__ = ["int8_t", "int8_t", "boolean", "double", "double", "double", "double"]
+    __typenames__ = ["int8_t", "int8_t", "boolean", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double"]
 
-    __dimensions__ = [None, None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None]
 
     def __init__(self):
         self.mode = 0
@@ -70,6 +70,48 @@ class localization_health_t(object):
         LCM Type: double
         """
 
+        self.latitude_deg = 0.0
+        """
+        Latitude of the base frame, degrees, WGS 84, north positive; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.longitude_deg = 0.0
+        """
+        Longitude of the base frame, degrees, east positive; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.height = 0.0
+        """
+        Height of the base frame above the ellipsoid, meters; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.heading_deg = 0.0
+        """
+        Heading of the base frame's x axis, degrees clockwise from true north, 0 to 360; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.sigma_horizontal = 0.0
+        """
+        Largest standard deviation of the horizontal position, meters; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.sigma_up = 0.0
+        """
+        Standard deviation of the height, meters; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -78,7 +120,7 @@ class localization_health_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">bbbdddd", self.mode, self.phase, self.stationary, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age))
+        buf.write(struct.pack(">bbbdddddddddd", self.mode, self.phase, self.stationary, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up))
 
     @staticmethod
     def decode(data: bytes):
@@ -95,13 +137,13 @@ class localization_health_t(object):
         self = localization_health_t()
         self.mode, self.phase = struct.unpack(">bb", buf.read(2))
         self.stationary = bool(struct.unpack('b', buf.read(1))[0])
-        self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age = struct.unpack(">dddd", buf.read(32))
+        self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up = struct.unpack(">dddddddddd", buf.read(80))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if localization_health_t in parents: return 0
-        tmphash = (0xa726871051f00e57) & 0xffffffffffffffff
+        tmphash = (0x5e40d8ceabe42f9c) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

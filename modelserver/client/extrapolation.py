@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.earth.geodesy import Geodesy, GeodesyError
+from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.estimation.history import DeferredEstimate
 from modelserver.messages import (
     NAN,
@@ -116,14 +115,9 @@ class PublishedEstimate(NamedTuple):
 def to_enu(origin: Origin, X_utm: Pose) -> Pose | None:
     """Convert a pose from World:UTM to World:ENU; None if it is too far from the origin, or the origin is invalid."""
     try:
-        return _get_geodesy(origin).pose_in_enu(X_utm)
+        return geodesy_of(origin).pose_in_enu(X_utm)
     except GeodesyError:
         return None
-
-
-@lru_cache(maxsize=16)
-def _get_geodesy(origin: Origin) -> Geodesy:
-    return Geodesy(origin)
 
 
 def estimate_motion(before: OdomSample, after: OdomSample) -> VehicleMotion:

@@ -22,6 +22,9 @@ from modelserver.core.state import (
     SourceTraffic,
     get_silence_limit,
 )
+from modelserver.earth.geodesy import compute_geodetic
+from modelserver.estimation.filter.protection_levels import compute_longest_axis
+from modelserver.geometry.names import WORLD_UTM
 from modelserver.version import __version__
 
 MIN_MESSAGES = 3
@@ -179,6 +182,10 @@ def _make_localization_health(
     if state.localizer is None or estimate is None:
         return messages.LocalizationHealth()
     summary = state.localizer.summary(now.utime)
+    geodetic = None
+    if estimate.utm is not None and estimate.origin is not None:
+        geodetic = compute_geodetic(estimate.utm, WORLD_UTM, estimate.origin)
+    P = estimate.covariance
     return messages.LocalizationHealth(
         summary.mode,
         summary.phase,
@@ -187,6 +194,9 @@ def _make_localization_health(
         estimate.heading_protection_level,
         estimate.seconds_to_limit,
         (now.utime - summary.fix_utime) * 1e-6 if summary.fix_utime else messages.NAN,
+        *((messages.NAN,) * 4 if geodetic is None else geodetic),
+        messages.NAN if P is None else math.sqrt(compute_longest_axis(P[0], P[7], P[1])),
+        messages.NAN if P is None else math.sqrt(P[14]),
     )
 
 

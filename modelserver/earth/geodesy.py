@@ -15,12 +15,14 @@ import math
 import struct
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
 
 from pyproj import Proj, Transformer
 from pyproj.enums import TransformDirection
 
+from modelserver.earth.magnetism import MagnetismError, declination
+from modelserver.earth.origin import Origin
 from modelserver.errors import ModelServerError
-from modelserver.messages import Origin
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
@@ -31,6 +33,9 @@ NORTHERN_LIMIT = 84.0
 
 MAX_ZONE_OFFSET = 20.0
 """Degrees of longitude from the zone's central meridian within which a pinned zone is used."""
+
+MIN_HORIZONTAL = 1e-6
+"""Horizontal part of a unit vector below which it has no heading."""
 
 _INVERSE = TransformDirection.INVERSE
 
@@ -270,6 +275,61 @@ class Geodesy:
                 f"longitude {longitude_deg:.6f} deg lies {abs(away):.1f} deg from the middle of the pinned UTM "
                 f"zone {self.origin.zone}, which reaches {MAX_ZONE_OFFSET:g} deg: set a new origin"
             )
+
+
+class GeodeticPose(NamedTuple):
+    """Where a frame is on the earth, and where its x axis points.
+
+    `latitude_deg` and `longitude_deg` are of WGS 84, north and east positive; `height` is above the ellipsoid, m.
+    `heading_deg` is clockwise from true north, 0 to 360, as on a compass rose; nan where x is vertical.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    heading_deg: float
+
+    def compute_magnetic_heading(self, utime: int) -> float:
+        """Return what a compass would show for the heading at a time, degrees; nan where no magnetic model covers it.
+
+        Without deviation by the vehicle's own iron.
+        """
+        try:
+            east = declination(self.latitude_deg, self.longitude_deg, self.height, utime)
+        except MagnetismError:
+            return math.nan
+        return (self.heading_deg - math.degrees(east)) % 360.0
+
+    def __str__(self) -> str:
+        heading = "" if math.isnan(self.heading_deg) else f", heading {self.heading_deg:.2f} deg"
+        return f"{self.latitude_deg:.8f}, {self.longitude_deg:.8f} deg, height {self.height:.3f} m{heading}"
+
+
+@lru_cache(maxsize=8)
+def geodesy_of(origin: Origin) -> Geodesy:
+    """Return the world coordinates around an origin. Raises GeodesyError for an invalid one."""
+    return Geodesy(origin)
+
+
+def compute_geodetic(X_world: Pose, frame_of_reference: str, origin: Origin) -> GeodeticPose | None:
+    """Return where a frame is from its pose in World:UTM or World:ENU; None for another reference, or out of range."""
+    try:
+        geodesy = geodesy_of(origin)
+        if frame_of_reference == "World:ENU":
+            X_world = geodesy.pose_in_utm(X_world)
+        elif frame_of_reference != "World:UTM":
+            return None
+        east, north, height = geodesy.origin.initial_utm
+        x, y, z = X_world.xyz
+        latitude, longitude, height = geodesy.geodetic_from_utm(east + x, north + y, height + z)
+        convergence = geodesy.convergence(latitude, longitude)
+    except GeodesyError:
+        return None
+    ahead_x, ahead_y, _ = so3.rotate(X_world.wxyz, (1.0, 0.0, 0.0))
+    heading = math.nan
+    if math.hypot(ahead_x, ahead_y) > MIN_HORIZONTAL:
+        heading = (90.0 - math.degrees(math.atan2(ahead_y, ahead_x) - convergence)) % 360.0
+    return GeodeticPose(latitude, longitude, height, heading)
 
 
 def rotation_about_up(angle: float) -> Quaternion:

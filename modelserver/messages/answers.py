@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.messages.estimates import Origin
+from modelserver.earth.origin import Origin
 from modelserver.messages.flags import NAN, NO_FLAGS, Quality
 from modelserver.transforms.so3 import Array
 from modelserver.transforms.transformation import Transformation
+
+if TYPE_CHECKING:
+    from modelserver.earth.geodesy import GeodeticPose
 
 
 class PoseAnswer(NamedTuple):
@@ -25,6 +28,17 @@ class PoseAnswer(NamedTuple):
     horizontal_protection_level: float = NAN
     heading_protection_level: float = NAN
     seconds_to_limit: float = NAN
+
+    @property
+    def geodetic(self) -> GeodeticPose | None:
+        """Latitude, longitude, height and true heading of the frame of interest; None if not in a world frame."""
+        # loads pyproj
+        from modelserver.earth.geodesy import compute_geodetic
+
+        if self.origin is None:
+            return None
+        found = self.transformation
+        return compute_geodetic(found.pose, found.frame_of_reference, self.origin)
 
 
 class PoseBatch(NamedTuple):

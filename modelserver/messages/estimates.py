@@ -5,29 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+from modelserver.earth.origin import Origin as Origin
 from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Origin of World:UTM: grid coordinates in a pinned zone, ellipsoidal height, meters.
-
-    `origin_id` identifies it and changes with any of the numbers.
-    """
-
-    easting: float
-    northing: float
-    height: float
-    zone: int
-    north: bool
-    origin_id: int
-
-    @property
-    def initial_utm(self) -> Vector3:
-        """Grid easting, grid northing, height above the ellipsoid, meters."""
-        return (self.easting, self.northing, self.height)
 
 
 class MotionCovariance(Protocol):

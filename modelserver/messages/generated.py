@@ -814,6 +814,18 @@ class LocalizationHealth:
         Seconds until a configured limit is passed if nothing more arrives; nan = not known, or passed already.
     fix_age
         Time since the last GPS fix that was used, seconds; nan = none yet.
+    latitude_deg
+        Latitude of the base frame, degrees, WGS 84, north positive; nan = not known.
+    longitude_deg
+        Longitude of the base frame, degrees, east positive; nan = not known.
+    height
+        Height of the base frame above the ellipsoid, meters; nan = not known.
+    heading_deg
+        Heading of the base frame's x axis, degrees clockwise from true north, 0 to 360; nan = not known.
+    sigma_horizontal
+        Largest standard deviation of the horizontal position, meters; nan = not known.
+    sigma_up
+        Standard deviation of the height, meters; nan = not known.
     """
 
     mode: Mode | None = None
@@ -823,6 +835,12 @@ class LocalizationHealth:
     heading_protection_level: float = NAN
     seconds_to_limit: float = NAN
     fix_age: float = NAN
+    latitude_deg: float = NAN
+    longitude_deg: float = NAN
+    height: float = NAN
+    heading_deg: float = NAN
+    sigma_horizontal: float = NAN
+    sigma_up: float = NAN
 
 
 class RejectedCount(NamedTuple):

@@ -14,7 +14,6 @@ from typing import Final
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
-from modelserver.earth.geodesy import Geodesy
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
@@ -29,14 +28,14 @@ from modelserver.wire.eventlog import LogEvent
 
 CSV_HEADER: Final = (
     "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
-    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg"
 )
 
 _NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
 _NO_BOUNDS: Final = (NAN, NAN)
 _NO_SIGMAS: Final = (NAN, NAN, NAN, NAN)
-_NO_PLACE: Final = (NAN, NAN)
-_UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f"
+_NO_PLACE: Final = (NAN, NAN, NAN)
+_UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f,%.5f"
 """Format of the last columns: to 0.1 mm, a microradian, a nanodegree."""
 
 
@@ -46,8 +45,8 @@ class TrackRow:
 
     `rotation` maps from the frame to grid east, grid north, up (w, x, y, z). `invalid` are the reason bits. `bounds`
     are the protection levels, horizontal (m) and heading (rad), of the base frame only; `sigmas` the standard
-    deviations along east, north, up (m) and of the yaw (rad); `place` is latitude and longitude, degrees. nan = not
-    known.
+    deviations along east, north, up (m) and of the yaw (rad); `place` is latitude, longitude and true
+    heading, degrees. nan = not known.
     """
 
     utime: int
@@ -59,12 +58,12 @@ class TrackRow:
     invalid: int = 0
     bounds: tuple[float, float] = _NO_BOUNDS
     sigmas: tuple[float, float, float, float] = _NO_SIGMAS
-    place: tuple[float, float] = _NO_PLACE
+    place: tuple[float, float, float] = _NO_PLACE
 
     def to_csv(self) -> str:
         """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian.
 
-        An unknown bound, sigma, latitude or longitude is empty.
+        An unknown bound, sigma, latitude, longitude or heading is empty.
         """
         quaternion = ",".join(f"{value:.9f}" for value in self.rotation)
         place = f"{self.easting:.5f},{self.northing:.5f},{self.up:.5f}"
@@ -100,7 +99,6 @@ class OfflineRun:
     last_utime: int = 0
     position: int = 0
     _state: CoreState | None = None
-    _geodesy: Geodesy | None = None
 
     def __post_init__(self) -> None:
         self.vehicle.model.get_transformation(self.frame, self.vehicle.config.base_frame)
@@ -174,11 +172,9 @@ class OfflineRun:
         found, origin = answer.transformation, answer.origin
         if origin is None:
             return TrackRow(utime, invalid=int(found.invalid_reasons))
-        if self._geodesy is None or self._geodesy.origin != origin:
-            self._geodesy = Geodesy(origin)
         x, y, z = found.pose.xyz
         easting, northing, up = origin.easting + x, origin.northing + y, origin.height + z
-        P, sigmas = found.covariance_numbers, _NO_SIGMAS
+        P, sigmas, geodetic = found.covariance_numbers, _NO_SIGMAS, answer.geodetic
         if P is not None:
             sigmas = (math.sqrt(P[0]), math.sqrt(P[7]), math.sqrt(P[14]), math.sqrt(P[35]))
         return TrackRow(
@@ -191,7 +187,7 @@ class OfflineRun:
             int(found.invalid_reasons),
             (answer.horizontal_protection_level, answer.heading_protection_level),
             sigmas,
-            self._geodesy.geodetic_from_utm(easting, northing, up)[:2],
+            _NO_PLACE if geodetic is None else (geodetic.latitude_deg, geodetic.longitude_deg, geodetic.heading_deg),
         )
 
 

@@ -151,10 +151,10 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "get_transformations_reply_t": bytes.fromhex("5c17dce904d61a93"),
     "get_transformations_request_t": bytes.fromhex("d71f006e179d5a75"),
     "gps_t": bytes.fromhex("661a4b5c1827f64c"),
-    "health_t": bytes.fromhex("eadb90c8ecd748c9"),
+    "health_t": bytes.fromhex("c744d7c254a7cdda"),
     "imu_t": bytes.fromhex("a488946aa26727f7"),
     "joints_t": bytes.fromhex("2f8bc69e04097f3d"),
-    "localization_health_t": bytes.fromhex("4e4d0e20a3e01caf"),
+    "localization_health_t": bytes.fromhex("bc81b19d57c85f38"),
     "localization_mode_t": bytes.fromhex("5862804cd0a8b608"),
     "model_snapshot_t": bytes.fromhex("0ed3b5078061bb8f"),
     "name_list_reply_t": bytes.fromhex("c14f1581c7c4db7b"),
@@ -199,9 +199,9 @@ _S15 = struct.Struct(">qb")
 _S16 = struct.Struct(">bhdddddddd9d3d9dddddddd")
 _S17 = struct.Struct(">qd")
 _S18 = struct.Struct(">biiqqqiqqdddd")
-_S19 = struct.Struct(">iiqdbbbddddi")
+_S19 = struct.Struct(">iiqdbbbddddddddddi")
 _S20 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S21 = struct.Struct(">bbbdddd")
+_S21 = struct.Struct(">bbbdddddddddd")
 _S22 = struct.Struct(">iii")
 _S23 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
 _S24 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
@@ -960,6 +960,12 @@ def pack_health(value: Health) -> bytes:
                 value.localization.heading_protection_level,
                 value.localization.seconds_to_limit,
                 value.localization.fix_age,
+                value.localization.latitude_deg,
+                value.localization.longitude_deg,
+                value.localization.height,
+                value.localization.heading_deg,
+                value.localization.sigma_horizontal,
+                value.localization.sigma_up,
                 len(value.channels),
             ),
             *map(pack_channel_health, value.channels),
@@ -1007,10 +1013,16 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         localization_heading_protection_level,
         localization_seconds_to_limit,
         localization_fix_age,
+        localization_latitude_deg,
+        localization_longitude_deg,
+        localization_height,
+        localization_heading_deg,
+        localization_sigma_horizontal,
+        localization_sigma_up,
         num_channels,
     ) = _S19.unpack_from(data, at)
     check_count(num_channels, "num_channels")
-    channels, at = read_each(unpack_channel_health, data, at + 63, num_channels)
+    channels, at = read_each(unpack_channel_health, data, at + 111, num_channels)
     (num_rejected,) = _S5.unpack_from(data, at)
     check_count(num_rejected, "num_rejected")
     rejected, at = read_each(unpack_rejected_count, data, at + 4, num_rejected)
@@ -1051,6 +1063,12 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
             localization_heading_protection_level,
             localization_seconds_to_limit,
             localization_fix_age,
+            localization_latitude_deg,
+            localization_longitude_deg,
+            localization_height,
+            localization_heading_deg,
+            localization_sigma_horizontal,
+            localization_sigma_up,
         ),
         channels,
         rejected,
@@ -1247,14 +1265,32 @@ def pack_localization_health(value: LocalizationHealth) -> bytes:
         value.heading_protection_level,
         value.seconds_to_limit,
         value.fix_age,
+        value.latitude_deg,
+        value.longitude_deg,
+        value.height,
+        value.heading_deg,
+        value.sigma_horizontal,
+        value.sigma_up,
     )
 
 
 def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth, int]:
     """Return the localization_health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    mode, phase, stationary, horizontal_protection_level, heading_protection_level, seconds_to_limit, fix_age = (
-        _S21.unpack_from(data, at)
-    )
+    (
+        mode,
+        phase,
+        stationary,
+        horizontal_protection_level,
+        heading_protection_level,
+        seconds_to_limit,
+        fix_age,
+        latitude_deg,
+        longitude_deg,
+        height,
+        heading_deg,
+        sigma_horizontal,
+        sigma_up,
+    ) = _S21.unpack_from(data, at)
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
         None if phase == -1 else read_enum(Phase, phase, "phase"),
@@ -1263,7 +1299,13 @@ def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth
         heading_protection_level,
         seconds_to_limit,
         fix_age,
-    ), at + 35
+        latitude_deg,
+        longitude_deg,
+        height,
+        heading_deg,
+        sigma_horizontal,
+        sigma_up,
+    ), at + 83
 
 
 def pack_localization_mode(value: SwitchMode) -> bytes:

@@ -18,6 +18,7 @@ from modelserver.earth.geodesy import (
     Geodesy,
     GeodesyError,
     LocalFrame,
+    compute_geodetic,
     ecef_from_geodetic,
     geodetic_from_ecef,
     make_origin,
@@ -284,3 +285,46 @@ def test_given_a_pose_in_enu_then_it_comes_back_from_utm(place: tuple[float, flo
         geodesy = Geodesy(origin_at(latitude, longitude, 700.0))
         pose = Pose.from_rpy(place, 0.1, -0.2, 2.5)
         assert geodesy.pose_in_enu(geodesy.pose_in_utm(pose)).is_close(pose, 1e-7, 1e-11)
+
+
+@pytest.mark.parametrize("reference", ["World:UTM", "World:ENU"])
+@given(
+    place=st.sampled_from(list(PLACES.values())),
+    xyz=st.tuples(*[st.floats(-3000.0, 3000.0)] * 2, st.floats(-50.0, 50.0)),
+    rpy=st.tuples(st.floats(-3.0, 3.0), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1)),
+)
+def test_geodetic_pose_equals_the_geodesic_to_a_point_ahead(reference, place, xyz, rpy):
+    origin = origin_at(*place)
+    X = Pose.from_rpy(xyz, *rpy)
+    found = compute_geodetic(X, reference, origin)
+    assert found is not None
+    ahead = compute_geodetic(Pose(tuple(X.transform([5.0, 0.0, 0.0])), X.wxyz), reference, origin)
+    assert ahead is not None
+    azimuth, _, _ = Geod(ellps="WGS84").inv(
+        found.longitude_deg, found.latitude_deg, ahead.longitude_deg, ahead.latitude_deg
+    )
+    assert math.remainder(found.heading_deg - azimuth, 360.0) == pytest.approx(0.0, abs=0.06)
+    assert 0.0 <= found.heading_deg < 360.0
+    absolute = Geodesy(origin).enu_from_geodetic(*found[:3])
+    as_enu = X.xyz if reference == "World:ENU" else Geodesy(origin).pose_in_enu(X).xyz
+    assert absolute == pytest.approx(as_enu, abs=1e-6)
+
+
+def test_given_a_vertical_axis_or_another_reference_then_there_is_no_heading_or_no_place():
+    origin = origin_at(*PLACES["Suffield"])
+    upright = compute_geodetic(Pose.from_rpy((0.0, 0.0, 0.0), 0.0, -math.pi / 2, 0.0), "World:UTM", origin)
+    assert upright is not None
+    assert math.isnan(upright.heading_deg)
+    assert "heading" not in str(upright)
+    assert compute_geodetic(Pose.identity(), "Raptor:CG", origin) is None
+    assert compute_geodetic(Pose.from_rpy((4e7, 0.0, 0.0)), "World:UTM", origin) is None
+
+
+def test_magnetic_heading_is_the_true_one_less_the_declination():
+    found = compute_geodetic(Pose.from_rpy((0.0, 0.0, 0.0), 0.0, 0.0, 1.0), "World:ENU", origin_at(*PLACES["Sydney"]))
+    assert found is not None
+    # magnetic north lies 12.8 deg east of true north there
+    assert math.remainder(found.heading_deg - found.compute_magnetic_heading(1_795_000_000_000_000), 360.0) == (
+        pytest.approx(12.8, abs=0.2)
+    )
+    assert math.isnan(found.compute_magnetic_heading(0))

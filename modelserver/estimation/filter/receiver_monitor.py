@@ -9,7 +9,7 @@ A field that a publisher never fills is 0 in a message of lcm-gen, and 0 is also
 
 The class of a receiver is the best type that CLASS_FIXES of its fixes had in a row. It determines how large the
 protection level of a valid pose may be, unless that is configured: a limit that suits centimeters would stop a vehicle
-whose receiver has no corrections, and a limit that suits meters says little to one that has them.
+whose receiver has no corrections, and a limit that suits meters is meaningless to one that has them.
 """
 
 from __future__ import annotations

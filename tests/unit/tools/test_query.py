@@ -132,7 +132,7 @@ def test_given_json_then_every_field_is_there_and_what_is_not_known_is_null(run:
     assert set(found) == {
         "frame_of_interest", "frame_of_reference", "utime", "position", "quaternion", "rpy", "matrix", "covariance",
         "valid", "invalid_reasons", "flags", "initial_utm", "utm_zone", "origin_id", "pose_epoch",
-        "horizontal_protection_level", "heading_protection_level", "model_revision",
+        "horizontal_protection_level", "heading_protection_level", "model_revision", "geodetic",
     }  # fmt: skip
     assert found["covariance"] is found["initial_utm"] is found["horizontal_protection_level"] is None
     assert (found["valid"], found["invalid_reasons"], found["flags"], found["utime"]) == (True, [], [], 0)
@@ -310,6 +310,8 @@ def test_given_a_world_pose_then_people_see_time_grid_bounds_and_what_speaks_aga
     )
     assert "2023-11-14T22:13:20.500000+00:00  (1700000000500000)" in text
     assert "445002.000 E  5029998.000 N  71.250 up  zone 18S" in text
+    assert "geodetic        -44.88131513  -75.69637246  deg,  height 71.250 m (WGS 84)" in text
+    assert "heading         0.49 deg from true north,  compass 348.70 deg" in text
     assert "sigma           0.2000  0.2000  0.2000  m,  11.459  11.459  11.459  deg" in text
     assert "protection      1.50 m, heading 5.73 deg" in text
     assert "flags           PREDICTED" in text
@@ -321,4 +323,5 @@ def test_given_a_world_pose_then_scripts_see_the_same() -> None:
     found = json.loads(json.dumps(as_dict(world_answer(horizontal_protection_level=math.nan)), allow_nan=False))
     assert found["initial_utm"] == [445_000.5, 5_030_000.0, 71.0]
     assert (found["utm_zone"], found["valid"], found["horizontal_protection_level"]) == ("18S", False, None)
+    assert found["geodetic"]["height"] == pytest.approx(71.25)
     assert found["invalid_reasons"] == ["STALE_GPS", "STALE_IMU"]

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 
 HEADER = (
     "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
-    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg"
 )
 
 Run = Callable[..., tuple[int, str, str]]
@@ -106,13 +106,14 @@ def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
         assert run(recorded_log, "-c", forward, "--poses", tmp_path / name, *options)[0] == 0
     base, antenna = rows(tmp_path / "base.csv")[-1], rows(tmp_path / "antenna.csv")[-1]
     # the protection levels are those of the base frame
-    horizontal, heading, east, north, up, yaw, latitude, longitude = base[10:]
+    horizontal, heading, east, north, up, yaw, latitude, longitude, ahead = base[10:]
     assert horizontal > 3.0 * max(east, north) > 0.0
     assert heading > 3.0 * yaw > 0.0
     assert up > 0.0
     there = origin_at(latitude, longitude, base[3])
     assert (there.easting, there.northing) == pytest.approx((base[1], base[2]), abs=1e-3)
-    assert [math.isnan(value) for value in antenna[10:]] == [True] * 2 + [False] * 6
+    assert [math.isnan(value) for value in antenna[10:]] == [True] * 2 + [False] * 7
+    assert ahead == pytest.approx(88.6, abs=1.5)  # grid east, which points 1.4 degrees north of true east there
     assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
 

@@ -74,6 +74,21 @@ def test_given_a_pose_that_may_not_be_used_then_every_reason_is_reported_in_word
     assert "NOT VALID: the last usable GPS fix is too old; " in text
 
 
+def test_given_a_place_then_it_is_shown_with_a_warning_where_it_is_uncertain() -> None:
+    place = replace(
+        DRIVING, latitude_deg=50.27, longitude_deg=-111.18, height=700.04, heading_deg=39.71, sigma_horizontal=0.5,
+        sigma_up=0.9,
+    )  # fmt: skip
+    text = format_report(replace(WELL, localization=place))
+    assert "at 50.2700000, -111.1800000 deg, height 700.0 m, heading 39.7 deg" in text
+    assert "WARNING" not in text
+    text = format_report(replace(WELL, localization=replace(place, sigma_up=99.0)))
+    assert "WARNING: the height is uncertain, sigma 99.0 m" in text
+    text = format_report(replace(WELL, localization=replace(place, heading_deg=math.nan, sigma_horizontal=15.0)))
+    assert "height 700.0 m\n" in text
+    assert "WARNING: the position is uncertain, sigma 15.0 m" in text
+
+
 def test_given_a_report_in_which_little_is_known_then_no_number_is_made_up() -> None:
     text = format_report(BARE)
     assert "no localization sensor is configured" in text

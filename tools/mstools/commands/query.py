@@ -287,6 +287,13 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
             lines.append(
                 f"  UTM             {easting:.3f} E  {northing:.3f} N  {height:.3f} up  zone {origin.zone}{half}"
             )
+        if geodetic := answer.geodetic:
+            latitude, longitude, height, heading = geodetic
+            lines.append(f"  geodetic        {latitude:.8f}  {longitude:.8f}  deg,  height {height:.3f} m (WGS 84)")
+            if not math.isnan(heading):
+                magnetic = geodetic.compute_magnetic_heading(transformation.utime)
+                compass = "" if math.isnan(magnetic) else f",  compass {magnetic:.2f} deg"
+                lines.append(f"  heading         {heading:.2f} deg from true north{compass}")
         lines.append(f"  epoch           {transformation.pose_epoch}, origin {origin.origin_id:016x}")
     if not math.isnan(answer.horizontal_protection_level):
         heading = math.degrees(answer.heading_protection_level)
@@ -319,6 +326,7 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "initial_utm": None if origin is None else list(origin.initial_utm),
         "utm_zone": None if origin is None else f"{origin.zone}{'N' if origin.north else 'S'}",
         "origin_id": f"{transformation.origin_id:016x}" if transformation.origin_id else None,
+        "geodetic": to_json(answer.geodetic),
         "pose_epoch": transformation.pose_epoch,
         "horizontal_protection_level": to_json(answer.horizontal_protection_level),
         "heading_protection_level": to_json(answer.heading_protection_level),

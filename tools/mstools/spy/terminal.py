@@ -19,6 +19,7 @@ import typer
 
 import mslcm
 from modelserver.errors import ModelServerError, WireError, find_nearest_names, quote
+from modelserver.messages import PoseAnswer
 from modelserver.wire.codec import decode, get_type_names
 from modelserver.wire.encoded import type_name_of
 from modelserver.wire.provider import handle_message
@@ -174,7 +175,17 @@ def format_message(seen: ChannelStatistics) -> list[str]:
         message: Any = getattr(mslcm, seen.type_name).decode(seen.last)
     except Exception as error:
         return [f"{seen.type_name} that cannot be decoded: {escape(truncate(str(error), 200))}"]
-    return format_fields(message, load_constants())
+    return [*format_fields(message, load_constants()), *_format_geodetic(seen)]
+
+
+def _format_geodetic(seen: ChannelStatistics) -> list[str]:
+    """Format latitude, longitude, height and heading of a pose in a world frame; of another message nothing."""
+    try:
+        value = decode(seen.type_name, seen.last) if seen.type_name in ("pose_transform_t", "pose_vector_t") else None
+    except WireError:
+        return []
+    geodetic = value.geodetic if isinstance(value, PoseAnswer) else None
+    return [] if geodetic is None else ["", f"geodetic: {geodetic}"]
 
 
 def print_once(listener: BusListener, seconds: float, channel: str = "") -> None:

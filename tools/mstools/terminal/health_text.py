@@ -19,6 +19,12 @@ MAX_ROWS: Final = 40
 SENSOR_PREFIX: Final = "sensor:"
 """Prefix of the sensors' names in a report."""
 
+LARGE_SIGMA_HORIZONTAL: Final = 10.0
+"""Standard deviation of the position beyond which status warns, meters: three times that of an ordinary fix."""
+
+LARGE_SIGMA_UP: Final = 20.0
+"""The same of the height: it is known less well than the position, and without undulation not at all."""
+
 FRESH_S: Final = 1.0
 """A source without a rate and with a message in this time was first received after the last rate computation."""
 
@@ -62,6 +68,7 @@ def _format_body(health: Health) -> str:
         rows = [
             ("pose", f"NOT VALID: {health.invalid_reasons.explain()}" if health.invalid_reasons else "valid"),
             ("", bounds),
+            *_format_place(localization),
             ("filter", f"{mode}; {_format_fix_age(localization.fix_age)}"),
             ("", f"epoch {health.pose_epoch}, {origin}, {published} published"),
         ]
@@ -78,6 +85,22 @@ def _format_body(health: Health) -> str:
         ("requests", f"{health.requests_answered} answered, {waiting}"),
     ]
     return "\n".join(f"{name:<9} {escape(text)}".rstrip() for name, text in rows)
+
+
+def _format_place(localization: LocalizationHealth) -> list[tuple[str, str]]:
+    """Return the lines for latitude, longitude, height, heading and their uncertainty."""
+    if math.isnan(localization.latitude_deg):
+        return []
+    heading = "" if math.isnan(localization.heading_deg) else f", heading {localization.heading_deg:.1f} deg"
+    place = f"{localization.latitude_deg:.7f}, {localization.longitude_deg:.7f} deg"
+    lines = [("", f"at {place}, height {localization.height:.1f} m{heading}")]
+    for name, sigma, limit in (
+        ("position", localization.sigma_horizontal, LARGE_SIGMA_HORIZONTAL),
+        ("height", localization.sigma_up, LARGE_SIGMA_UP),
+    ):
+        if sigma > limit:
+            lines.append(("", f"WARNING: the {name} is uncertain, sigma {sigma:.1f} m"))
+    return lines
 
 
 def _format_bounds(localization: LocalizationHealth) -> str:
@@ -178,6 +201,7 @@ def format_line(health: Health) -> str:
     if localization.mode is not None:
         reasons = health.invalid_reasons
         parts.append(f"pose not valid: {reasons.explain()}" if reasons else _format_bounds(localization))
+        parts += [text for _, text in _format_place(localization)]
     parts += [f"{each.channel} {_format_source(each)}" for each in health.channels[:MAX_ROWS]]
     parts.append(f"tick latency p99 {health.tick_latency_p99 * 1e3:.2f} ms")
     parts += [f"{name}: {text}" for name, text in health.warnings]
