@@ -24,7 +24,7 @@ from modelserver.server.journal.writer import JournalContext, JournalWriter, pau
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import encode
-from mstools.demo.drive import make_simulation
+from mstools.launch.drive import make_simulation
 
 START = 1_700_000_000_000_000
 ROUNDS, SAMPLES = 40, 200

@@ -44,7 +44,7 @@ from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
 from modelserver.wire.codec import encode
 from modelserver.wire.provider import resolve_url
-from mstools.demo.drive import make_simulation
+from mstools.launch.drive import make_simulation
 
 START = 1_700_000_000_000_000
 IMU_HZ, WHEELS_HZ, GPS_HZ, MALFORMED_PERIOD = 20.0, 5.0, 1.0, 50

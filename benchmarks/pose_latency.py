@@ -30,7 +30,7 @@ from modelserver.messages import GpsSample, ImuSample, WheelsSample
 from modelserver.simulation import ImuModel, Timing, WheelsModel
 from modelserver.wire.codec import encode
 from modelserver.wire.provider import resolve_url
-from mstools.demo.drive import make_simulation
+from mstools.launch.drive import make_simulation
 
 RATE_HZ = 100
 PERIOD_NS = 1_000_000_000 // RATE_HZ

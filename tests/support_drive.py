@@ -18,7 +18,7 @@ from modelserver.messages import GpsSample, ImuSample, Invalid, PoseAnswer, Publ
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.simulation import Event, Simulation
 from modelserver.transforms.pose import Pose
-from mstools.demo.drive import make_simulation
+from mstools.launch.drive import make_simulation
 
 RAPTOR = Path(__file__).parents[1] / "config" / "raptor"
 CHANNELS: dict[type, str] = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}

@@ -252,7 +252,7 @@ def drive() -> Drawing:
     from modelserver.messages import GpsSample, ImuSample
     from modelserver.server.vehicle import load_vehicle
     from modelserver.simulation import GpsModel, ImuModel, Timing
-    from mstools.demo.drive import SUFFIELD, make_simulation
+    from mstools.launch.drive import SUFFIELD, make_simulation
 
     vehicle = load_vehicle(load_config(ROOT / "config" / "raptor" / "vehicle.yaml"))
     config, geodesy = vehicle.config, Geodesy(origin_at(*SUFFIELD))

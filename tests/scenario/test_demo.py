@@ -18,7 +18,7 @@ from support_lcm import TIMEOUT_S
 
 from modelserver.errors import NoServerError
 from mstools.commands import demo
-from mstools.demo.processes import ChildProcesses, DemoError
+from mstools.launch.processes import ChildProcesses, LaunchError
 
 DEMO = [sys.executable, "-c", "from mstools.cli import main; main()", "demo"]
 
@@ -162,14 +162,14 @@ def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_re
         children._started[0].process.wait()
         raise NoServerError("no reply")
 
-    with ChildProcesses(tmp_path, verbose=False) as children:
+    with ChildProcesses() as children:
         children.start("daemon", "-c", "import sys; sys.exit('the geometry is wrong')")
-        with pytest.raises(DemoError, match=r"the daemon ended with exit code 1(.|\n)*the geometry is wrong"):
+        with pytest.raises(LaunchError, match=r"the daemon ended with exit code 1(.|\n)*the geometry is wrong"):
             demo.wait_for_answer(nobody, children)
 
 
 def test_given_an_error_in_the_demo_when_it_leaves_then_its_children_are_ended(tmp_path):
-    children = ChildProcesses(tmp_path, verbose=False)
+    children = ChildProcesses()
 
     def fail() -> None:
         with children:

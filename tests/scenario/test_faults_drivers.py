@@ -16,8 +16,8 @@ from support_lcm import MODELSERVER, run_process
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import DriverHealth, DriverPhase
 from modelserver.wire.codec import decode
-from mstools.demo.connections import make_connections
-from mstools.demo.drive import make_simulation
+from mstools.launch.connections import make_connections
+from mstools.launch.drive import make_simulation
 
 CHANNELS = {"gps": "GPS", "imu": "IMU", "wheels": "WHEELS", "raptor": "VEHICLE_STATUS", "front_axis": "JOINTS"}
 LOCALIZING = ("gps", "imu", "wheels")
@@ -57,7 +57,7 @@ class Drivers:
 def test_given_each_driver_killed_and_hung_then_it_streams_again_and_the_pose_is_right_or_invalid(
     tmp_path: Path,
 ) -> None:
-    lines = make_connections(RAPTOR / "vehicle.yaml", tmp_path)
+    lines = make_connections(RAPTOR / "vehicle.yaml", tmp_path, own_bus=True)
     with ExitStack() as stack:
         run = Trial(lines.url, tmp_path, SimulatedDrive.create(0, 1.0), lines.vehicle)
         stack.callback(run.close)

@@ -21,6 +21,7 @@ from mstools.terminal.problems import suggest_path
 
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and show its answers.",
+    "up": "Run the service and all drivers of a vehicle, or emulate them.",
     "run": "Run the service for a vehicle file.",
     "check": "Report every problem of a geometry or vehicle file.",
     "convert": "Convert a geometry file to another format, or Miro's process configuration to a vehicle file.",
@@ -48,6 +49,7 @@ COMMANDS = {
 with subcommands of its own has a Typer application there instead."""
 
 _ALIASES = {
+    "up": "launch all",
     "run": "serve server start daemon",
     "check": "validate lint",
     "replay": "play verify journal",

@@ -8,7 +8,7 @@ import pytest
 
 from modelserver.messages import ChannelHealth
 from mstools.commands.demo import format_usage
-from mstools.demo.processes import DemoError
+from mstools.launch.processes import LaunchError
 from mstools.terminal.health_text import as_data, format_report
 from tests.unit.tools.test_status import WELL
 
@@ -30,7 +30,7 @@ def test_given_a_report_then_the_demo_and_the_status_report_how_many_measurement
 def test_given_wheels_that_were_never_used_then_the_demo_fails_and_reports_why() -> None:
     warning = ("sensor:wheels", "1230 received, 0 of 217 measurements used; the last 217 were dropped: nan")
     health = replace(WELL, channels=(replace(WHEELS, used=0),), warnings=(warning,))
-    with pytest.raises(DemoError, match="no measurement of the wheels was used: sensor:wheels: 1230 received"):
+    with pytest.raises(LaunchError, match="no measurement of the wheels was used: sensor:wheels: 1230 received"):
         format_usage(health)
-    with pytest.raises(DemoError, match="no health report"):
+    with pytest.raises(LaunchError, match="no health report"):
         format_usage(None)

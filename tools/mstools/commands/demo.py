@@ -16,9 +16,9 @@ from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, Pos
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
-from mstools.demo.connections import DemoConnections, make_connections
-from mstools.demo.processes import MODELSERVER, ChildProcesses, DemoError
 from mstools.deployment.steps import get_examples_folder
+from mstools.launch.connections import EmulatedConnections, make_connections
+from mstools.launch.processes import MODELSERVER, ChildProcesses, LaunchError
 from mstools.terminal.options import option
 
 SEED = 20050901
@@ -50,21 +50,26 @@ def command(
     """
     with (
         tempfile.TemporaryDirectory(prefix="modelserver-demo-") as scratch,
-        ChildProcesses(Path(scratch), verbose) as children,
+        ChildProcesses(print_line if verbose else None) as children,
     ):
-        run_demo(make_connections(find_vehicle_file(), Path(scratch)), seconds, children)
+        run_demo(make_connections(find_vehicle_file(), Path(scratch), own_bus=True), seconds, children)
+
+
+def print_line(name: str, text: str) -> None:
+    """Print a line of a child process."""
+    typer.echo(f"{name}: {text}", err=True)
 
 
 def find_vehicle_file() -> Path:
-    """Return the Raptor's vehicle file in the package. Raises DemoError."""
+    """Return the Raptor's vehicle file in the package. Raises LaunchError."""
     file = get_examples_folder() / "raptor" / "vehicle.yaml"
     if file.is_file():
         return file
-    raise DemoError(f"{file} is missing; reinstall ModelServer")
+    raise LaunchError(f"{file} is missing; reinstall ModelServer")
 
 
-def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -> None:
-    """Start all processes, query, and print. Raises DemoError if something is missing."""
+def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesses) -> None:
+    """Start all processes, query, and print. Raises LaunchError if something is missing."""
     config = str(lines.vehicle)
     typer.echo(f"1. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to emulated devices")
     start = time.monotonic()
@@ -75,7 +80,7 @@ def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -
     from modelserver.client.remote import Platform
     from modelserver.config.vehicle_file import load_config
     from mstools.commands.query import describe
-    from mstools.demo.drive import make_simulation
+    from mstools.launch.drive import make_simulation
 
     vehicle = load_config(lines.vehicle)
     prefix = vehicle.lcm.channel_prefix
@@ -91,7 +96,8 @@ def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -
         start_utime = round((time.time() + LEAD_SECONDS + LEAD_FACTOR * loading_time) * 10) * 100_000
         together = ("--start", str(start_utime), "--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
         for name, line in lines.devices.items():
-            children.start(f"device {name}", *MODELSERVER, "emulate", name, "-c", config, *line, *together)
+            words = ("emulate", name, "-c", config, *line, *together)
+            children.start(f"device {name}", *MODELSERVER, *words, is_last=True)
             typer.echo(f"modelserver emulate {name} -c {config} {' '.join((*line, *together))}")
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
@@ -117,11 +123,11 @@ def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -
                 alive = ", ".join(f"{name} {listener.drivers[name].rate_hz:.1f} Hz" for name in lines.devices)
                 typer.echo(f"   all {len(lines.devices)} devices are streaming: {alive}")
         if not alive:
-            raise DemoError(
+            raise LaunchError(
                 f"not all devices are streaming: {'; '.join(list_missing_devices(listener.drivers, lines))}"
             )
         if not valid:
-            raise DemoError(
+            raise LaunchError(
                 f"the pose never became valid in {seconds:g} s: {received} poses were received on POSE. "
                 "Run it again with --verbose; a busy machine may need --seconds 20"
             )
@@ -150,14 +156,14 @@ def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -
 def format_usage(service: Health | None) -> list[str]:
     """Format how many measurements of each sensor were used, and the warnings about sensors.
 
-    Raises DemoError if no wheel measurement was used: the Raptor's front wheels steer, and must be used.
+    Raises LaunchError if no wheel measurement was used: the Raptor's front wheels steer, and must be used.
     """
     if service is None:
-        raise DemoError("no health report on MODELSERVER_HEALTH; run the demo with --verbose")
+        raise LaunchError("no health report on MODELSERVER_HEALTH; run the demo with --verbose")
     used = {each.channel.removeprefix("sensor:"): each for each in service.channels if each.measured}
     warnings = [f"{subject}: {text}" for subject, text in service.warnings if subject.startswith("sensor")]
     if "wheels" in used and not used["wheels"].used:
-        raise DemoError(f"no measurement of the wheels was used: {'; '.join(warnings) or 'see --verbose'}")
+        raise LaunchError(f"no measurement of the wheels was used: {'; '.join(warnings) or 'see --verbose'}")
     return [f"{name}: {each.used} of {each.measured} measurements used" for name, each in used.items()] + warnings
 
 
@@ -185,7 +191,7 @@ class PoseListener(DaemonListener):
 
 
 def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> list[str]:
-    """Query until the daemon answers. Raises DemoError if it fails or takes too long."""
+    """Query until the daemon answers. Raises LaunchError if it fails or takes too long."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:
@@ -194,11 +200,11 @@ def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> l
             children.check()
             if time.monotonic() > deadline:
                 why = f"no reply of the daemon within {START_TIMEOUT_S:g} s"
-                raise DemoError(f"{why}; run the demo with --verbose") from None
+                raise LaunchError(f"{why}; run the demo with --verbose") from None
 
 
-def wait_for_drivers(listener: PoseListener, lines: DemoConnections, children: ChildProcesses) -> None:
-    """Wait for a health report of every driver. Raises DemoError if one fails or takes too long."""
+def wait_for_drivers(listener: PoseListener, lines: EmulatedConnections, children: ChildProcesses) -> None:
+    """Wait for a health report of every driver. Raises LaunchError if one fails or takes too long."""
 
     def has_all() -> bool:
         children.check()
@@ -206,10 +212,10 @@ def wait_for_drivers(listener: PoseListener, lines: DemoConnections, children: C
 
     if not listener.listen(START_TIMEOUT_S, has_all):
         missing = ", ".join(name for name in lines.devices if name not in listener.drivers)
-        raise DemoError(f"no report within {START_TIMEOUT_S:g} s of driver {missing}; see --verbose")
+        raise LaunchError(f"no report within {START_TIMEOUT_S:g} s of driver {missing}; see --verbose")
 
 
-def list_missing_devices(drivers: dict[str, DriverHealth], lines: DemoConnections) -> list[str]:
+def list_missing_devices(drivers: dict[str, DriverHealth], lines: EmulatedConnections) -> list[str]:
     """List the devices that do not stream, with their status."""
     return [
         f"{name} is {drivers[name].phase.name.lower()} ({drivers[name].text})"

@@ -124,7 +124,7 @@ def simulate(
     """
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
     from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
-    from mstools.demo.drive import WHEELS_HZ, make_simulation
+    from mstools.launch.drive import WHEELS_HZ, make_simulation
 
     sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
     sensors, kind = vehicle.sensors, settings.kind.sample

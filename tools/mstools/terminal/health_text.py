@@ -194,6 +194,16 @@ def _format_limited_table(head: Sequence[str], rows: Sequence[Sequence[str]], nu
     return f"{text}\n  and {len(rows) - MAX_ROWS} more" if len(rows) > MAX_ROWS else text
 
 
+def describe_pose(health: Health) -> str:
+    """Describe whether the pose is valid and where the vehicle is, in one line."""
+    localization, reasons = health.localization, health.invalid_reasons
+    if localization.mode is None:
+        return "no pose: no localization sensor is configured"
+    if reasons:
+        return f"pose not valid: {health.invalid_text or reasons.explain()}"
+    return "; ".join(("pose valid", *(text for _, text in _format_place(localization)), _format_bounds(localization)))
+
+
 def format_line(health: Health) -> str:
     """Format a report as one line, for logs."""
     localization = health.localization

@@ -13,7 +13,7 @@ from msdrivers.endpoint import HostTime
 from msdrivers.protocol.can.database import parse_dbc
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_driver
-from mstools.demo.drive import make_simulation
+from mstools.launch.drive import make_simulation
 
 START = 1_750_000_000_000_000
 

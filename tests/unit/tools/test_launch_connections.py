@@ -10,12 +10,12 @@ from modelserver.config.vehicle_file import load_config
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_drivers
-from mstools.demo import connections as demo_lines
-from mstools.demo.processes import DemoError
+from mstools.launch import connections
+from mstools.launch.processes import LaunchError
 
 
 def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_machine(tmp_path: Path) -> None:
-    lines = demo_lines.make_connections(find_vehicle_file(), tmp_path)
+    lines = connections.make_connections(find_vehicle_file(), tmp_path, own_bus=True)
     vehicle, drivers = load_drivers(lines.vehicle)
     original, before = load_drivers(find_vehicle_file())
     for name in ("gps", "imu", "front_axis"):
@@ -45,14 +45,14 @@ def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_ma
 def test_given_no_multicast_then_it_is_reported_and_nothing_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo_lines, "has_multicast_loopback", lambda group, port: False)
-    with pytest.raises(DemoError, match=r"multicast does not work(.|\n)*ip route replace 239"):
-        demo_lines.make_connections(find_vehicle_file(), tmp_path)
+    monkeypatch.setattr(connections, "has_multicast_loopback", lambda group, port: False)
+    with pytest.raises(LaunchError, match=r"multicast does not work(.|\n)*ip route replace 239"):
+        connections.make_connections(find_vehicle_file(), tmp_path, own_bus=True)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_given_a_group_that_is_none_then_nothing_comes_back() -> None:
-    assert not demo_lines.has_multicast_loopback("127.0.0.1", 0)
+    assert not connections.has_multicast_loopback("127.0.0.1", 0)
 
 
 def test_given_the_raptor_then_its_drivers_are_as_the_vehicle_file_reports() -> None:

@@ -1,4 +1,4 @@
-"""Local connections of `modelserver demo`: a vehicle file whose drivers connect to emulated devices."""
+"""Connections to emulated devices: a copy of a vehicle file whose drivers use lines of this machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from modelserver.wire.urls import make_route_command
-from mstools.demo.processes import DemoError
+from mstools.launch.processes import LaunchError
 
 BUS_GROUP = "239.255.76.67"
 """LCM's multicast group."""
@@ -21,38 +21,56 @@ BUS_GROUP = "239.255.76.67"
 CAN_GROUP = "239.74.163.2"
 """Multicast group of python-can's bus over UDP."""
 
+STATE_FOLDER = "state"
+"""Folder of the state, below that of the copied vehicle file."""
+
 PROBE_TIMEOUT_S = 1.0
 """Timeout for a datagram over loopback, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
-class DemoConnections:
-    """LCM provider, vehicle file, and the options of `modelserver emulate` for each of its drivers."""
+class EmulatedConnections:
+    """LCM provider, vehicle file, and the options of `modelserver emulate` for each of its drivers.
+
+    `url` is empty if the vehicle file has it.
+    """
 
     url: str
     vehicle: Path
     devices: Mapping[str, tuple[str, ...]]
 
 
-def make_connections(vehicle: Path, folder: Path) -> DemoConnections:
+def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedConnections:
     """Write a copy of a vehicle file into `folder` whose drivers use free local connections.
 
-    Serial ports become pseudo-terminals, CAN buses one bus over UDP, TCP servers those of loopback. Raises OSError, and
-    DemoError if multicast does not work.
+    Serial ports become pseudo-terminals, CAN buses one bus over UDP, TCP servers those of loopback. Paths of files that
+    are read become absolute; state and journal are below `folder`. `own_bus`: LCM on a free port of loopback, so that a
+    running vehicle is not disturbed. Raises OSError, and LaunchError if multicast does not work.
     """
     content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
-    content["geometry"] = str(vehicle.parent / content["geometry"])
+
+    def make_absolute(section: Any, key: str) -> None:
+        if isinstance(section, dict) and section.get(key):
+            section[key] = str((vehicle.parent / Path(section[key]).expanduser()).resolve())
+
+    make_absolute(content, "geometry")
+    make_absolute(content.get("commands"), "key_file")
+    content["state_directory"] = STATE_FOLDER
+    if isinstance(journal := content.get("journal"), dict) and journal.get("directory"):
+        journal["directory"] = Path(journal["directory"]).name
     devices: dict[str, tuple[str, ...]] = {}
     with contextlib.ExitStack() as held:
-        url = f"udpm://{BUS_GROUP}:{_find_multicast_port(BUS_GROUP, held)}?ttl=0"
-        bus = f"{CAN_GROUP}:{_find_multicast_port(CAN_GROUP, held)}"
-        for name, driver in content["drivers"].items():
-            devices[name] = _redirect_driver(driver, folder / name, bus, held)
-            if "dbc" in driver:
-                driver["dbc"] = str(vehicle.parent / driver["dbc"])
+        url = f"udpm://{BUS_GROUP}:{_find_multicast_port(BUS_GROUP, held)}?ttl=0" if own_bus else ""
+        drivers = content.get("drivers") or {}
+        bus = ""
+        if any("can" in driver for driver in drivers.values()):
+            bus = f"{CAN_GROUP}:{_find_multicast_port(CAN_GROUP, held)}"
+        for name, driver in drivers.items():
+            devices[name] = _redirect_driver(driver, (folder / name).resolve(), bus, held)
+            make_absolute(driver, "dbc")
     path = folder / "vehicle.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return DemoConnections(url, path, devices)
+    return EmulatedConnections(url, path, devices)
 
 
 def _redirect_driver(driver: dict[str, Any], port: Path, bus: str, held: contextlib.ExitStack) -> tuple[str, ...]:
@@ -69,10 +87,10 @@ def _redirect_driver(driver: dict[str, Any], port: Path, bus: str, held: context
 
 
 def _find_multicast_port(group: str, held: contextlib.ExitStack) -> int:
-    """Return a free UDP port of a working multicast group. Raises DemoError if it does not work."""
+    """Return a free UDP port of a working multicast group. Raises LaunchError if it does not work."""
     port = _reserve_port(socket.SOCK_DGRAM, held)
     if not has_multicast_loopback(group, port):
-        raise DemoError(
+        raise LaunchError(
             f"multicast does not work on this machine: a datagram to {group} is not received. LCM and CAN over UDP "
             "need it. Try: sudo ip link set lo up "
             f"multicast on && sudo {make_route_command(group)}"

@@ -1,0 +1,122 @@
+"""`modelserver up` as a person runs it: one terminal, one Ctrl-C, and a valid pose without hardware."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from support_lcm import MODELSERVER, TIMEOUT_S, invoke
+
+from tests.scenario.test_demo import close, list_running, text_until
+
+pytestmark = pytest.mark.slow
+
+GEOMETRY = """\
+modelserver: geometry/1
+name: Cart
+bodies:
+  Cart: {frames: {Base: {}, Antenna: {xyz: [0, 0, 1]}, Unit: {xyz: [0.1, 0, 0.3]}}}
+"""
+
+VEHICLE = """\
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Base
+state_directory: state
+sensors:
+  gps: {channel: GPS, frame: "Cart:Antenna"}
+  imu: {channel: IMU, frame: "Cart:Unit"}
+drivers:
+  gps: {device: novatel, port: /dev/ttyGPS, rate_hz: 10}
+  imu: {device: gx1, port: /dev/ttyIMU}
+"""
+
+
+@pytest.fixture
+def cart(tmp_path: Path) -> Path:
+    (tmp_path / "geometry.yaml").write_text(GEOMETRY)
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(VEHICLE)
+    return path
+
+
+def start_up(cart: Path, url: str, *options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*MODELSERVER, "up", "-c", str(cart), "--url", url, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+
+
+def test_given_emulated_devices_then_the_pose_becomes_valid_and_all_end_with_ctrl_c(cart: Path, lcm_url: str) -> None:
+    process = start_up(cart, lcm_url, "--emulate")
+    emulated = str(cart.parent / "emulated" / "vehicle.yaml")
+    try:
+        text_until(process, r" *up \| pose valid")
+        # 30 deg of heading and half a kilometer from the site would do: the filter's own tests are sharper
+        status = json.loads(invoke(lcm_url, "status", "--json").stdout)
+        assert status["localization"]["latitude_deg"] == pytest.approx(50.27, abs=0.005)
+        assert status["localization"]["longitude_deg"] == pytest.approx(-111.18, abs=0.005)
+        answer = json.loads(invoke(lcm_url, "query", "Cart:Antenna", "World:UTM", "--json").stdout)
+        assert answer["geodetic"]["latitude_deg"] == pytest.approx(50.27, abs=0.005)
+        running = list_running(emulated)
+        assert set(running) == {"run", "driver gps", "driver imu", "emulate gps", "emulate imu"}
+        os.kill(running["driver imu"], signal.SIGKILL)
+        text_until(process, r" *up \| imu was killed by SIGKILL; it is restarted in 1 s")
+        text_until(process, r" *imu \| .*streams message")
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=TIMEOUT_S)
+    finally:
+        close(process)
+    assert process.returncode == 0
+    assert list_running(emulated) == {}
+    # the drivers ended in order while their devices were there
+    assert re.search(r"gps \| .*closed: ended", rest)
+    assert "restored" not in rest
+    assert not (cart.parent / "state").exists()
+
+
+def test_given_real_devices_that_are_missing_then_up_waits_for_them_and_ends_after_its_time(
+    cart: Path, lcm_url: str
+) -> None:
+    process = start_up(cart, lcm_url, "--seconds", "6")
+    try:
+        out, _ = process.communicate(timeout=TIMEOUT_S)
+    finally:
+        close(process)
+    assert process.returncode == 0, out
+    assert "/dev/ttyGPS: there is no such port" in out
+    assert "up | pose not valid: no usable GPS fix yet" in out
+    assert not (cart.parent / "emulated").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "expected"),
+    [
+        ("vehicle.yaml", VEHICLE.replace("channel: GPS", "chanel: GPS"), "nearest: channel"),
+        ("vehicle.yaml", VEHICLE.partition("drivers:")[0], "no section drivers"),
+        ("geometry.yaml", GEOMETRY.replace("Antenna", "Antena"), "Cart:Antena"),
+        ("vehicle.yaml", None, "modelserver new writes one"),
+    ],
+)
+def test_given_a_fault_in_a_file_then_nothing_is_started_and_the_fix_is_named(
+    cart: Path, lcm_url: str, file: str, text: str | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if text is None:
+        (cart.parent / file).unlink()
+    else:
+        (cart.parent / file).write_text(text)
+    monkeypatch.chdir(cart.parent)
+    found = invoke(lcm_url, "up", "--emulate")
+    assert found.returncode == 1
+    assert expected in found.stderr
+    assert not (cart.parent / "emulated" / "state").exists()
+    shutil.rmtree(cart.parent / "emulated", ignore_errors=True)

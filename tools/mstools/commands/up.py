@@ -1,0 +1,182 @@
+"""`modelserver up`: the service and all drivers of a vehicle in one terminal, with real or emulated devices."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from modelserver.config.vehicle_file import VehicleConfig, load_config
+from modelserver.errors import ModelServerError, Severity
+from modelserver.messages import Health
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.check import check_vehicle
+from mstools.commands.emulate import SCENARIOS
+from mstools.commands.run import LEVELS, check_log_options
+from mstools.commands.status import HealthListener
+from mstools.launch.connections import STATE_FOLDER, EmulatedConnections, make_connections
+from mstools.launch.processes import MODELSERVER, ChildProcesses
+from mstools.terminal.health_text import describe_pose
+from mstools.terminal.options import UrlOption, choose_name, option
+from mstools.terminal.output import escape, print_problems
+from mstools.terminal.progress import catch_signals
+
+DEFAULT_FILE: Final = Path("vehicle.yaml")
+
+EMULATED_FOLDER: Final = "emulated"
+"""Folder beside the vehicle file for the copy that leads to emulated devices, with its state and journal."""
+
+SERVICE: Final = "service"
+SELF: Final = "up"
+"""Names of the service and of this command in the output."""
+
+REPORT_TIMEOUT_S: Final = 20.0
+"""Timeout for the first report of every driver before the emulated devices start, seconds."""
+
+LEAD_S: Final = 1.0
+LEAD_FACTOR: Final = 0.5
+"""Time from the start of the emulated devices to their drive, plus this fraction of the time that the processes before
+took to load, which measures how slow the machine is."""
+
+POLL_S: Final = 0.5
+
+COLORS: Final = (36, 32, 33, 35, 34, 96, 92, 93, 95, 94)
+"""Colors of the names, as SGR codes of a terminal (ECMA-48)."""
+
+
+def command(
+    config: Annotated[
+        Path, option("--config -c FILE", f"The vehicle file. Default: {DEFAULT_FILE} in this folder.")
+    ] = DEFAULT_FILE,
+    emulate: Annotated[bool, option("--emulate", "Emulate each device, all on one simulated drive.")] = False,
+    scenario: Annotated[str, option("--scenario NAME", f"The drive of --emulate: {', '.join(SCENARIOS)}.")] = SCENARIOS[
+        0
+    ],
+    seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
+    url: UrlOption = "",
+    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
+) -> None:
+    """Run the service and all drivers of a vehicle file, a process each, with their logs in this terminal.
+
+    A process that ends is restarted, later each time. Ctrl-C ends all of them. With --emulate no hardware is needed:
+    each device is emulated, and measures one simulated drive. What that writes is in the folder emulated/ beside the
+    vehicle file. On a vehicle, `modelserver install` lets systemd do the same.
+
+    \b
+    Examples:
+      modelserver up
+      modelserver up -c vehicle.yaml --emulate
+      modelserver status, in another terminal
+    """
+    choose_name(scenario, SCENARIOS, "scenario", "--scenario")
+    check_log_options(log_level, "auto")
+    vehicle = load_checked(config)
+    if emulate and not vehicle.drivers:
+        raise ModelServerError(
+            f"{config} has no section drivers, so there is no device to emulate; modelserver new writes an example"
+        )
+    lines = emulate_lines(config) if emulate else EmulatedConnections(url, config, {})
+    printer = LinePrinter((SERVICE, SELF, *(name for each in vehicle.drivers for name in (each, f"{each} device"))))
+    with catch_signals() as stop, ChildProcesses(printer.print) as children:
+        more = (*(("--url", url) if url else ()), "--log-level", log_level)
+        began = time.monotonic()
+        children.start(SERVICE, *MODELSERVER, "run", "-c", str(lines.vehicle), *more)
+        for name in vehicle.drivers:
+            children.start(name, *MODELSERVER, "driver", name, "-c", str(lines.vehicle), *more)
+        listener = HealthListener(open_lcm(resolve_url(url or vehicle.lcm.url)), vehicle.lcm.channel_prefix)
+        supervision = Supervision(children, listener, printer, stop.is_set, began + seconds)
+        if emulate:
+            supervision.run(REPORT_TIMEOUT_S, lambda: listener.has_drivers(tuple(vehicle.drivers)))
+            start_devices(children, lines, LEAD_S + LEAD_FACTOR * (time.monotonic() - began), scenario)
+        supervision.run(math.inf, lambda: False)
+        printer.print(SELF, "stopping")
+
+
+def load_checked(config: Path) -> VehicleConfig:
+    """Return a vehicle file without errors; print its problems, and exit with 1 on an error. Raises OSError."""
+    if not config.exists():
+        hint = "modelserver new writes one" if config == DEFAULT_FILE else "check the path"
+        raise ModelServerError(f"{config} does not exist; give the vehicle file with -c, or {hint}")
+    _, problems = check_vehicle(str(config))
+    print_problems(each for each in problems if each.severity is not Severity.NOTE)
+    if any(each.severity is Severity.ERROR for each in problems):
+        raise typer.Exit(1)
+    return load_config(config)
+
+
+def emulate_lines(config: Path) -> EmulatedConnections:
+    """Write the copy of a vehicle file for emulated devices, without the state of an earlier drive."""
+    folder = config.resolve().parent / EMULATED_FOLDER
+    folder.mkdir(exist_ok=True)
+    # the next drive begins at the same place as the last one
+    shutil.rmtree(folder / STATE_FOLDER, ignore_errors=True)
+    return make_connections(config.resolve(), folder, own_bus=False)
+
+
+def start_devices(children: ChildProcesses, lines: EmulatedConnections, lead: float, scenario: str) -> None:
+    """Start an emulator for each device, on one drive that begins `lead` seconds from now."""
+    start = round((time.time() + lead) * 10) * 100_000
+    options = ("--start", str(start), "--scenario", scenario)
+    for name, line in lines.devices.items():
+        words = ("emulate", name, "-c", str(lines.vehicle), *line, *options)
+        children.start(f"{name} device", *MODELSERVER, *words, is_last=True)
+
+
+class LinePrinter:
+    """Print lines of several processes with their names, in colors on a terminal. It is used by several threads."""
+
+    def __init__(self, names: Iterable[str]):
+        self._lock = threading.Lock()
+        names = tuple(names)
+        width = max(map(len, names))
+        start, end = ("\x1b[{}m", "\x1b[0m") if sys.stdout.isatty() and "NO_COLOR" not in os.environ else ("", "")
+        self._heads = {
+            name: f"{start.format(COLORS[number % len(COLORS)])}{name:>{width}} |{end}"
+            for number, name in enumerate(names)
+        }
+
+    def print(self, name: str, text: str) -> None:
+        """Print a line of a process."""
+        with self._lock:
+            typer.echo(f"{self._heads[name]} {escape(text)}")
+            sys.stdout.flush()
+
+
+class Supervision:
+    """Restart processes that end, and print when the pose becomes valid or invalid, until it is stopped."""
+
+    def __init__(
+        self,
+        children: ChildProcesses,
+        listener: HealthListener,
+        printer: LinePrinter,
+        is_stopped: Callable[[], bool],
+        end_s: float,
+    ):
+        self._children, self._listener, self._printer = children, listener, printer
+        self._is_stopped, self._end_s = is_stopped, end_s
+        self._shown: tuple[object, ...] = ()
+
+    def run(self, seconds: float, until: Callable[[], bool]) -> None:
+        """Supervise for up to `seconds`, until a condition holds or all is stopped."""
+        end = min(time.monotonic() + seconds, self._end_s)
+        while not self._is_stopped() and not until() and time.monotonic() < end:
+            self._listener.listen(POLL_S, lambda: self._is_stopped() or until())
+            for name, what in self._children.restart_ended():
+                self._printer.print(SELF, f"{name} {what}")
+            if self._listener.health is not None:
+                self._show(self._listener.health)
+
+    def _show(self, health: Health) -> None:
+        shown = (health.state, health.invalid_reasons, health.pid)
+        if shown != self._shown:
+            self._shown = shown
+            self._printer.print(SELF, describe_pose(health))

@@ -1,1 +1,0 @@
-"""Parts of `modelserver demo`: processes, simulated drive, and local connections of the drivers."""

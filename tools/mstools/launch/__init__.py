@@ -1,0 +1,1 @@
+"""Parts of `modelserver demo`, `up` and `emulate`: child processes, simulated drive, and emulated connections."""

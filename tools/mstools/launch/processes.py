@@ -1,0 +1,191 @@
+"""Child processes of one terminal: their output line by line, and their end with the parent's, however that ends.
+
+`modelserver demo` fails with the first child that ends; `modelserver up` restarts it, later each time.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Final
+
+from modelserver.errors import ModelServerError
+
+STOP_TIMEOUT_S: Final = 3.0
+"""Time between SIGTERM and SIGKILL for a child, seconds."""
+
+FIRST_DELAY_S: Final = 1.0
+LONGEST_DELAY_S: Final = 30.0
+"""Delays before a restart, seconds: doubled with each one, until a child has run for `STABLE_S`."""
+
+STABLE_S: Final = 60.0
+
+TAIL_LINES: Final = 8
+"""Last lines of output that explain an end."""
+
+MAX_LINE_BYTES: Final = 4096
+"""A longer line of output is split."""
+
+MODELSERVER: Final = (
+    "-c",
+    "from mstools.launch.processes import end_with_parent; end_with_parent(); from mstools.cli import main; main()",
+)
+"""Arguments of Python that run the `modelserver` command of this installation until its parent ends."""
+
+
+def end_with_parent() -> None:
+    """End this process with SIGTERM when its standard input closes, whose other end `ChildProcesses` holds.
+
+    The kernel closes it however the parent ends, SIGKILL included.
+    """
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        # to the main thread, to interrupt a blocking call there
+        signal.pthread_kill(main, signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class LaunchError(ModelServerError):
+    """The processes cannot run; the message is what is missing."""
+
+
+@dataclass(slots=True)
+class ChildProcess:
+    """A child process: its arguments, its last output, and when it is restarted if it has ended."""
+
+    name: str
+    arguments: tuple[str, ...]
+    is_last: bool
+    process: subprocess.Popen[bytes]
+    started_s: float
+    reader: threading.Thread | None = None
+    tail: deque[str] = field(default_factory=lambda: deque(maxlen=TAIL_LINES))
+    delay_s: float = FIRST_DELAY_S
+    restart_s: float = 0.0
+
+    def describe_end(self, code: int) -> str:
+        """Describe how the process ended."""
+        return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+
+
+class ChildProcesses:
+    """A group of child processes; leaving the block ends them, also on an error or SIGTERM.
+
+    `on_line` gets each line that a child prints, with the child's name; it is called by a thread for each child.
+    """
+
+    def __init__(
+        self, on_line: Callable[[str, str], object] | None = None, environment: Mapping[str, str] | None = None
+    ):
+        self._on_line = on_line
+        self._environment = dict(environment or {})
+        self._started: list[ChildProcess] = []
+        self._before: Callable[[int, FrameType | None], object] | int | None = None
+
+    def __enter__(self) -> ChildProcesses:
+        def on_sigterm(number: int, frame: FrameType | None) -> None:
+            raise SystemExit(128 + number)
+
+        self._before = signal.signal(signal.SIGTERM, on_sigterm)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # a second Ctrl-C must not skip the rest
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            # a driver restores its device's state, for which the emulated device must still be there
+            for is_last in (False, True):
+                self._stop([child for child in self._started if child.is_last is is_last])
+        finally:
+            signal.signal(signal.SIGINT, before)
+            signal.signal(signal.SIGTERM, self._before)
+
+    def start(self, name: str, *arguments: str, is_last: bool = False) -> None:
+        """Start a Python process with these arguments; `is_last`: it ends after those that need it."""
+        child = ChildProcess(name, arguments, is_last, self._spawn(arguments), time.monotonic())
+        self._started.append(child)
+        self._read(child)
+
+    def check(self) -> None:
+        """Raise LaunchError with the last output of a process that has ended: all must run."""
+        for child, code in self._list_ended():
+            self._finish(child)
+            tail = "\n  ".join(child.tail) or "(nothing)"
+            raise LaunchError(f"the {child.name} {child.describe_end(code)}. Its output:\n  {tail}")
+
+    def restart_ended(self) -> Iterator[tuple[str, str]]:
+        """Restart the processes that have ended, after a delay; yield the name and what happened to each, once."""
+        now = time.monotonic()
+        for child, code in self._list_ended():
+            if child.restart_s == 0.0:
+                child.delay_s = FIRST_DELAY_S if now - child.started_s > STABLE_S else child.delay_s
+                child.restart_s = now + child.delay_s
+                yield child.name, f"{child.describe_end(code)}; it is restarted in {child.delay_s:.0f} s"
+            elif now >= child.restart_s:
+                child.delay_s = min(2.0 * child.delay_s, LONGEST_DELAY_S)
+                child.restart_s, child.started_s = 0.0, now
+                self._finish(child)
+                child.process = self._spawn(child.arguments)
+                self._read(child)
+
+    def _list_ended(self) -> list[tuple[ChildProcess, int]]:
+        ended = ((child, child.process.poll()) for child in self._started)
+        return [(child, code) for child, code in ended if code is not None]
+
+    def _spawn(self, arguments: tuple[str, ...]) -> subprocess.Popen[bytes]:
+        # a session of its own: Ctrl-C reaches only the parent, which ends them in order; nothing is written to its
+        # standard input, which closes when the parent ends
+        return subprocess.Popen(
+            [sys.executable, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **self._environment},
+            start_new_session=True,
+        )
+
+    def _read(self, child: ChildProcess) -> None:
+        child.reader = threading.Thread(target=self._forward, args=(child, child.process), daemon=True)
+        child.reader.start()
+
+    def _forward(self, child: ChildProcess, process: subprocess.Popen[bytes]) -> None:
+        """Pass each line that a process prints on, until it ends."""
+        assert process.stdout is not None
+        with process.stdout as output:
+            while line := output.readline(MAX_LINE_BYTES):
+                text = line.decode(errors="replace").rstrip("\r\n")
+                child.tail.append(text)
+                if self._on_line is not None:
+                    self._on_line(child.name, text)
+
+    def _finish(self, child: ChildProcess) -> None:
+        """Read the rest of the output of an ended process, and close its pipes."""
+        assert child.process.stdin is not None
+        child.process.stdin.close()
+        if child.reader is not None:
+            child.reader.join(STOP_TIMEOUT_S)
+
+    def _stop(self, children: list[ChildProcess]) -> None:
+        for child in children:
+            child.process.terminate()
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        for child in children:
+            try:
+                child.process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+            self._finish(child)
