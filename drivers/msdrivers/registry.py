@@ -67,6 +67,7 @@ class DeviceKind:
     command_channel: channel of the commands that it accepts, empty for none. faults: kinds of faults of its emulator
     and the meaning of their amounts. follows_samples: the emulator's state comes from samples, not from commands.
     has_memory: the emulator can persist its memory in a file. has_hard_iron: it has a hard-iron calibration.
+    has_z_down: z of its own axes points down when it is mounted upright.
     """
 
     name: str
@@ -82,6 +83,7 @@ class DeviceKind:
     follows_samples: bool = True
     has_memory: bool = False
     has_hard_iron: bool = False
+    has_z_down: bool = False
 
 
 def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
@@ -184,6 +186,7 @@ _KINDS = (
         faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
         has_memory=True,
         has_hard_iron=True,
+        has_z_down=True,
     ),
     DeviceKind(
         "wheels",

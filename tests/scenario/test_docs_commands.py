@@ -196,6 +196,8 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("tutorial")
     with reserved_url() as url:
         run_page(TUTORIAL, folder, folder / "scratch", url)
+        # the guides after it name the journal of a drive with devices
+        (folder / "rover" / "journal").symlink_to("emulated/journal")
         yield folder / "rover"
 
 
@@ -215,9 +217,10 @@ def test_given_a_page_for_the_source_folder_then_every_command_runs(
 def test_given_the_guides_for_a_running_service_then_every_command_runs(
     rover: Path, tmp_path: Path, lcm_url: str
 ) -> None:
-    """The rover is started once more for all of them, by the tutorial's own script."""
+    """The rover is started once more for all of them, as in the tutorial."""
     both = tmp_path / "both.md"
-    start = "```sh\n. ./start.sh\nuntil modelserver status > status.txt; do sleep 0.5; done\n```\n"
+    until = "until modelserver status > status.txt; do sleep 0.5; done"
+    start = f"```sh\nmodelserver up --emulate > up.log 2>&1 &\n{until}\n```\n"
     both.write_text(start + "".join(page.read_text(encoding="utf-8") for page in ON_THE_ROVER), encoding="utf-8")
     run_page(both, rover, tmp_path / "scratch", lcm_url)
 

@@ -21,6 +21,7 @@ from mstools.terminal.problems import suggest_path
 
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and show its answers.",
+    "new": "Write the files of a new vehicle, from a few questions.",
     "up": "Run the service and all drivers of a vehicle, or emulate them.",
     "run": "Run the service for a vehicle file.",
     "check": "Report every problem of a geometry or vehicle file.",
@@ -49,6 +50,7 @@ COMMANDS = {
 with subcommands of its own has a Typer application there instead."""
 
 _ALIASES = {
+    "new": "init create template",
     "up": "launch all",
     "run": "serve server start daemon",
     "check": "validate lint",
@@ -95,7 +97,7 @@ def build_app(arguments: Sequence[str]) -> typer.Typer:
     """Return the application. Only the subcommand in `arguments` is imported, the others are stubs, for speed."""
     app = typer.Typer(
         help="Where is A relative to B, now or at time t, and with which uncertainty?",
-        epilog="Start with: modelserver demo",
+        epilog="Start with: modelserver demo, then modelserver new",
         add_completion=False,
         no_args_is_help=True,
         rich_markup_mode=None,

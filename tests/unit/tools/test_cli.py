@@ -12,7 +12,7 @@ from mstools.cli import COMMAND_ALIASES, COMMANDS, main
     [
         ("serve", "did you mean run? Run the service"),
         ("replya", "did you mean replay?"),
-        ("xyzzy", "commands: demo, run, check"),
+        ("xyzzy", "commands: demo, new, up, run, check"),
     ],
 )
 def test_given_an_unknown_command_then_the_nearest_is_offered(

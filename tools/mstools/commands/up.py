@@ -8,7 +8,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -19,6 +19,7 @@ from modelserver.errors import ModelServerError, Severity
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
+from mstools.commands.driver import load_driver
 from mstools.commands.emulate import SCENARIOS
 from mstools.commands.run import LEVELS, check_log_options
 from mstools.commands.status import HealthListener
@@ -60,6 +61,10 @@ def command(
     scenario: Annotated[str, option("--scenario NAME", f"The drive of --emulate: {', '.join(SCENARIOS)}.")] = SCENARIOS[
         0
     ],
+    faults: Annotated[
+        list[str] | None,
+        option("--fault NAME:KIND@SECONDS[:AMOUNT]", "Fault of an emulated device, e.g. gps:stall@20:30. Repeatable."),
+    ] = None,
     seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
     url: UrlOption = "",
     log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
@@ -83,6 +88,7 @@ def command(
         raise ModelServerError(
             f"{config} has no section drivers, so there is no device to emulate; modelserver new writes an example"
         )
+    of_devices = assign_faults(faults or (), vehicle, config, emulate=emulate)
     lines = emulate_lines(config) if emulate else EmulatedConnections(url, config, {})
     printer = LinePrinter((SERVICE, SELF, *(name for each in vehicle.drivers for name in (each, f"{each} device"))))
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
@@ -95,7 +101,8 @@ def command(
         supervision = Supervision(children, listener, printer, stop.is_set, began + seconds)
         if emulate:
             supervision.run(REPORT_TIMEOUT_S, lambda: listener.has_drivers(tuple(vehicle.drivers)))
-            start_devices(children, lines, LEAD_S + LEAD_FACTOR * (time.monotonic() - began), scenario)
+            lead = LEAD_S + LEAD_FACTOR * (time.monotonic() - began)
+            start_devices(children, lines, lead, scenario, of_devices)
         supervision.run(math.inf, lambda: False)
         printer.print(SELF, "stopping")
 
@@ -121,12 +128,38 @@ def emulate_lines(config: Path) -> EmulatedConnections:
     return make_connections(config.resolve(), folder, own_bus=False)
 
 
-def start_devices(children: ChildProcesses, lines: EmulatedConnections, lead: float, scenario: str) -> None:
+def assign_faults(
+    faults: Iterable[str], vehicle: VehicleConfig, config: Path, *, emulate: bool
+) -> dict[str, tuple[str, ...]]:
+    """Return the options of the emulators for `NAME:KIND@SECONDS[:AMOUNT]`. Raises typer.BadParameter."""
+    from msdrivers.emulate.faults import parse_fault
+
+    options: dict[str, tuple[str, ...]] = {}
+    for each in faults:
+        name, _, fault = each.partition(":")
+        if not emulate:
+            raise typer.BadParameter("goes with --emulate", param_hint="--fault")
+        name = choose_name(name, vehicle.drivers, "driver", "--fault")
+        try:
+            parse_fault(fault, load_driver(name, config)[1].kind.faults)
+        except ValueError as error:
+            raise typer.BadParameter(str(error), param_hint="--fault") from None
+        options[name] = (*options.get(name, ()), "--fault", fault)
+    return options
+
+
+def start_devices(
+    children: ChildProcesses,
+    lines: EmulatedConnections,
+    lead: float,
+    scenario: str,
+    faults: Mapping[str, tuple[str, ...]],
+) -> None:
     """Start an emulator for each device, on one drive that begins `lead` seconds from now."""
     start = round((time.time() + lead) * 10) * 100_000
     options = ("--start", str(start), "--scenario", scenario)
     for name, line in lines.devices.items():
-        words = ("emulate", name, "-c", str(lines.vehicle), *line, *options)
+        words = ("emulate", name, "-c", str(lines.vehicle), *line, *options, *faults.get(name, ()))
         children.start(f"{name} device", *MODELSERVER, *words, is_last=True)
 
 

@@ -1,0 +1,1 @@
+"""The files that `modelserver new` writes for a vehicle."""

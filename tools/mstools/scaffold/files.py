@@ -1,0 +1,213 @@
+"""Geometry, vehicle file and DBC of a new vehicle, with comments; what must be measured is marked MEASURE."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from modelserver.messages import GpsSample, ImuSample
+from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
+from msdrivers.registry import DeviceKind
+from mstools.scaffold.templates import Place, VehicleTemplate
+
+MARK: Final = "MEASURE"
+"""Word in the comment of each line that must be adapted to the vehicle."""
+
+GEOMETRY_FILE, VEHICLE_FILE, DBC_FILE = "geometry.yaml", "vehicle.yaml", "wheels.dbc"
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A device of the new vehicle and its line: the path of a port, a CAN channel, or HOST:PORT."""
+
+    kind: DeviceKind
+    line: str
+
+    @property
+    def line_key(self) -> str:
+        """The key of the line in the vehicle file."""
+        return find_line_key(self.kind, self.line)
+
+
+def find_line_key(kind: DeviceKind, line: str) -> str:
+    """Return the key of a line in a driver's section: by its form, where the kind has several."""
+    keys = {SerialSettings: "port", TcpSettings: "address", CanSettings: "can", ModbusSettings: "address"}
+    if SerialSettings in kind.lines and TcpSettings in kind.lines:
+        is_address = "/" not in line and ":" in line
+        return "address" if is_address else "port"
+    return keys[kind.lines[0]]
+
+
+@dataclass(frozen=True, slots=True)
+class NewVehicle:
+    """What is on a new vehicle. `frames` are those of base, gps and imu in a geometry that exists already."""
+
+    name: str
+    template: VehicleTemplate
+    gps: Device | None = None
+    imu: Device | None = None
+    wheels: Device | None = None
+    has_camera: bool = False
+    frames: Mapping[str, str] | None = None
+
+    @property
+    def body(self) -> str:
+        """Name of the vehicle's body."""
+        words = "".join(character if character.isalnum() else " " for character in self.name).split()
+        return "".join(word[:1].upper() + word[1:] for word in words) or "Vehicle"
+
+
+def make_geometry(vehicle: NewVehicle) -> str:
+    """Return the text of the geometry file."""
+    template, body = vehicle.template, vehicle.body
+
+    def frame(name: str, place: Place, comment: str, more: str = "") -> str:
+        x, y, z = place
+        return f"      {name}: {{xyz: [{x:g}, {y:g}, {z:g}]{more}}}   # {comment}"
+
+    lines = [
+        "modelserver: geometry/1",
+        f"name: {vehicle.name}",
+        "",
+        "# Axes: x forward, y left, z up. Meters and degrees. A frame is given in the coordinates of its body; the",
+        f"# origin of {body} is the frame Base, {template.base}.",
+        f"# A line with {MARK} has a typical length: measure it on your vehicle, and remove the word.",
+        "",
+        "defaults:",
+        f"  sigma: {{xyz: 0.02, rpy_deg: 1}}   # {MARK}: how well you measured, one standard deviation",
+        "",
+        "bodies:",
+        f"  {body}:",
+        "    frames:",
+        f"      Base: {{}}   # {template.base}",
+    ]
+    if vehicle.wheels is not None:
+        for name, place in template.wheels.items():
+            lines.append(frame(_frame_of_wheel(name), place, f"{MARK}: where the wheel touches the ground"))
+    if vehicle.gps is not None:
+        lines.append(frame("Antenna", template.antenna, f"{MARK}: phase center of the antenna"))
+    if vehicle.imu is not None:
+        comment = f"{MARK}: the unit and its own axes; here x forward, y left, z up"
+        more = ", rpy_deg: [0, 0, 0]"
+        if vehicle.imu.kind.has_z_down:
+            more, comment = ", rpy_deg: [180, 0, 0]", f"{MARK}: the unit and its own axes; here x forward, z down"
+        lines.append(frame("ImuUnit", template.imu, comment, more))
+    if vehicle.has_camera:
+        lines += [
+            frame("CameraMount", template.camera, f"{MARK}: where the camera is fixed"),
+            "  Camera:",
+            "    frames:",
+            "      Mount: {}",
+            "      # the optical frame: z ahead out of the lens, x right, y down in the image",
+            f"      Lens: {{xyz: [0.03, 0, 0.02], rpy_deg: [-90, 0, -90]}}   # {MARK}: the entrance pupil",
+            "",
+            "constraints:",
+            "  CameraFixed:",
+            f'    {{from: "{body}:CameraMount", to: "Camera:Mount", rpy_deg: [0, 0, 0]}}   # {MARK}: its tilt',
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _frame_of_wheel(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split("_")) + "Wheel"
+
+
+def make_vehicle(vehicle: NewVehicle) -> str:
+    """Return the text of the vehicle file."""
+    template, body = vehicle.template, vehicle.body
+    frames = vehicle.frames or {"base": f"{body}:Base", "gps": f"{body}:Antenna", "imu": f"{body}:ImuUnit"}
+    lines = [
+        f"# {vehicle.name}: {template.summary}.",
+        "# Check with: modelserver check vehicle.yaml. All keys: docs/vehicle-file.md.",
+        *(f"# {line}" for line in template.note.splitlines()),
+        f"vehicle: {vehicle.name}",
+        f"geometry: {GEOMETRY_FILE}",
+        f'base_frame: "{frames["base"]}"   # POSE describes this frame',
+        "state_directory: state   # the origin, and the state for the next start",
+        "journal: {directory: journal, megabytes: 256}   # all inputs and outputs, to replay; the oldest are deleted",
+    ]
+    if sensors := list(_list_sensors(vehicle, frames)):
+        lines += ["", "sensors:", *sensors]
+    if template.settings:
+        lines += [
+            "",
+            "localization:",
+            "  filter:",
+            *(f"    {key}: {value:g}" for key, value in template.settings.items()),
+        ]
+    if drivers := list(_list_drivers(vehicle)):
+        lines += [
+            "",
+            "# modelserver up runs the service and all of these; modelserver driver --list shows the ports.",
+            "drivers:",
+        ]
+        lines += drivers
+    return "\n".join(lines) + "\n"
+
+
+def _list_sensors(vehicle: NewVehicle, frames: Mapping[str, str]) -> Iterator[str]:
+    if vehicle.gps is not None:
+        yield f'  gps: {{channel: GPS, frame: "{frames["gps"]}"}}'
+    if vehicle.imu is not None:
+        yield f'  imu: {{channel: IMU, frame: "{frames["imu"]}"}}'
+    if vehicle.wheels is not None:
+        yield "  wheels:"
+        yield "    channel: WHEELS"
+        yield f"    kinematics: {vehicle.template.kinematics}"
+        yield "    frames:"
+        for name in vehicle.template.wheels:
+            yield f'      {name}: "{vehicle.body}:{_frame_of_wheel(name)}"'
+
+
+def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
+    for name, device in (("gps", vehicle.gps), ("imu", vehicle.imu)):
+        if device is not None:
+            yield f"  {name}:   # {device.kind.description}"
+            yield f"    device: {device.kind.name}"
+            yield f"    {device.line_key}: {_quote(device.line)}   # {MARK}: its line on this machine"
+    if vehicle.wheels is not None:
+        yield f"  wheels:   # {vehicle.wheels.kind.description}"
+        yield f"    device: {vehicle.wheels.kind.name}"
+        channel = vehicle.wheels.line
+        yield f"    can: {_quote(channel)}   # {MARK}: sudo ip link set {channel} up type can bitrate 500000"
+        yield f"    dbc: {DBC_FILE}   # {MARK}: the frames that your controller sends; this one is an example"
+        yield f"    max_speed: {vehicle.template.max_speed:g}   # m/s: a higher one is damage"
+        yield "    wheels:"
+        for name in vehicle.template.wheels:
+            yield f"      {name}:"
+            yield f"        count:   # {MARK}: the distance of one count is circumference / counts per turn"
+            yield f"          {{signal: WheelCounts.{_signal_of_wheel(name)}, meters_per_count: 0.001}}"
+
+
+def _quote(line: str) -> str:
+    return f'"{line}"' if ":" in line else line
+
+
+def _signal_of_wheel(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split("_")) + "Count"
+
+
+def make_dbc(vehicle: NewVehicle) -> str:
+    """Return the text of an example DBC file: a 16-bit counter for each wheel, up when it rolls forward."""
+    signals = "\n".join(
+        f' SG_ {_signal_of_wheel(name)} : {16 * number}|16@1+ (1,0) [0|65535] "" Computer'
+        for number, name in enumerate(vehicle.template.wheels)
+    )
+    head = f'VERSION "{vehicle.name}"\n\nNS_ :\n\nBS_:\n\nBU_: Controller Computer\n\n'
+    return f"{head}BO_ 256 WheelCounts: {2 * len(vehicle.template.wheels)} Controller\n{signals}\n"
+
+
+def list_marks(folder: Path, files: Iterator[str] | tuple[str, ...]) -> Iterator[str]:
+    """Yield `file:line: what` for each line of some files that must be adapted."""
+    for name in files:
+        for number, line in enumerate((folder / name).read_text(encoding="utf-8").splitlines(), 1):
+            head, mark, what = line.partition(f"# {MARK}: ")
+            if mark:
+                yield f"{name}:{number}: {head.split(':')[0].strip(' {')}: {what}"
+
+
+def list_kinds(kinds: Mapping[str, DeviceKind], sample: type[GpsSample] | type[ImuSample]) -> dict[str, DeviceKind]:
+    """Return the kinds of devices with samples of a type, by name."""
+    return {name: kind for name, kind in kinds.items() if kind.sample is sample}
