@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from msdrivers.devices.gps.driver import GpsDriver
+from msdrivers.devices.ublox import UbloxDriver
 from msdrivers.emulate.faults import FaultInjector
 from msdrivers.emulate.gps import GpsEmulator
+from msdrivers.emulate.ublox import UbloxEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 
 START = 1_700_000_000_000_000
@@ -55,8 +57,8 @@ class Line:
     is_broken: nothing passes. device_baud: at another rate the driver receives garbage and the device nothing.
     """
 
-    driver: GpsDriver
-    device: GpsEmulator | FaultInjector[bytes]
+    driver: GpsDriver | UbloxDriver
+    device: GpsEmulator | UbloxEmulator | FaultInjector[bytes]
     to_host: Callable[[bytes], Sequence[bytes]] = lambda data: [data]
     utime: int = START
     is_broken: bool = False

@@ -93,6 +93,7 @@ def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules
 
 
 _load_gps = partial(_load, "gps.settings:GpsSettings", "gps.driver:GpsDriver")
+_load_ublox = partial(_load, "ublox:UbloxSettings", "ublox:UbloxDriver")
 _load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
 _load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
 _load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
@@ -110,6 +111,15 @@ def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     # one series for the receiver before and after a restart
     samples = iter(wanted.samples)
     return FaultInjector(lambda: GpsEmulator(samples, unit), wanted.faults)
+
+
+def _make_ublox_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.ublox import UbloxEmulator, UbloxUnit
+
+    unit = UbloxUnit()
+    # one series for the receiver before and after a restart
+    samples = iter(wanted.samples)
+    return FaultInjector(lambda: UbloxEmulator(samples, unit), wanted.faults)
 
 
 def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -168,6 +178,15 @@ _CAN_FAULTS = {**FAULT_AMOUNTS, "jump": "counts by which counters jump", "bus_of
 _BYTE_LINES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
 
 _KINDS = (
+    DeviceKind(
+        "ublox",
+        "u-blox receiver, by its protocol UBX",
+        GpsSample,
+        _BYTE_LINES,
+        _load_ublox,
+        _make_ublox_emulator,
+        38400,
+    ),
     *(
         DeviceKind(name, text, GpsSample, _BYTE_LINES, _load_gps, _make_gps_emulator, baud, presets={"protocol": name})
         for name, text, baud in (

@@ -38,7 +38,7 @@ NONE: Final = "none"
 
 DEFAULT_PORT, DEFAULT_ADDRESS = "/dev/ttyUSB{}", "192.168.1.20:502"
 
-DEFAULT_GPS, DEFAULT_IMU, DEFAULT_CAN = "nmea", "gx1", "can0"
+DEFAULT_GPS, DEFAULT_IMU, DEFAULT_CAN = "ublox", "gx1", "can0"
 
 MAX_NAME: Final = 40
 
@@ -48,7 +48,7 @@ def command(
     name: Annotated[str, option("--name NAME", "Name of the vehicle. Default: that of the folder.")] = "",
     vehicle: Annotated[str, option("--vehicle KIND", f"One of {', '.join(TEMPLATES)}.")] = "",
     gps: Annotated[
-        str, option("--gps DEVICE[@LINE]", "GNSS receiver, e.g. nmea@/dev/ttyUSB0 or novatel@10.0.0.7:3001; none.")
+        str, option("--gps DEVICE[@LINE]", "GNSS receiver, e.g. ublox@/dev/ttyACM0 or novatel@10.0.0.7:3001; none.")
     ] = "",
     imu: Annotated[str, option("--imu DEVICE[@LINE]", "Inertial unit, e.g. gx1@/dev/ttyUSB1; none.")] = "",
     wheels: Annotated[str, option("--wheels CHANNEL", "CAN channel of the wheel encoders, e.g. can0; none.")] = "",
@@ -70,7 +70,7 @@ def command(
     \b
     Examples:
       modelserver new rover
-      modelserver new rover --yes --vehicle skid --gps nmea@/dev/ttyACM0 --imu gx1@/dev/ttyUSB0 --wheels can0 --camera
+      modelserver new rover --yes --vehicle skid --gps ublox@/dev/ttyACM0 --imu gx1@/dev/ttyUSB0 --wheels can0 --camera
       modelserver new arm --from-urdf arm.urdf --base-frame base_link:Origin
     """
     for option_name, given in (("--base-frame", base_frame), ("--gps-frame", gps_frame), ("--imu-frame", imu_frame)):

@@ -19,9 +19,12 @@ from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Measured
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.nmea.epochs import POSITION_KINDS
 from msdrivers.protocol.novatel import CommandResponse, NovatelLog, Prompt
+from msdrivers.protocol.recognition import recognize
 
 QUOTED_BYTES = 24
 """Quoted bytes of the beginning."""
+EXAMINED_BYTES = 4096
+"""Bytes of the beginning by which another device is recognized."""
 MAX_NAMES = 6
 MIN_FLAWED_SENTENCES = 2
 """Fewer flawed sentences may be chance."""
@@ -51,8 +54,8 @@ class LineMonitor:
     def add(self, data: bytes) -> None:
         """Record received data."""
         self._bytes_received += len(data)
-        if len(self._first_bytes) < QUOTED_BYTES:
-            self._first_bytes = (self._first_bytes + data)[:QUOTED_BYTES]
+        if len(self._first_bytes) < EXAMINED_BYTES:
+            self._first_bytes = (self._first_bytes + data)[:EXAMINED_BYTES]
         if len(self._names) < MAX_NAMES:
             self._names.update(each.decode("ascii") for each in _ADDRESS.findall(data)[:MAX_NAMES])
 
@@ -101,9 +104,11 @@ class LineMonitor:
             for kind, number in counts.items()
             if kind.startswith("rejected.")
         )
+        if (protocol := recognize(self._first_bytes)) is not None:
+            return f"{protocol.name}: write device: {protocol.devices[0]}"
         broken = f" ({rejected} damaged ones)" if rejected else ""
         text = f"{self._bytes_received} bytes that are neither NovAtel logs nor NMEA sentences"
-        return f"{text}{broken}, beginning {self._first_bytes!r}"
+        return f"{text}{broken}, beginning {self._first_bytes[:QUOTED_BYTES]!r}"
 
 
 def explain_missing_receiver(wanted: str, attempts: Sequence[tuple[int | None, str]]) -> str:
@@ -111,6 +116,8 @@ def explain_missing_receiver(wanted: str, attempts: Sequence[tuple[int | None, s
     tried = "; ".join(f"{f'at {baud} baud ' if baud else ''}received {what}" for baud, what in attempts)
     if all(what == "nothing" for _, what in attempts):
         advice = "check the receiver's power, the cable, and that the port is the right one"
+    elif any("write device: " in what for _, what in attempts):
+        advice = "another device is on this port"
     elif all("bytes that are neither" in what or what == "nothing" for _, what in attempts):
         advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
     else:

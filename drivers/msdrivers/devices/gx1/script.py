@@ -17,9 +17,13 @@ from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, 
 from msdrivers.protocol import gx1
 from msdrivers.protocol.gx1 import requests
 from msdrivers.protocol.gx1.scaling import QUARTER_TURN, format_version, is_unit
+from msdrivers.protocol.recognition import recognize
 
 QUOTED_BYTES = 32
 """Number of received bytes that are quoted."""
+
+EXAMINED_BYTES = 4096
+"""Number of received bytes by which another device is recognized."""
 
 
 class Gx1Reply(NamedTuple):
@@ -48,8 +52,8 @@ class Gx1Receiver:
         """Return the replies that `data` completes."""
         self.now = now
         self.bytes_received += len(data)
-        if len(self._first_bytes) < QUOTED_BYTES:
-            self._first_bytes = (self._first_bytes + data)[:QUOTED_BYTES]
+        if len(self._first_bytes) < EXAMINED_BYTES:
+            self._first_bytes = (self._first_bytes + data)[:EXAMINED_BYTES]
         packets = self.parser.feed(data)
         replies = [Gx1Reply(packet, count) for packet, count in zip(packets, self._tick_counts, strict=True)]
         self._tick_counts.clear()
@@ -78,7 +82,9 @@ class Gx1Receiver:
         """Describe the input since `reset_input`."""
         if not self.bytes_received:
             return "nothing"
-        shown = self._first_bytes
+        if (protocol := recognize(self._first_bytes)) is not None:
+            return f"{protocol.name} (write device: {protocol.devices[0]})"
+        shown = self._first_bytes[:QUOTED_BYTES]
         if sum(32 <= byte < 127 or byte in b"\r\n" for byte in shown) > 0.9 * len(shown):
             return f"{self.bytes_received} bytes of text, beginning {shown.decode('ascii', 'replace')!r}"
         return f"{self.bytes_received} bytes, beginning {shown.hex(' ')}"
