@@ -94,6 +94,8 @@ def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules
 
 _load_gps = partial(_load, "gps.settings:GpsSettings", "gps.driver:GpsDriver")
 _load_ublox = partial(_load, "ublox:UbloxSettings", "ublox:UbloxDriver")
+_load_vectornav = partial(_load, "vectornav:VectornavSettings", "vectornav:VectornavDriver")
+_load_xsens = partial(_load, "xsens:XsensSettings", "xsens:XsensDriver")
 _load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
 _load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
 _load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
@@ -120,6 +122,21 @@ def _make_ublox_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     # one series for the receiver before and after a restart
     samples = iter(wanted.samples)
     return FaultInjector(lambda: UbloxEmulator(samples, unit), wanted.faults)
+
+
+def _make_vectornav_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.vectornav import VectornavEmulator
+
+    samples = iter(wanted.samples)
+    return FaultInjector(lambda: VectornavEmulator(samples), wanted.faults)
+
+
+def _make_xsens_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.xsens import XsensEmulator, XsensUnit
+
+    unit = XsensUnit(field_strength=wanted.settings.field_strength or 5e-5)
+    samples = iter(wanted.samples)
+    return FaultInjector(lambda: XsensEmulator(samples, unit), wanted.faults)
 
 
 def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -206,6 +223,25 @@ _KINDS = (
         has_memory=True,
         has_hard_iron=True,
         has_z_down=True,
+    ),
+    DeviceKind(
+        "vectornav",
+        "VectorNav VN-100 inertial unit",
+        ImuSample,
+        _BYTE_LINES,
+        _load_vectornav,
+        _make_vectornav_emulator,
+        115200,
+        has_z_down=True,
+    ),
+    DeviceKind(
+        "xsens",
+        "Xsens MTi inertial unit",
+        ImuSample,
+        _BYTE_LINES,
+        _load_xsens,
+        _make_xsens_emulator,
+        115200,
     ),
     DeviceKind(
         "wheels",

@@ -24,6 +24,7 @@ from pyubx2 import (
 
 from modelserver.messages import FixType
 from msdrivers.protocol.framing import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
+from msdrivers.protocol.setup_step import SetupStep
 
 SYNC: Final = b"\xb5\x62"
 HEADER_BYTES: Final = 6
@@ -169,41 +170,27 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
 # --- configuration --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class ReceiverSetup:
-    """A configuration message, which the receiver acknowledges. `is_optional`: its rejection does not matter."""
-
-    frame: bytes
-    what: str
-    is_optional: bool = False
-
-    @property
-    def key(self) -> tuple[int, int]:
-        """Class and identifier that the acknowledgement names."""
-        return self.frame[2], self.frame[3]
-
-
 def make_version_poll() -> bytes:
     """Return the request for MON-VER."""
     return _encode(UBXMessage("MON", "MON-VER", 2))
 
 
-def make_setup(protocol: float, rate_hz: float) -> tuple[ReceiverSetup, ...]:
+def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
     """Return what sets a receiver of a protocol version up, in its volatile memory only."""
     period_ms = round(1000.0 / rate_hz)
     if protocol >= VALSET_VERSION:
         return _make_valset(period_ms)
     rate = UBXMessage("CFG", "CFG-RATE", SET, measRate=period_ms, navRate=1, timeRef=1)
     return (
-        ReceiverSetup(_encode(rate), f"a rate of {rate_hz:g} Hz"),
+        SetupStep(_encode(rate), f"a rate of {rate_hz:g} Hz"),
         *(_make_message_rate(name, is_optional=False) for name in REQUIRED_OUTPUT),
         *(_make_message_rate(name, is_optional=True) for name in OPTIONAL_OUTPUT),
     )
 
 
-def _make_valset(period_ms: int) -> tuple[ReceiverSetup, ...]:
-    def configure(values: list[tuple[str, int]], what: str, is_optional: bool = False) -> ReceiverSetup:
-        return ReceiverSetup(_encode(UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
+def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
+    def configure(values: list[tuple[str, int]], what: str, is_optional: bool = False) -> SetupStep:
+        return SetupStep(_encode(UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
 
     setups = [
         configure([("CFG_RATE_MEAS", period_ms), ("CFG_RATE_NAV", 1)], f"a rate of {1000.0 / period_ms:g} Hz"),
@@ -221,10 +208,10 @@ def _make_valset(period_ms: int) -> tuple[ReceiverSetup, ...]:
 _CODES: Final = {name.replace("-", "_"): code for code, name in UBX_MSGIDS.items()}
 
 
-def _make_message_rate(name: str, *, is_optional: bool) -> ReceiverSetup:
+def _make_message_rate(name: str, *, is_optional: bool) -> SetupStep:
     """Return the CFG-MSG that switches a message on at this port."""
     frame = UBXMessage("CFG", "CFG-MSG", SET, payload=_CODES[name] + b"\x01")
-    return ReceiverSetup(_encode(frame), name.replace("_", "-"), is_optional)
+    return SetupStep(_encode(frame), name.replace("_", "-"), is_optional)
 
 
 def _encode(message: UBXMessage) -> bytes:

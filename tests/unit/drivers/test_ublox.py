@@ -37,7 +37,10 @@ def connect(unit: UbloxUnit = GENERATION_9, seconds: float = 20.0, rate_hz: floa
 @pytest.mark.parametrize("unit", [GENERATION_9, GENERATION_8], ids=lambda unit: unit.product)
 def test_given_a_receiver_when_set_up_then_each_fix_is_published_as_it_was_measured(unit: UbloxUnit) -> None:
     line = connect(unit).open().run(12.0)
-    assert line.status_text.splitlines()[-1] == f"streaming: {unit.product}, receiving NAV-PVT"
+    assert (
+        line.status_text.splitlines()[-1]
+        == f"streaming: {unit.product} (protocol {unit.protocol:g}), receiving NAV-PVT"
+    )
     assert isinstance(line.device, UbloxEmulator)
     assert line.device.messages == frozenset(ORDER) - unit.missing | frozenset({"RXM-RTCM"}) - unit.missing
     assert 100 <= len(line.samples) <= 121
@@ -150,7 +153,7 @@ def test_given_a_restart_when_its_setup_is_lost_then_it_is_set_up_again() -> Non
     device = FaultInjector(lambda: UbloxEmulator(samples), (parse_fault("restart@8:2"),))
     line = Line(UbloxDriver(UbloxSettings("gps", rate_hz=10.0)), device).open().run(30.0)
     assert sum(each.header.device_utime > START + 15 * SECOND for each in line.samples) > 100
-    assert "setting the receiver up again" in line.status_text
+    assert "setting the device up again" in line.status_text
 
 
 def test_given_a_line_that_cannot_send_then_what_the_receiver_sends_unasked_is_used() -> None:
@@ -161,7 +164,7 @@ def test_given_a_line_that_cannot_send_then_what_the_receiver_sends_unasked_is_u
         line.deliver(encode_sample("NAV-PVT", later) + encode_sample("NAV-EOE", later))
         line.run(0.2)
     assert len(line.samples) == 40
-    assert "sends fixes but answers nothing" in line.status_text
+    assert "sends NAV-PVT but answers nothing" in line.status_text
 
 
 def test_given_a_rejected_rate_then_it_is_a_warning_and_the_rest_is_set_up() -> None:
@@ -171,7 +174,7 @@ def test_given_a_rejected_rate_then_it_is_a_warning_and_the_rest_is_set_up() -> 
 
     line = Line(UbloxDriver(UbloxSettings("gps", rate_hz=20.0)), Slow(drive(20.0))).open().run(10.0)
     (warning,) = (each for each in line.statuses if each.is_warning)
-    assert "the receiver rejected a rate of 20 Hz; is `rate_hz` within" in warning.text
+    assert "the device rejected a rate of 20 Hz: is `rate_hz` within" in warning.text
     assert len(line.samples) >= 8
 
 
