@@ -57,22 +57,34 @@ from modelserver.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from modelserver.client.mirror import PlatformMirror as PlatformMirror
+    from modelserver.client.publisher import SensorPublisher as SensorPublisher
     from modelserver.client.remote import Platform as Platform
     from modelserver.formats import load_model as load_model
     from modelserver.geometry.builder import ModelBuilder as ModelBuilder
     from modelserver.geometry.model import Model as Model
+    from modelserver.messages import Direction as Direction
+    from modelserver.messages import FixType as FixType
     from modelserver.messages import Invalid as Invalid
+    from modelserver.messages import OrientationReference as OrientationReference
     from modelserver.messages import Policy as Policy
+    from modelserver.messages import PoseAnswer as PoseAnswer
     from modelserver.messages import Quality as Quality
+    from modelserver.messages import YawSource as YawSource
     from modelserver.transforms.pose import Pose as Pose
     from modelserver.transforms.transformation import Transformation as Transformation
 
 _LAZY = {
     "PlatformMirror": "modelserver.client.mirror",
     "Platform": "modelserver.client.remote",
+    "SensorPublisher": "modelserver.client.publisher",
     "load_model": "modelserver.formats",
     "ModelBuilder": "modelserver.geometry.builder",
     "Model": "modelserver.geometry.model",
+    "Direction": "modelserver.messages",
+    "FixType": "modelserver.messages",
+    "OrientationReference": "modelserver.messages",
+    "YawSource": "modelserver.messages",
+    "PoseAnswer": "modelserver.messages",
     "Invalid": "modelserver.messages",
     "Policy": "modelserver.messages",
     "Quality": "modelserver.messages",

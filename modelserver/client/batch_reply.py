@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from modelserver.client.times import Time, to_utime
 from modelserver.errors import MalformedRequestError, WireError
 from modelserver.messages import PoseBatch, PoseBatchReply
 from modelserver.wire.fields import MAX_PAIRS
@@ -25,18 +26,22 @@ class BatchQuery(NamedTuple):
 
 
 def check_batch(
-    pairs: Sequence[tuple[str, str]], at: Sequence[int] | npt.NDArray[np.int64]
+    pairs: Sequence[tuple[str, str]], at: Sequence[Time] | npt.NDArray[Any]
 ) -> tuple[tuple[tuple[str, str], ...], npt.NDArray[np.int64]]:
     """Return the pairs and times of a batch query. Raises MalformedRequestError where the wire cannot hold them."""
     wanted = tuple((interest, reference) for interest, reference in pairs)
     try:
         given = np.asarray(at)
+        if given.dtype.kind == "M" or (given.dtype.kind == "O" and given.ndim == 1):
+            given = np.array([to_utime(each) for each in at], dtype=np.int64)
         utimes = given.astype(np.int64)
         is_integer = given.ndim == 1 and bool((utimes == given).all())
     except (TypeError, ValueError, OverflowError):
         is_integer = False
     if not is_integer:
-        raise MalformedRequestError(f"times must be integer microseconds since 1970, got {reprlib.repr(at)}")
+        raise MalformedRequestError(
+            f"times must be integer microseconds since 1970, datetime or datetime64, got {reprlib.repr(at)}"
+        )
     if not 1 <= len(wanted) <= MAX_PAIRS:
         raise MalformedRequestError(f"a batch query has 1 to {MAX_PAIRS} pairs, got {len(wanted)}")
     return wanted, utimes

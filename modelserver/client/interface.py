@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-import numpy as np
 import numpy.typing as npt
 
 from modelserver.client.batch_reply import BatchQuery, check_batch
+from modelserver.client.times import Time, to_utime
 from modelserver.errors import WireError
 from modelserver.messages import (
     Explanation,
@@ -52,12 +52,14 @@ class FrameClient(ABC):
         frame_of_interest: str,
         frame_of_reference: str,
         *,
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return the transformation with its origin, protection levels and quality flags."""
-        return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
+        return self._query_pose(
+            frame_of_interest, frame_of_reference, at if type(at) is int else to_utime(at), policy, wait_ms
+        )
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -73,7 +75,7 @@ class FrameClient(ABC):
         frame_of_reference: str,
         *,
         expressed_in: str = "",
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> MotionAnswer:
@@ -83,7 +85,7 @@ class FrameClient(ABC):
         vehicle's velocity from its poses in Odom: its sigma is larger than the server's, and its acceleration is
         unknown (nan). Raises as `get_transformation`.
         """
-        time = TimeQuery(at, policy, wait_ms)
+        time = TimeQuery(to_utime(at), policy, wait_ms)
         request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
         return require_answer(self._query(request, MotionReply).answer)
 
@@ -92,7 +94,7 @@ class FrameClient(ABC):
         frame_of_interest: str,
         frame_of_reference: str,
         *,
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Explanation:
@@ -100,7 +102,7 @@ class FrameClient(ABC):
 
         Raises as `get_transformation`.
         """
-        time = TimeQuery(at, policy, wait_ms)
+        time = TimeQuery(to_utime(at), policy, wait_ms)
         request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
         return require_answer(self._query(request, ExplanationReply).answer)
 
@@ -119,9 +121,9 @@ class FrameClient(ABC):
 class PlatformClient(FrameClient):
     """Annotate a parameter with this where `Platform` or `PlatformMirror` will do.
 
-    Times are microseconds since the Unix epoch, 0 for the latest. All methods raise NoServerError if the server does
-    not answer (`PlatformMirror`: OutOfDateError where its replica is incomplete or too old), and a QueryError with the
-    reason if there is no answer.
+    Times are microseconds since the Unix epoch, datetime or numpy.datetime64; 0 for the latest. All methods raise
+    NoServerError if the server does not answer (`PlatformMirror`: OutOfDateError where its replica is incomplete or too
+    old), and a QueryError with the reason if there is no answer.
     """
 
     def __enter__(self) -> Self:
@@ -140,7 +142,7 @@ class PlatformClient(FrameClient):
         frame_of_interest: str,
         frame_of_reference: str,
         *,
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Transformation:
@@ -151,7 +153,7 @@ class PlatformClient(FrameClient):
         frame_of_interest, frame_of_reference
             Body:Frame.
         at
-            Time in microseconds since the Unix epoch, 0 for the latest common one.
+            Time: microseconds since the Unix epoch, a datetime or a numpy.datetime64; 0 for the latest common one.
         policy
             What is accepted at that time: interpolated, latest, held (the last value before it) or predicted data.
         wait_ms
@@ -164,40 +166,42 @@ class PlatformClient(FrameClient):
         QueryError
             The reason in the reply.
         """
-        return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+        return self._query_pose(
+            frame_of_interest, frame_of_reference, at if type(at) is int else to_utime(at), policy, wait_ms
+        ).transformation
 
     def get_state_vector(
-        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+        self, *, at: Time = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
         """Return the vehicle's pose in World:UTM, through its 7-vector. Raises as `get_transformation`."""
-        request = GetStateVector(self._header(), TimeQuery(at, policy, wait_ms))
+        request = GetStateVector(self._header(), TimeQuery(to_utime(at), policy, wait_ms))
         return require_answer(self._query(request, StateVectorReply).answer).transformation
 
     def get_h_transform(
-        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+        self, *, inverse: bool = False, at: Time = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
         """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
 
         Raises as `get_transformation`.
         """
-        request = GetHTransform(self._header(), inverse, TimeQuery(at, policy, wait_ms))
+        request = GetHTransform(self._header(), inverse, TimeQuery(to_utime(at), policy, wait_ms))
         return require_answer(self._query(request, TransformReply).answer).transformation
 
-    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
+    def get_history(self, start_utime: Time, end_utime: Time, rate_hz: float) -> list[Transformation]:
         """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
 
         Raises NoServerError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
         """
-        request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
+        request = GetHistory(self._header(), to_utime(start_utime), to_utime(end_utime), rate_hz)
         return [answer.transformation for answer in self._query(request, HistoryReply).answers]
 
     def get_transformations(
         self,
         pairs: Sequence[tuple[str, str]],
-        at: Sequence[int] | npt.NDArray[np.int64],
+        at: Sequence[Time] | npt.NDArray[Any],
         *,
         fixed_frame: str = "",
-        reference_at: int = 0,
+        reference_at: Time = 0,
         covariance: bool = True,
     ) -> list[PoseBatch]:
         """Return for each pair (frame of interest, frame of reference) its poses at all times `at`.
@@ -209,7 +213,7 @@ class PlatformClient(FrameClient):
         pairs
             Frames of interest and reference.
         at
-            (n,) times, microseconds since the Unix epoch.
+            (n,) times.
         fixed_frame
             If given, the frame of reference is taken at `reference_at` instead of at each time, through this frame,
             which is assumed stationary between the times: Odom:Origin for short ones (tf2's "advanced" lookup).
@@ -224,7 +228,7 @@ class PlatformClient(FrameClient):
             As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
             `fixed_frame` and a `reference_at` of 0 for more times than one request to the server holds.
         """
-        return self._query_batch(BatchQuery(*check_batch(pairs, at), fixed_frame, reference_at, covariance))
+        return self._query_batch(BatchQuery(*check_batch(pairs, at), fixed_frame, to_utime(reference_at), covariance))
 
     @abstractmethod
     def _query_batch(self, query: BatchQuery) -> list[PoseBatch]:

@@ -13,6 +13,7 @@ import lcm
 
 from modelserver.client.local import IN_HISTORY, LocalPlatform
 from modelserver.client.mirror_state import Ages, MirrorReceiver, MirrorState
+from modelserver.client.times import Time, to_utime
 from modelserver.errors import OutOfDateError
 from modelserver.messages import Policy, PoseAnswer
 from modelserver.transforms.transformation import Transformation
@@ -99,7 +100,7 @@ class PlatformMirror(LocalPlatform):
         self,
         frame_of_interest: str,
         frame_of_reference: str,
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Transformation:
@@ -110,14 +111,14 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_transforms[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+            return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms).transformation
 
     def get_pose(
         self,
         frame_of_interest: str,
         frame_of_reference: str,
         *,
-        at: int = 0,
+        at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
@@ -125,7 +126,7 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_answers[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
+            return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms)
 
     @property
     def age(self) -> Ages:

@@ -24,6 +24,7 @@ import numpy as np
 
 from modelserver.client.batch_reply import BatchQuery, BatchReplyAssembler, concatenate
 from modelserver.client.interface import PlatformClient, R, require_answer
+from modelserver.client.pose_stream import PoseStream
 from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
 from modelserver.messages import (
     CHANNEL_OF,
@@ -200,6 +201,14 @@ class Platform(PlatformClient):
             )
             batches.append(parts.join(pairs, chunk))
         return [concatenate([batch[number] for batch in batches]) for number in range(len(pairs))]
+
+    def subscribe_pose(self, callback: Callable[[PoseAnswer], object] | None = None) -> PoseStream:
+        """Receive the poses that the service publishes on POSE.
+
+        With a callback, a thread calls it with each pose until `close` of the result; without, the result is iterated,
+        with `for` or `async for`, and ends when it is closed.
+        """
+        return PoseStream(self.url, f"{self._prefix}POSE", callback)
 
     def reload_model(self, *, dry_run: bool = False) -> ReloadReply:
         """Reload the server's geometry file; return its revision and the changes, one per line.

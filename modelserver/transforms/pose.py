@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,13 @@ def _floats(values: Iterable[float], expected: str) -> tuple[float, ...]:
     if isinstance(values, np.ndarray) and values.ndim != 1:
         raise ValueError(f"{expected}, got an array of shape {values.shape}")
     return found
+
+
+class SupportsAsQuaternion(Protocol):
+    """A rotation of scipy.spatial.transform."""
+
+    def as_quat(self) -> Any:
+        """Return the quaternion x, y, z, w."""
 
 
 class Pose:
@@ -98,6 +105,17 @@ class Pose:
         return cls(m[:3, 3].tolist(), so3.from_matrix(rotation))
 
     @classmethod
+    def from_xyzw(cls, position: Iterable[float], quaternion: Iterable[float]) -> Self:
+        """Return the pose of a position and a quaternion x, y, z, w, scalar last, as in scipy and ROS."""
+        x, y, z, w = _floats(quaternion, "a quaternion is 4 numbers, here scalar last")
+        return cls(position, (w, x, y, z))
+
+    @classmethod
+    def from_scipy(cls, position: Iterable[float], rotation: SupportsAsQuaternion) -> Self:
+        """Return the pose of a position and a scipy.spatial.transform.Rotation."""
+        return cls.from_xyzw(position, rotation.as_quat())
+
+    @classmethod
     def from_rpy(cls, position: Iterable[float], roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Self:
         """Return the pose at `position` rotated by fixed-axis roll, pitch, yaw in radians (REP-103)."""
         if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
@@ -121,6 +139,18 @@ class Pose:
     def wxyz(self) -> Quaternion:
         """The unit quaternion, scalar first, w >= 0, as plain floats."""
         return self._q
+
+    @property
+    def xyzw(self) -> Quaternion:
+        """The unit quaternion x, y, z, w, scalar last, as in scipy and ROS."""
+        w, x, y, z = self._q
+        return (x, y, z, w)
+
+    def to_scipy(self) -> Any:
+        """Return the rotation as a scipy.spatial.transform.Rotation. Raises ImportError without scipy."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(self.xyzw)
 
     @property
     def position(self) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -131,6 +131,15 @@ class Transformation:
     def quaternion(self) -> Array:
         """The unit quaternion (4), scalar first, w >= 0."""
         return self.pose.quaternion
+
+    @property
+    def xyzw(self) -> tuple[float, float, float, float]:
+        """The unit quaternion x, y, z, w, scalar last, as in scipy and ROS."""
+        return self.pose.xyzw
+
+    def to_scipy(self) -> Any:
+        """Return the rotation as a scipy.spatial.transform.Rotation. Raises ImportError without scipy."""
+        return self.pose.to_scipy()
 
     @property
     def rotation(self) -> Array:
