@@ -56,6 +56,7 @@ from modelserver.errors import UnknownFrameError as UnknownFrameError
 from modelserver.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from modelserver.client.commander import VehicleCommander as VehicleCommander
     from modelserver.client.mirror import PlatformMirror as PlatformMirror
     from modelserver.client.publisher import SensorPublisher as SensorPublisher
     from modelserver.client.remote import Platform as Platform
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from modelserver.transforms.transformation import Transformation as Transformation
 
 _LAZY = {
+    "VehicleCommander": "modelserver.client.commander",
     "PlatformMirror": "modelserver.client.mirror",
     "Platform": "modelserver.client.remote",
     "SensorPublisher": "modelserver.client.publisher",

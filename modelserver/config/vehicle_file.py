@@ -350,6 +350,8 @@ class CommandsConfig:
     """Whether the geometry file may be reloaded."""
     set_pose: bool = False
     """Whether the pose of the vehicle may be set."""
+    drive: Literal["auto", "signed", "unsigned"] = "auto"
+    """Whether commands to the vehicle controller must be signed. `auto`: where there is a key file."""
     key_file: str = ""
     """Keys with which such a message must be signed, relative to this file; see `modelserver.signing.key_files`."""
     window_s: float = 5.0
@@ -357,7 +359,13 @@ class CommandsConfig:
 
     def __post_init__(self) -> None:
         enabled = [name for name in ("reload", "set_pose") if getattr(self, name) and not self.key_file]
+        enabled += ["drive: signed"] if self.drive == "signed" and not self.key_file else []
         _check(self, *(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled), window_s=(0.1, 300.0))
+
+    @property
+    def is_drive_signed(self) -> bool:
+        """Whether commands to the vehicle controller must be signed."""
+        return self.drive == "signed" or (self.drive == "auto" and bool(self.key_file))
 
 
 @dataclass(frozen=True, slots=True)

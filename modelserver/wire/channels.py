@@ -13,6 +13,7 @@ DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"
 REPLY_PREFIX = "REPLY_"
 
 SIGNED: Final = "MODELSERVER_SIGNED"
+DRIVE_SIGNED: Final = "VEHICLE_COMMAND_SIGNED"
 """The channel of signed commands, without the vehicle's prefix."""
 
 PROBE_CHANNEL = "MODELSERVER_PROBE"
@@ -82,6 +83,7 @@ CHANNELS = (
         ("VEHICLE_COMMAND", "vehicle_command_t", "10 Hz and more", "commands to the vehicle controller"),
         ("LOCALIZATION_MODE", "localization_mode_t", "on demand", "which sources localization uses"),
         (SIGNED, "signed_t", "on demand", "signed commands"),
+        (DRIVE_SIGNED, "signed_t", "10 Hz and more", "signed commands to the vehicle controller"),
     ),
     *_channels(
         ChannelUse.BROADCAST,

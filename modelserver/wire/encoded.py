@@ -6,7 +6,7 @@ import struct
 from typing import Final
 
 from modelserver.errors import WireError
-from modelserver.wire.channels import CHANNELS, SIGNED, ChannelUse
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.fields import read_text
 from modelserver.wire.generated import CODECS, FINGERPRINTS
 from modelserver.wire.journal import MAGIC
@@ -15,7 +15,7 @@ _INPUTS: Final = frozenset(
     FINGERPRINTS[channel.type_name]
     for channel in CHANNELS
     # signed commands are no inputs for playback: signatures protect against replayed commands
-    if channel.use in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.name != SIGNED
+    if channel.use in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.type_name != "signed_t"
 )
 _SERVICE: Final = frozenset(codec.fingerprint for codec in CODECS) - _INPUTS | {MAGIC}
 _STAMPED: Final = frozenset(

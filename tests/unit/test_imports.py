@@ -55,7 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "msdrivers.endpoint": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.endpoint"},
     "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.endpoint"},
-    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth"},
+    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "signing.signatures"},
     "mslcm": set(),
     "mstools": SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"},
     # the public names, loaded when they are first used

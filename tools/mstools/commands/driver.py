@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.server.supervision.systemd import Notifier
     from msdrivers.links import Link
+    from msdrivers.raw_log import TimeSource
     from msdrivers.registry import DeviceKind
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
@@ -280,10 +281,11 @@ def run(
     options = RunnerSettings(settings.name, kind.name)
     if kind.command_channel:
         options = replace(options, poll_timeout=COMMAND_POLL_S)
-    runner = Runner(station, link, options, SystemTimeSource(), publisher.publish_sample, publisher.publish_health)
+    time_source = SystemTimeSource()
+    runner = Runner(station, link, options, time_source, publisher.publish_sample, publisher.publish_health)
     attend: Callable[[], object] = lambda: None  # noqa: E731
     if kind.command_channel:
-        attend = _subscribe_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.command_channel}", runner)
+        attend = subscribe_commands(bus, vehicle, kind.command_channel, runner, time_source)
     stop_on_signal(runner)
     notifier = Notifier.from_environment()
     try:
@@ -298,20 +300,49 @@ def stop_on_signal(runner: Runner[Any]) -> None:
         signal.signal(number, lambda *_: runner.stop())
 
 
-def _subscribe_commands(bus: Any, channel: str, runner: Runner[Any]) -> Callable[[], object]:
-    """Subscribe to a command channel; return the function that processes the received commands."""
+def subscribe_commands(
+    bus: Any, vehicle: VehicleConfig, channel: str, runner: Runner[Any], time_source: TimeSource
+) -> Callable[[], object]:
+    """Subscribe to a command channel; return the function that processes the received commands.
+
+    Where commands must be signed, those on `channel` itself are rejected. Raises KeyFileError.
+    """
     from modelserver.errors import WireError
-    from modelserver.wire.channels import to_subscription_pattern
+    from modelserver.signing.key_files import read_keys
+    from modelserver.wire.channels import DRIVE_SIGNED, to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.provider import handle_message
+    from msdrivers.signed_commands import COMMAND_TYPE, CommandDeniedError, DriveVerifier
+
+    prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
+    plain = f"{prefix}{channel}"
 
     def handle(_: str, data: bytes) -> None:
         try:
-            runner.send_command(decode("vehicle_command_t", data))
+            runner.send_command(decode(COMMAND_TYPE, data))
         except WireError as error:
-            runner.reject_command(error.reason, f"a command on {channel} rejected: {error}")
+            runner.reject_command(error.reason, f"a command on {plain} rejected: {error}")
 
-    bus.subscribe(to_subscription_pattern(channel), handle)
+    def reject_unsigned(_: str, data: bytes) -> None:
+        text = (
+            f"a command on {plain} rejected: it is not signed; use modelserver.VehicleCommander with the vehicle's key"
+        )
+        runner.reject_command("unsigned", text)
+
+    if config.is_drive_signed:
+        signed = f"{prefix}{DRIVE_SIGNED}"
+        verifier = DriveVerifier(
+            read_keys(config.key_file), prefix, channel, config.window_s, time_source.now().monotonic_ns
+        )
+
+        def verify(_: str, data: bytes) -> None:
+            try:
+                runner.send_command(verifier.verify(data, time_source.now()))
+            except CommandDeniedError as error:
+                runner.reject_command(error.reason, f"a command on {signed} rejected: {error}")
+
+        bus.subscribe(to_subscription_pattern(signed), verify)
+    bus.subscribe(to_subscription_pattern(plain), reject_unsigned if config.is_drive_signed else handle)
 
     def attend() -> None:
         while handle_message(bus):
