@@ -17,6 +17,8 @@ from tests.scenario.test_demo import close, list_running, text_until
 
 pytestmark = pytest.mark.slow
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "python" / "own_device.py"
+
 GEOMETRY = """\
 modelserver: geometry/1
 name: Cart
@@ -120,3 +122,54 @@ def test_given_a_fault_in_a_file_then_nothing_is_started_and_the_fix_is_named(
     assert expected in found.stderr
     assert not (cart.parent / "emulated" / "state").exists()
     shutil.rmtree(cart.parent / "emulated", ignore_errors=True)
+
+
+PLUGIN_DRIVER = """\
+  radar: {device: speed, port: /dev/ttyRADAR, wheel: middle}
+"""
+
+
+def install_plugin(folder: Path, *entries: str) -> None:
+    """Install a package with the example of an own device: its module, and the metadata that pip writes."""
+    info = folder / "speed_device-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: speed-device\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("\n".join(["[modelserver.drivers]", *entries, ""]))
+    shutil.copy(EXAMPLE, folder / "speed_device.py")
+
+
+def test_given_an_installed_device_then_it_is_found_checked_emulated_and_fused(
+    cart: Path, tmp_path: Path, lcm_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packages = tmp_path / "packages"
+    install_plugin(packages, "speed = speed_device:KIND", "broken = no_such_module:KIND")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(packages), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    wheels = 'sensors:\n  wheels: {frames: {middle: "Cart:Base"}}\n'
+    cart.write_text(VEHICLE.replace("sensors:\n", wheels) + PLUGIN_DRIVER)
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*MODELSERVER, *arguments], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+        )
+
+    listed = run("driver", "--list")
+    assert "speed            device of an installed package: speed sensor that sends $SPD" in listed.stdout
+    assert "broken           device of an installed package, not usable: ModuleNotFoundError" in listed.stderr
+    checked = run("check", str(cart))
+    assert (checked.returncode, "clean" in checked.stdout) == (0, True), checked.stdout
+    cart.write_text(cart.read_text().replace("device: speed", "device: broken"))
+    assert "of an installed package cannot be used: ModuleNotFoundError" in run("check", str(cart)).stdout
+    cart.write_text(cart.read_text().replace("device: broken", "device: speed").replace("wheel:", "weel:"))
+    assert "unknown key 'weel'" in run("check", str(cart)).stdout
+    cart.write_text(cart.read_text().replace("weel:", "wheel:"))
+
+    process = start_up(cart, lcm_url, "--emulate")
+    try:
+        text_until(process, r" *up \| pose valid")
+        status = json.loads(invoke(lcm_url, "status", "--json").stdout)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=TIMEOUT_S)
+        close(process)
+    (radar,) = (each for each in status["channels"] if each["channel"] == "sensor:radar")
+    assert radar["used"] > 0

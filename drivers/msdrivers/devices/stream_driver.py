@@ -41,7 +41,7 @@ class StreamSettings(Protocol):
 
     @property
     def bauds(self) -> tuple[int, ...]:
-        """Baud rates to try; empty: the usual ones of the device."""
+        """Baud rates to try; empty: the line has none."""
 
     @property
     def silence(self) -> float:
@@ -81,12 +81,11 @@ class StreamDriver(ABC, Generic[M]):
     """What is looked for, e.g. "u-blox receiver"."""
     awaited: ClassVar[str]
     """What it streams, e.g. "NAV-PVT"."""
-    default_bauds: ClassVar[tuple[int, ...]]
 
     def __init__(self, settings: StreamSettings, stream: FrameScanner[M]) -> None:
         self._settings, self._stream = settings, stream
         self.max_silence = settings.silence
-        self._bauds = settings.bauds or self.default_bauds
+        self._bauds = settings.bauds
         self._phase, self._reported = EndpointPhase.WAITING, ""
         self._product = ""
         self._steps: tuple[SetupStep, ...] = ()
@@ -269,15 +268,18 @@ class StreamDriver(ABC, Generic[M]):
 
     def _try_next_baud(self, now: HostTime) -> list[Output[bytes]]:
         found = recognize_line(self._first_bytes, self.device)
-        baud = self._bauds[self._baud_index]
-        self._tried.append(f"at {baud} baud {found}")
+        baud = self._bauds[self._baud_index] if self._bauds else None
+        self._tried.append(f"at {baud} baud {found}" if baud else found)
         out: list[Output[bytes]] = []
-        if len(self._tried) >= len(self._bauds):
+        if len(self._tried) >= max(1, len(self._bauds)):
             # the text differs with the noise: rate limit
             if self._phase is not EndpointPhase.SILENT or now.monotonic_ns >= self._next_warning_ns:
                 self._next_warning_ns = now.monotonic_ns + WARNING_INTERVAL_NS
                 text = f"no {self.description} answers on this line: {'; '.join(self._tried)}"
                 out += self._set_status(EndpointPhase.SILENT, text)
             self._tried = []
+        if len(self._bauds) < 2:
+            self._first_bytes = b""
+            return [*out, *self._identify(now)]
         self._baud_index = (self._baud_index + 1) % len(self._bauds)
         return [*out, Reopen(f"no {self.description} at {baud} baud, {found}", self._bauds[self._baud_index])]

@@ -35,8 +35,8 @@ class UbloxSettings:
     source: str
     rate_hz: float = 5.0
     """Fixes per second, 0.1 to 25; what a product reaches depends on its constellations."""
-    bauds: tuple[int, ...] = ()
-    """Baud rates to try; the line is opened at the first. Empty: 38400, 9600, 115200, 460800."""
+    bauds: tuple[int, ...] = (38400, 9600, 115200, 460800)
+    """Baud rates to try; the line is opened at the first. Empty: the line has none."""
     silence: float = 2.0
     """Timeout for fixes, seconds, after which the setup is repeated."""
     answer_timeout: float = 0.5
@@ -144,8 +144,6 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     device = "ublox"
     description = "u-blox receiver"
     awaited = "NAV-PVT"
-    # the factory setting of generation 9, that of earlier ones, and usual ones of configured receivers
-    default_bauds = (38400, 9600, 115200, 460800)
 
     def __init__(self, settings: UbloxSettings) -> None:
         super().__init__(settings, UbxStream())

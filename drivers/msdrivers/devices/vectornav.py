@@ -28,8 +28,8 @@ class VectornavSettings:
     """Serial port of the unit that this line is at, 1 or 2."""
     heading: str = "magnetic"
     """What the yaw of its orientation is measured against: `magnetic`, or `none` where its magnetometers are off."""
-    bauds: tuple[int, ...] = ()
-    """Baud rates to try; the line is opened at the first. Empty: 115200, 921600, 460800, 230400."""
+    bauds: tuple[int, ...] = (115200, 921600, 460800, 230400)
+    """Baud rates to try; the line is opened at the first. Empty: the line has none."""
     silence: float = 0.5
     """Timeout for samples, seconds, after which the setup is repeated."""
     answer_timeout: float = 0.3
@@ -57,7 +57,6 @@ class VectornavDriver(StreamDriver[VnMessage]):
     device = "vectornav"
     description = "VectorNav unit"
     awaited = "binary output"
-    default_bauds = (115200, 921600, 460800, 230400)
 
     def __init__(self, settings: VectornavSettings) -> None:
         super().__init__(settings, VnStream())

@@ -30,8 +30,8 @@ class XsensSettings:
     """Magnetic field at its calibration, tesla: the unit reports multiples of it. 0: its field is not used."""
     heading: str = "magnetic"
     """What the yaw of its orientation is measured against: `magnetic`, `none` (VRU), or `true` (with declination)."""
-    bauds: tuple[int, ...] = ()
-    """Baud rates to try; the line is opened at the first. Empty: 115200, 921600, 460800, 230400, 2000000."""
+    bauds: tuple[int, ...] = (115200, 921600, 460800, 230400, 2000000)
+    """Baud rates to try; the line is opened at the first. Empty: the line has none."""
     silence: float = 0.5
     """Timeout for samples, seconds, after which the setup is repeated."""
     answer_timeout: float = 0.5
@@ -81,7 +81,6 @@ class XsensDriver(StreamDriver[XbusMessage]):
     device = "xsens"
     description = "Xsens MTi"
     awaited = "MTData2"
-    default_bauds = (115200, 921600, 460800, 230400, 2000000)
 
     def __init__(self, settings: XsensSettings) -> None:
         super().__init__(settings, XbusStream())

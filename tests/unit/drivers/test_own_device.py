@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -22,7 +21,7 @@ from msdrivers.emulate.faults import InjectedFault
 from msdrivers.endpoint import HostTime, Send
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.framing import FrameScanner
-from msdrivers.registry import KINDS, EmulatorInputs
+from msdrivers.registry import KINDS, DeviceRegistry, EmulatorInputs
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
 
@@ -103,28 +102,38 @@ def test_given_a_line_that_is_right_by_its_checksum_alone_then_it_is_rejected(li
     assert scanner.counts["rejected.content"] == 1
 
 
-@pytest.mark.slow
-def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_is_reported_with_its_line(tmp_path: Path) -> None:
-    (code,) = re.findall(
-        r"```python\n(.*?)```", (ROOT / "docs" / "own-device.md").read_text(encoding="utf-8"), re.DOTALL
-    )
-    (tmp_path / "vehicle.yaml").write_text(
-        "vehicle: cart\ngeometry: cart.yaml\nbase_frame: Cart:Base\n"
-        "drivers:\n  radar: {device: speed, port: /dev/ttyUSB2, weel: speed}\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(EXAMPLE.parent)},
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stderr == (
-        "vehicle.yaml:5 (drivers.radar.weel): error: unknown key 'weel'; nearest: wheel; fix: write wheel\n"
-    )
+class FakeEntryPoint:
+    """An entry point of an installed package."""
+
+    def __init__(self, name: str, found: object):
+        self.name, self.value, self._found = name, f"package:{name}", found
+
+    def load(self) -> object:
+        if isinstance(self._found, Exception):
+            raise self._found
+        return self._found
+
+
+def test_given_entry_points_then_those_that_can_be_used_are_devices_and_the_others_have_a_reason() -> None:
+    kind = OWN["KIND"]
+    entries = [
+        FakeEntryPoint("speed", kind),
+        FakeEntryPoint("broken", ImportError("no module")),
+        FakeEntryPoint("number", 5),
+        FakeEntryPoint("other_name", kind),
+        FakeEntryPoint("gx1", replace(kind, name="gx1")),
+    ]
+    registry = DeviceRegistry([KINDS["gx1"]], lambda: entries)
+    assert registry["gx1"] is KINDS["gx1"]
+    assert dict(registry) == {"gx1": KINDS["gx1"], "speed": kind}
+    assert registry.plugins == {"speed": kind}
+    assert {name: why[:12] for name, why in registry.problems.items()} == {
+        "broken": "ImportError:",
+        "number": "package:numb",
+        "other_name": "package:othe",
+        "gx1": "there is a d",
+    }
+    assert "nothing" not in registry
 
 
 def test_given_silence_then_it_is_reported_and_ends_with_the_next_speed() -> None:

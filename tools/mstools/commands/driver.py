@@ -162,8 +162,19 @@ def show_ports() -> None:
         typer.echo(escape(f"{port.path:<16} {port.description}") + (f"\n    {escape(port.hint)}" if port.hint else ""))
     for network in list_can_interfaces():
         typer.echo(escape(f"{network:<16} CAN network interface"))
+    show_plugins()
     if not ports:
         typer.echo("no serial port found: is the adapter plugged in? see dmesg for the kernel's messages")
+
+
+def show_plugins() -> None:
+    """Print the kinds of devices of installed packages, and why one of them cannot be used."""
+    from msdrivers.registry import KINDS
+
+    for name, kind in KINDS.plugins.items():
+        typer.echo(escape(f"{name:<16} device of an installed package: {kind.description}"))
+    for name, why in KINDS.problems.items():
+        typer.echo(escape(f"{name:<16} device of an installed package, not usable: {why}"), err=True)
 
 
 def show_drivers(config: Path) -> None:
