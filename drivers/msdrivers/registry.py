@@ -67,7 +67,8 @@ class DeviceKind:
     command_channel: channel of the commands that it accepts, empty for none. faults: kinds of faults of its emulator
     and the meaning of their amounts. follows_samples: the emulator's state comes from samples, not from commands.
     has_memory: the emulator can persist its memory in a file. has_hard_iron: it has a hard-iron calibration.
-    has_z_down: z of its own axes points down when it is mounted upright.
+    has_z_down: z of its own axes points down when it is mounted upright. example: further lines of its section, which
+    it needs.
     """
 
     name: str
@@ -84,6 +85,7 @@ class DeviceKind:
     has_memory: bool = False
     has_hard_iron: bool = False
     has_z_down: bool = False
+    example: tuple[str, ...] = ()
 
 
 def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
@@ -96,6 +98,8 @@ _load_gps = partial(_load, "gps.settings:GpsSettings", "gps.driver:GpsDriver")
 _load_ublox = partial(_load, "ublox:UbloxSettings", "ublox:UbloxDriver")
 _load_vectornav = partial(_load, "vectornav:VectornavSettings", "vectornav:VectornavDriver")
 _load_xsens = partial(_load, "xsens:XsensSettings", "xsens:XsensDriver")
+_load_gpsd = partial(_load, "gpsd:GpsdSettings", "gpsd:GpsdDriver")
+_load_text_imu = partial(_load, "text_imu:TextImuSettings", "text_imu:TextImuDriver")
 _load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
 _load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
 _load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
@@ -122,6 +126,20 @@ def _make_ublox_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     # one series for the receiver before and after a restart
     samples = iter(wanted.samples)
     return FaultInjector(lambda: UbloxEmulator(samples, unit), wanted.faults)
+
+
+def _make_gpsd_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.gpsd import GpsdEmulator
+
+    samples = iter(wanted.samples)
+    return FaultInjector(lambda: GpsdEmulator(samples), wanted.faults)
+
+
+def _make_text_imu_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.text_imu import TextImuEmulator
+
+    samples = iter(wanted.samples)
+    return FaultInjector(lambda: TextImuEmulator(samples, wanted.settings), wanted.faults)
 
 
 def _make_vectornav_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -211,6 +229,7 @@ _KINDS = (
             ("nmea", "receiver that speaks NMEA 0183", 4800),
         )
     ),
+    DeviceKind("gpsd", "gpsd, by its JSON reports", GpsSample, (TcpSettings,), _load_gpsd, _make_gpsd_emulator),
     DeviceKind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
@@ -242,6 +261,26 @@ _KINDS = (
         _load_xsens,
         _make_xsens_emulator,
         115200,
+    ),
+    DeviceKind(
+        "text_imu",
+        "inertial unit that sends lines of text",
+        ImuSample,
+        _BYTE_LINES,
+        _load_text_imu,
+        _make_text_imu_emulator,
+        115200,
+        example=(
+            "columns: 7   # MEASURE: the columns of a line: time, force x y z, rate x y z",
+            "fields:",
+            "  time: {column: 0, scale: 0.001}   # milliseconds",
+            "  specific_force_x: {column: 1, scale: 9.80665}   # g",
+            "  specific_force_y: {column: 2, scale: 9.80665}",
+            "  specific_force_z: {column: 3, scale: 9.80665}",
+            "  angular_velocity_x: {column: 4, scale: 0.0174533}   # degrees per second",
+            "  angular_velocity_y: {column: 5, scale: 0.0174533}",
+            "  angular_velocity_z: {column: 6, scale: 0.0174533}",
+        ),
     ),
     DeviceKind(
         "wheels",

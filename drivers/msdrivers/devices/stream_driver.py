@@ -133,11 +133,12 @@ class StreamDriver(ABC, Generic[M]):
         """Discard incomplete data and ask the device who it is."""
         self._stream.clear()
         self._arrivals.clear()
-        self._first_bytes = b""
         self._on_start()
         # no new status within a search over the baud rates
         searching = self._tried or self._phase is EndpointPhase.SILENT
-        status = [] if searching else self._set_status(EndpointPhase.WAITING, f"waiting for a {self.description}")
+        status = (
+            [] if searching else self._set_status(EndpointPhase.WAITING, f"waiting for an answer: {self.description}")
+        )
         return [*status, *self._identify(now)]
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
@@ -231,7 +232,7 @@ class StreamDriver(ABC, Generic[M]):
 
     def _identify(self, now: HostTime) -> list[Output[bytes]]:
         self._is_identifying, self._steps, self._index, self._attempt = True, (), 0, 1
-        self._seq_at_setup = self._seq
+        self._seq_at_setup, self._first_bytes = self._seq, b""
         self._answer_deadline_ns = now.monotonic_ns + round(self._settings.answer_timeout * SECOND_NS)
         return [Send(self._make_identification())]
 
@@ -279,7 +280,6 @@ class StreamDriver(ABC, Generic[M]):
                 out += self._set_status(EndpointPhase.SILENT, text)
             self._tried = []
         if len(self._bauds) < 2:
-            self._first_bytes = b""
             return [*out, *self._identify(now)]
         self._baud_index = (self._baud_index + 1) % len(self._bauds)
         return [*out, Reopen(f"no {self.description} at {baud} baud, {found}", self._bauds[self._baud_index])]

@@ -12,6 +12,7 @@ import pytest
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Severity
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
+from msdrivers.line_settings import SerialSettings
 from msdrivers.registry import KINDS
 from mstools import cli
 from mstools.commands.check import check_vehicle
@@ -70,10 +71,12 @@ def test_given_a_kind_of_vehicle_then_its_files_are_clean_and_what_must_be_measu
     ],
 )
 def test_given_a_device_then_its_driver_is_configured(option: str, name: str, tmp_path: Path, run: Run) -> None:
-    assert run(tmp_path, "--yes", "--name", "cart", option, f"{name}@/dev/ttyACM7")[0] == 0
-    assert find_problems(tmp_path) == []
-    section: Any = load_config(tmp_path / "vehicle.yaml").drivers[option.removeprefix("--")]
-    assert (section["device"], section["port"]) == (name, "/dev/ttyACM7")
+    section: Any
+    if SerialSettings in KINDS[name].lines:
+        assert run(tmp_path, "--yes", "--name", "cart", option, f"{name}@/dev/ttyACM7")[0] == 0
+        assert find_problems(tmp_path) == []
+        section = load_config(tmp_path / "vehicle.yaml").drivers[option.removeprefix("--")]
+        assert (section["device"], section["port"]) == (name, "/dev/ttyACM7")
     if option == "--gps":
         assert run(tmp_path, "--yes", "--name", "cart", option, f"{name}@10.0.0.7:3001", "--force")[0] == 0
         section = load_config(tmp_path / "vehicle.yaml").drivers["gps"]

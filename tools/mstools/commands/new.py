@@ -36,7 +36,8 @@ from mstools.terminal.output import escape, print_problems, write_file
 NONE: Final = "none"
 """Answer for a device that is not there."""
 
-DEFAULT_PORT, DEFAULT_ADDRESS = "/dev/ttyUSB{}", "192.168.1.20:502"
+DEFAULT_PORT, DEFAULT_ADDRESS = "/dev/ttyUSB{}", "127.0.0.1:2947"
+"""Lines of devices where this machine has none: gpsd has this address."""
 
 DEFAULT_GPS, DEFAULT_IMU, DEFAULT_CAN = "ublox", "gx1", "can0"
 

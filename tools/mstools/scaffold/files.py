@@ -167,6 +167,7 @@ def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
             yield f"  {name}:   # {device.kind.description}"
             yield f"    device: {device.kind.name}"
             yield f"    {device.line_key}: {_quote(device.line)}   # {MARK}: its line on this machine"
+            yield from (f"    {line}" for line in device.kind.example)
     if vehicle.wheels is not None:
         yield f"  wheels:   # {vehicle.wheels.kind.description}"
         yield f"    device: {vehicle.wheels.kind.name}"

@@ -1,0 +1,139 @@
+"""Driver of gpsd: publishes the fixes of the receiver that gpsd reads.
+
+A TPV report is a fix. The standard deviations are those of a GST report of the same instant, which gpsd passes on from
+the receiver; its own error estimates (epx, epy, epv) are of an unstated certainty and are not used. Without GST the
+dilution of the last SKY report is published, from which the filter computes the sigma.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from modelserver.messages import NAN, FixType, GpsSample
+from msdrivers.devices.gps.fixes import course_from_track, to_covariance
+from msdrivers.devices.ranges import check_ranges
+from msdrivers.devices.stream_driver import SECOND_NS, StreamDriver, check_stream_settings
+from msdrivers.endpoint import HostTime, Output
+from msdrivers.protocol.gpsd import WATCH, GpsdReport, GpsdStream
+
+
+@dataclass(frozen=True, slots=True)
+class GpsdSettings:
+    """Settings of gpsd. Raises ValueError with the key for an invalid value."""
+
+    source: str
+    receiver: str = ""
+    """Path of the receiver at gpsd's machine, e.g. /dev/ttyACM0, where gpsd has several; empty: all."""
+    hold: float = 0.02
+    """How long a fix waits for its GST report, seconds."""
+    silence: float = 5.0
+    """Timeout for fixes, seconds, after which gpsd is asked again."""
+    answer_timeout: float = 2.0
+    """Timeout for gpsd's answer, seconds."""
+    attempts: int = 2
+    """How often gpsd is asked."""
+    delay: float = 0.0
+    """Shortest time from a fix to its report, seconds; it cannot be distinguished from the offset of the clocks."""
+    delay_sigma: float = 0.05
+    """Its standard deviation, seconds."""
+
+    def __post_init__(self) -> None:
+        check_stream_settings(self)
+        check_ranges(self, hold=(0.0, 2.0))
+
+    @property
+    def bauds(self) -> tuple[int, ...]:
+        """None: gpsd owns the receiver's line."""
+        return ()
+
+
+class GpsdDriver(StreamDriver[GpsdReport]):
+    """An `Endpoint` of bytes at gpsd's TCP port; see `GpsdSettings`.
+
+    Further counts: `repeated` instants, `other_receiver`.
+    """
+
+    device = "gpsd"
+    description = "gpsd"
+    awaited = "TPV"
+
+    def __init__(self, settings: GpsdSettings) -> None:
+        super().__init__(settings, GpsdStream())
+        self._receiver, self._hold_ns = settings.receiver, round(settings.hold * SECOND_NS)
+        self._pending: tuple[GpsdReport, int, int] | None = None
+        self._gst: GpsdReport | None = None
+        self._sky: GpsdReport | None = None
+        self._last_utime = 0
+
+    def _make_identification(self) -> bytes:
+        return WATCH
+
+    def _on_start(self) -> None:
+        self._pending = self._gst = self._sky = None
+
+    def _get_extra_deadline(self) -> int | None:
+        return None if self._pending is None else self._pending[2]
+
+    def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
+        return self._release(now)
+
+    def _on_message(self, message: GpsdReport, now: HostTime) -> list[Output[bytes]]:
+        if message.name == "WATCH":
+            return self._on_identity("gpsd", (), now)
+        receiver = message.fields.get("device")
+        if self._receiver and isinstance(receiver, str) and receiver != self._receiver:
+            self._counts["other_receiver"] += 1
+            return []
+        if message.name == "SKY":
+            # reports of some receivers have the satellites only
+            if math.isfinite(message.get_number("hdop")):
+                self._sky = message
+        elif message.name == "GST":
+            self._gst = message
+            if self._pending is not None and self._pending[0].utime == message.utime:
+                return self._release(now)
+        elif message.name == "TPV":
+            out = self._release(now)
+            utime = message.utime
+            if utime and utime == self._last_utime:
+                self._counts["repeated"] += 1
+                return out
+            self._last_utime = utime
+            self._pending = (message, self._find_arrival(message.start, now), now.monotonic_ns + self._hold_ns)
+            return out + (self._release(now) if self._gst is not None and self._gst.utime == utime else [])
+        return []
+
+    def _release(self, now: HostTime) -> list[Output[bytes]]:
+        """Publish the pending fix."""
+        if self._pending is None:
+            return []
+        (tpv, host_utime, _), self._pending = self._pending, None
+        fix_type, get = tpv.fix_type, tpv.get_number
+        latitude, longitude = get("lat"), get("lon")
+        has_place = math.isfinite(latitude) and math.isfinite(longitude)
+        east, north, down = get("velE"), get("velN"), get("velD")
+        has_velocity = math.isfinite(east + north + down)
+        speed, track = get("speed"), get("track")
+        sky, gst = self._sky, self._gst
+        covariance = None
+        if gst is not None and gst.utime == tpv.utime:
+            covariance = to_covariance(gst.get_number("lon"), gst.get_number("lat"), gst.get_number("alt"))
+        sample = GpsSample(
+            self._make_header(host_utime, tpv.utime),
+            fix_type if has_place else FixType.NONE,
+            latitude,
+            longitude,
+            height_ellipsoidal=get("altHAE"),
+            height_msl=get("altMSL"),
+            undulation=get("geoidSep"),
+            satellites=-1 if sky is None or not math.isfinite(sky.get_number("uSat")) else int(sky.get_number("uSat")),
+            hdop=NAN if sky is None else sky.get_number("hdop"),
+            vdop=NAN if sky is None else sky.get_number("vdop"),
+            pdop=NAN if sky is None else sky.get_number("pdop"),
+            position_covariance=covariance,
+            velocity=(east, north, -down) if has_velocity else None,
+            speed=speed,
+            course=course_from_track(track),
+        )
+        return self._publish(sample, now)

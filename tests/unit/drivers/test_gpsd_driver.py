@@ -1,0 +1,102 @@
+"""gpsd as a source of fixes: reports, sigmas, several receivers, and what goes wrong on a line."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support_gps import START, Line, drive, split_in_half, split_randomly
+
+from modelserver.messages import FixType
+from msdrivers.devices.gpsd import GpsdDriver, GpsdSettings
+from msdrivers.emulate.gpsd import GpsdEmulator
+from msdrivers.endpoint import EndpointPhase
+from msdrivers.protocol.gpsd import GpsdStream
+
+
+def connect(seconds: float = 30.0, has_gst: bool = True, **more: object) -> Line:
+    device = GpsdEmulator(drive(seconds, 5.0), has_gst=has_gst)
+    return Line(GpsdDriver(GpsdSettings("gps")), device, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("has_gst", [True, False])
+def test_given_gpsd_then_each_fix_is_published_as_it_was_measured(has_gst: bool) -> None:
+    line = connect(has_gst=has_gst).open().run(10.0)
+    assert line.status_text.splitlines()[-1] == "streaming: gpsd, receiving TPV"
+    assert len(line.samples) >= 48
+    truth = {each.header.utime: each for each in drive(30.0, 5.0)}
+    for sample in line.samples:
+        same = truth[sample.header.device_utime]
+        assert (sample.fix_type, sample.hdop, sample.satellites) == (same.fix_type, same.hdop, 9)
+        assert (sample.latitude_deg, sample.longitude_deg) == (same.latitude_deg, same.longitude_deg)
+        assert (sample.height_ellipsoidal, sample.undulation) == (same.height_ellipsoidal, same.undulation)
+        assert sample.velocity == pytest.approx(same.velocity)
+        assert sample.course == pytest.approx(math.pi / 4)
+        if has_gst:
+            assert sample.position_covariance == pytest.approx(same.position_covariance)
+        else:
+            assert sample.position_covariance is None
+        assert 0 <= sample.header.host_utime - sample.header.device_utime < 60_000
+
+
+@pytest.mark.parametrize("fix_type", FixType)
+def test_given_a_type_of_fix_then_it_is_published(fix_type: FixType) -> None:
+    line = Line(GpsdDriver(GpsdSettings("gps")), GpsdEmulator(drive(8.0, 5.0, fix_type))).open().run(6.0)
+    assert {each.fix_type for each in line.samples} == {fix_type}
+
+
+def test_given_several_receivers_then_only_the_chosen_one_is_used() -> None:
+    for receiver, count in (("/dev/ttyACM0", 2), ("/dev/ttyUSB9", 0)):
+        line = Line(GpsdDriver(GpsdSettings("gps", receiver=receiver)), GpsdEmulator(()))
+        line.open()
+        for second in range(2):
+            report = {"class": "TPV", "device": "/dev/ttyACM0", "mode": 3, "lat": 50.0, "lon": 8.0}
+            line.deliver(json.dumps(report | {"time": f"2027-01-15T08:00:0{second}.000Z"}).encode() + b"\n")
+            line.run(0.1)
+        assert len(line.samples) == count
+
+
+@pytest.mark.parametrize("to_host", [split_in_half, lambda data: split_randomly(data, len(data))])
+def test_given_split_bytes_then_every_fix_is_published(to_host: object) -> None:
+    line = connect(to_host=to_host).open().run(25.0)
+    assert len(line.samples) >= 120
+    stamps = [each.header.device_utime for each in line.samples]
+    assert stamps == sorted(set(stamps))
+
+
+def test_given_gpsd_that_was_away_when_it_is_back_then_fixes_are_published_again() -> None:
+    line = connect(120.0).open().run(5.0)
+    line.is_broken = True
+    line.run(30.0)
+    assert "no gpsd answers on this line: received nothing" in line.status_text
+    line.is_broken = False
+    line.run(30.0)
+    assert line.phases[-1] is EndpointPhase.STREAMING
+    assert line.samples[-1].header.device_utime > START + 60_000_000
+    assert not line.reopens
+
+
+def test_given_fields_that_are_none_then_they_are_not_known() -> None:
+    line = Line(GpsdDriver(GpsdSettings("gps")), GpsdEmulator(()))
+    line.open()
+    line.deliver(
+        b'{"class":"TPV","mode":3,"lat":"fifty","lon":8,"time":"soon","status":"x"}\n'
+        b'{"class":"TPV","mode":3,"lat":1e999,"lon":NaN,"time":5}\n'
+        b'[1,2]\n{"class":5}\n{"class":"TPV"\n'
+    )
+    line.run(0.1)
+    assert [each.fix_type for each in line.samples] == [FixType.NONE, FixType.NONE]
+    assert all(each.header.device_utime == 0 for each in line.samples)
+    assert line.driver.counts["rejected.json"] >= 1
+
+
+@given(st.binary(max_size=300), st.integers(0, 100))
+def test_given_any_bytes_then_nothing_is_raised_and_pieces_give_the_same(data: bytes, seed: int) -> None:
+    data += b'\n{"class":"TPV","mode":1}\n'
+    stream, whole = GpsdStream(), GpsdStream().feed(data)
+    pieces = [each for piece in split_randomly(data, seed) for each in stream.feed(piece)]
+    assert pieces == whole
+    assert whole[-1].name == "TPV"
