@@ -84,6 +84,32 @@ class ModbusSettings:
         return f"Modbus {self.address}, unit {self.unit_id}"
 
 
+@dataclass(frozen=True, slots=True)
+class NtripSettings:
+    """A caster and its mountpoint. Raises ValueError for an invalid value."""
+
+    caster: str
+    """`HOST:PORT` of the caster; the port is customarily 2101."""
+    mountpoint: str
+    """Name of the stream."""
+    user: str = ""
+    """User name; empty for none."""
+    password: str = ""
+    """Password."""
+    gga_period: float = 0.0
+    """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; 0: none."""
+
+    def __post_init__(self) -> None:
+        try:
+            split_address(self.caster)
+        except ValueError:
+            raise ValueError(f"caster is HOST:PORT, e.g. rtk.example.org:2101, got {quote(self.caster)}") from None
+        if not self.mountpoint or not self.mountpoint.isprintable() or set(self.mountpoint) & set(" /\r\n"):
+            raise ValueError(f"mountpoint is the name of a stream, got {quote(self.mountpoint)}")
+        if not (self.gga_period == 0.0 or 1.0 <= self.gga_period <= 3600.0):
+            raise ValueError(f"gga_period is 0 or 1 to 3600 s, got {self.gga_period:g}")
+
+
 LineSettings: TypeAlias = SerialSettings | TcpSettings | CanSettings | ModbusSettings
 
 

@@ -68,7 +68,7 @@ class DeviceKind:
     and the meaning of their amounts. follows_samples: the emulator's state comes from samples, not from commands.
     has_memory: the emulator can persist its memory in a file. has_hard_iron: it has a hard-iron calibration.
     has_z_down: z of its own axes points down when it is mounted upright. example: further lines of its section, which
-    it needs.
+    it needs. takes_corrections: what it gets on its line may be corrections for it (RTCM).
     """
 
     name: str
@@ -86,6 +86,7 @@ class DeviceKind:
     has_hard_iron: bool = False
     has_z_down: bool = False
     example: tuple[str, ...] = ()
+    takes_corrections: bool = False
 
 
 def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
@@ -221,9 +222,20 @@ _KINDS = (
         _load_ublox,
         _make_ublox_emulator,
         38400,
+        takes_corrections=True,
     ),
     *(
-        DeviceKind(name, text, GpsSample, _BYTE_LINES, _load_gps, _make_gps_emulator, baud, presets={"protocol": name})
+        DeviceKind(
+            name,
+            text,
+            GpsSample,
+            _BYTE_LINES,
+            _load_gps,
+            _make_gps_emulator,
+            baud,
+            presets={"protocol": name},
+            takes_corrections=True,
+        )
         for name, text, baud in (
             ("novatel", "NovAtel OEM4 and heirs", 9600),
             ("nmea", "receiver that speaks NMEA 0183", 4800),

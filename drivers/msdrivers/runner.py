@@ -192,6 +192,13 @@ class Runner(Generic[U]):
         """Let the endpoint count and report a malformed command."""
         self._dispatch_command(lambda endpoint, now: endpoint.reject_command(reason, text, now))
 
+    def send_unit(self, unit: U) -> None:
+        """Send a unit to the device, such as corrections; it is dropped and counted if the line is closed."""
+        if not self._is_open:
+            self.counts["units_dropped"] += 1
+            return
+        self._execute_guarded("send", lambda: [Send(unit)])
+
     def _dispatch_command(self, call: Callable[[CommandableEndpoint[U], HostTime], Sequence[Output[U]]]) -> None:
         endpoint = self._endpoint
         if not self._is_open or not isinstance(endpoint, CommandableEndpoint):

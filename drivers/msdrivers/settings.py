@@ -19,7 +19,7 @@ from typing import Any, get_args
 
 from modelserver.config.reader import Path_, SettingsReader, find_renamed_key, get_value, list_known_keys
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
-from msdrivers.line_settings import LineSettings, TcpSettings, get_line_key
+from msdrivers.line_settings import LineSettings, NtripSettings, TcpSettings, get_line_key
 from msdrivers.registry import KINDS, DeviceKind
 
 _LIST_ERRORS = ("tuple_type", "list_type")
@@ -247,7 +247,7 @@ class SourceMap:
 class DriverSettings:
     """A driver: its name, its kind, its line, the settings of its station; `channel` empty: that of the sensor.
 
-    `place` is where they were read from.
+    `source_map` is where they were read from; `ntrip` the caster of its corrections, None for none.
     """
 
     name: str
@@ -256,6 +256,7 @@ class DriverSettings:
     device_settings: Any
     channel: str = ""
     source_map: SourceMap = field(default=SourceMap(), compare=False, repr=False)
+    ntrip: NtripSettings | None = None
 
 
 def read_drivers(
@@ -294,7 +295,7 @@ def read_driver(
     kind = reader.read_kind(kinds)
     settings = kind.load().settings
     station_keys = [key for key in list_keys(settings) if key != SOURCE_FIELD and key not in kind.presets]
-    more = [*list_keys(_CommonKeys), *station_keys]
+    more = [*COMMON_KEYS, *([NTRIP_FIELD] if kind.takes_corrections else []), *station_keys]
     line = reader.read_line_type(kind, more)
     reader.report_unknown_keys(kind, line, more)
     line_values = reader.read_values(line)
@@ -311,7 +312,7 @@ def read_driver(
     common = reader.read_values(_CommonKeys)
     if reader.problems:
         raise ConfigError(reader.problems)
-    return DriverSettings(name, kind, line_values, values, common.channel, source_map)
+    return DriverSettings(name, kind, line_values, values, common.channel, source_map, common.ntrip)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +321,11 @@ class _CommonKeys:
 
     device: str = ""
     channel: str = ""
+    ntrip: NtripSettings | None = None
 
 
-COMMON_KEYS = tuple(list_keys(_CommonKeys))
+NTRIP_FIELD = "ntrip"
+"""Key of the corrections, for receivers that take them."""
+
+COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
 """Keys that every driver has."""

@@ -29,6 +29,7 @@ from mstools.terminal.output import escape, print_problems
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
+    from modelserver.messages import Sample
     from modelserver.server.supervision.systemd import Notifier
     from msdrivers.links import Link
     from msdrivers.raw_log import TimeSource
@@ -293,16 +294,28 @@ def run(
     if kind.command_channel:
         options = replace(options, poll_timeout=COMMAND_POLL_S)
     time_source = SystemTimeSource()
-    runner = Runner(station, link, options, time_source, publisher.publish_sample, publisher.publish_health)
+    publish: Callable[[Sample], object] = publisher.publish_sample
+    corrections = None
+    if settings.ntrip is not None:
+        from msdrivers.corrections import CorrectionsClient
+
+        corrections = CorrectionsClient(settings.ntrip, settings.name)
+        publish = corrections.wrap_publish(publish)
+    runner = Runner(station, link, options, time_source, publish, publisher.publish_health)
     attend: Callable[[], object] = lambda: None  # noqa: E731
     if kind.command_channel:
         attend = subscribe_commands(bus, vehicle, kind.command_channel, runner, time_source)
+    if corrections is not None:
+        attend = corrections.feed_runner(runner)
+        corrections.start()
     stop_on_signal(runner)
     notifier = Notifier.from_environment()
     try:
         runner.run(DriverSupervision(runner, notifier).wrap_callback(attend))
     finally:
         notifier.notify_stopping()
+        if corrections is not None:
+            corrections.stop()
 
 
 def stop_on_signal(runner: Runner[Any]) -> None:

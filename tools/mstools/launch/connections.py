@@ -75,6 +75,8 @@ def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedC
 
 def _redirect_driver(driver: dict[str, Any], port: Path, bus: str, held: contextlib.ExitStack) -> tuple[str, ...]:
     """Change a driver's connection; return the options of its emulator."""
+    # no corrections from a network for an emulated receiver
+    driver.pop("ntrip", None)
     if "can" in driver:
         driver |= {"can": bus, "interface": "udp_multicast"}
         return ("--can", bus)
