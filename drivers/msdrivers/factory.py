@@ -173,10 +173,14 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
 
 
 def find_unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Iterator[Problem]:
-    """Yield a joint that is no constraint of the geometry."""
-    joint = getattr(driver.device_settings, "joint", "")
-    if joint and joint not in constraints:
+    """Yield the joints that are no constraints of the geometry."""
+    settings = driver.device_settings
+    places = {joint: ("joint",) for joint in [getattr(settings, "joint", "")] if joint}
+    places |= {joint: ("joints", joint) for joint in getattr(settings, "joints", ())}
+    for joint, place in places.items():
+        if joint in constraints:
+            continue
         what = f"the geometry has no constraint {quote(joint)}: what is measured of this joint moves nothing"
         near = suggest_name(joint, constraints)
         fix = f"write {near[0]}" if near else f"known: {', '.join(list(constraints)[:10]) or 'none'}"
-        yield Problem(Severity.WARNING, what, driver.source_map.locate("drivers", driver.name, "joint"), fix, near)
+        yield Problem(Severity.WARNING, what, driver.source_map.locate("drivers", driver.name, *place), fix, near)

@@ -101,6 +101,7 @@ _load_vectornav = partial(_load, "vectornav:VectornavSettings", "vectornav:Vecto
 _load_xsens = partial(_load, "xsens:XsensSettings", "xsens:XsensDriver")
 _load_gpsd = partial(_load, "gpsd:GpsdSettings", "gpsd:GpsdDriver")
 _load_text_imu = partial(_load, "text_imu:TextImuSettings", "text_imu:TextImuDriver")
+_load_text_joints = partial(_load, "text_joints:TextJointsSettings", "text_joints:TextJointsDriver")
 _load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
 _load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
 _load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
@@ -141,6 +142,12 @@ def _make_text_imu_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
     samples = iter(wanted.samples)
     return FaultInjector(lambda: TextImuEmulator(samples, wanted.settings), wanted.faults)
+
+
+def _make_text_joints_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.text_joints import TextJointsEmulator
+
+    return FaultInjector(lambda: TextJointsEmulator(wanted.settings), wanted.faults)
 
 
 def _make_vectornav_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -312,6 +319,16 @@ _KINDS = (
         _make_vehicle_emulator,
         command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
+    ),
+    DeviceKind(
+        "text_joints",
+        "pan-tilt head or other joints that send lines of text",
+        JointsSample,
+        _BYTE_LINES,
+        _load_text_joints,
+        _make_text_joints_emulator,
+        115200,
+        follows_samples=False,
     ),
     DeviceKind(
         "axis",

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from functools import reduce
-from operator import xor
 
 from modelserver.messages import ImuSample
 from msdrivers.endpoint import HostTime, Output, Send
-from msdrivers.protocol.text_lines import LineDescription
+from msdrivers.protocol.text_lines import LineDescription, encode_line
 
 CELSIUS = 25.0
 
@@ -58,16 +56,8 @@ class TextImuEmulator:
 
     def _encode(self, sample: ImuSample) -> bytes:
         self._first_utime = sample.header.utime if self._first_utime is None else self._first_utime
-        settings, columns = self._settings, ["0"] * self._settings.columns
-        for name, each in settings.fields.items():
-            value = self._get_value(sample, name)
-            columns[each.column] = f"{(value - each.offset) / each.scale:.9g}"
-        if settings.starts_with:
-            columns[0] = settings.starts_with
-        text = (settings.separator or " ").join(columns)
-        if settings.checksum == "xor":
-            text = f"{text}*{reduce(xor, text.removeprefix('$').encode(), 0):02X}"
-        return f"{text}\r\n".encode()
+        values = {name: self._get_value(sample, name) for name in self._settings.fields}
+        return encode_line(self._settings, values)
 
     def _get_value(self, sample: ImuSample, name: str) -> float:
         assert self._first_utime is not None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import xor
 from typing import Final, Protocol
 
 from msdrivers.protocol.can.mapping import Strict, check_factor
@@ -78,3 +80,16 @@ class LineReader:
                     lines.append((self._buffer.rstrip(b"\r"), self._first_utime))
                 self._buffer, self._is_first = b"", False
         return lines
+
+
+def encode_line(description: LineDescription, values: Mapping[str, float]) -> bytes:
+    """Return the line of some fields in SI units; columns without a field are 0."""
+    columns = ["0"] * description.columns
+    for name, each in description.fields.items():
+        columns[each.column] = f"{(values[name] - each.offset) / each.scale:.9g}"
+    if description.starts_with:
+        columns[0] = description.starts_with
+    text = (description.separator or " ").join(columns)
+    if description.checksum == "xor":
+        text = f"{text}*{reduce(xor, text.removeprefix('$').encode(), 0):02X}"
+    return f"{text}\r\n".encode()

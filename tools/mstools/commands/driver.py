@@ -228,7 +228,8 @@ def load_driver(
 
 def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
     """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
-    constraints = constraints_of(vehicle) if hasattr(settings.device_settings, "joint") else None
+    has_joints = any(hasattr(settings.device_settings, name) for name in ("joint", "joints"))
+    constraints = constraints_of(vehicle) if has_joints else None
     for problem in find_misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 

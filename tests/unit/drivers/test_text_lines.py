@@ -1,4 +1,4 @@
-"""An inertial unit that sends lines of text: columns, factors, checksums, and lines that are not used."""
+"""Devices that send lines of text: columns, factors, checksums, and lines that are not used."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_gps import START, Line, split_in_half, split_randomly
 
+from modelserver.errors import ConfigError
 from msdrivers.devices.text_imu import TextImuDriver, TextImuSettings
+from msdrivers.devices.text_joints import TextJointsDriver, TextJointsSettings
 from msdrivers.emulate.text_imu import TextImuEmulator
+from msdrivers.emulate.text_joints import TextJointsEmulator
 from msdrivers.endpoint import EndpointPhase
+from msdrivers.factory import find_unknown_joint
 from msdrivers.protocol.text_lines import MAX_LINE, ColumnMap
 from msdrivers.settings import read_driver
 from tests.unit.drivers.test_imu_units import turn
@@ -152,3 +156,43 @@ def test_given_any_bytes_then_nothing_is_raised(data: bytes, seed: int) -> None:
     for piece in split_randomly(data, seed):
         line.deliver(piece)
     assert sum(line.driver.counts.values()) >= 0
+
+
+# --- joints ---------------------------------------------------------------------------------------------------
+
+JOINTS = {"Pan": ColumnMap(0, DEGREE), "Tilt": ColumnMap(2, -DEGREE, 0.1)}
+
+
+def make_joints(**more: Any) -> TextJointsSettings:
+    return TextJointsSettings(**{"source": "head", "joints": JOINTS, "columns": 3, "separator": "", **more})
+
+
+@pytest.mark.parametrize("time", [None, ColumnMap(3, 1e-3)])
+def test_given_a_pan_tilt_head_then_its_joints_are_published_as_they_sweep(time: ColumnMap | None) -> None:
+    settings = make_joints(time=time, columns=4, sigma=0.001)
+    emulator = TextJointsEmulator(settings)
+    line = Line(TextJointsDriver(settings), emulator).open().run(10.0)
+    assert 490 <= len(line.samples) <= 500
+    for sample in line.samples[::25]:
+        values = emulator.get_values((sample.header.host_utime - START) * 1e-6)
+        for joint in sample.joints:
+            assert joint.position == pytest.approx(values[joint.name], abs=1e-6)
+            assert joint.position_sigma == 0.001
+        assert [each.name for each in sample.joints] == ["Pan", "Tilt"]
+        assert (sample.header.device_utime > 0) == (time is not None)
+
+
+def test_given_wrong_joints_then_the_error_names_them() -> None:
+    for more, words in (
+        ({"joints": {}}, "1 to 64 joints"),
+        ({"columns": 2}, "Tilt is in column 2"),
+        ({"sigma": -1.0}, "sigma"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make_joints(**more)
+    joints = {"Pann": {"column": 0}, "Tilt": {"column": 1}}
+    section = {"device": "text_joints", "port": "/dev/ttyUSB3", "columns": 2, "joints": joints}
+    (problem,) = find_unknown_joint(read_driver("head", section), ["Pan", "Tilt"])
+    assert (problem.nearest, problem.fix) == (("Pan",), "write Pan")
+    with pytest.raises(ConfigError, match="joints"):
+        read_driver("head", {key: value for key, value in section.items() if key != "joints"})
