@@ -24,8 +24,8 @@ OTHER = os.environ.get("MODELSERVER_OTHER_PYTHON", "")
 pytestmark = pytest.mark.skipif(not OTHER, reason="MODELSERVER_OTHER_PYTHON names no second interpreter")
 
 WRITE = (
-    "import sys; from pathlib import Path; from support_journal import OPEN, Kept; "
-    "kept = Kept(Path(sys.argv[1]), OPEN); kept.drive(6.0); kept.finish()"
+    "import sys; from pathlib import Path; from support_journal import OPEN, JournalRig; "
+    "rig = JournalRig(Path(sys.argv[1]), OPEN); rig.drive(6.0); rig.finish()"
 )
 
 
