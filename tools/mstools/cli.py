@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated
@@ -49,6 +50,9 @@ COMMANDS = {
 """Subcommands with their summary. `import-bag` is function `command` of module `mstools.commands.import_bag`; a command
 with subcommands of its own has a Typer application there instead."""
 
+COMPLETION_VARIABLE = "_MODELSERVER_COMPLETE"
+"""Environment variable with which a shell asks for completions."""
+
 _ALIASES = {
     "new": "init create template",
     "up": "launch all",
@@ -75,6 +79,10 @@ COMMAND_ALIASES = {alias: name for name, aliases in _ALIASES.items() for alias i
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if COMPLETION_VARIABLE in os.environ:
+        # a shell asks what may follow its words, the first of which is this program
+        words = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
+        build_app(words.split()[1:])(prog_name="modelserver")
     _check_command(_command_of(arguments))
     try:
         build_app(arguments)(arguments, prog_name="modelserver")
@@ -98,7 +106,7 @@ def build_app(arguments: Sequence[str]) -> typer.Typer:
     app = typer.Typer(
         help="Where is A relative to B, now or at time t, and with which uncertainty?",
         epilog="Start with: modelserver demo, then modelserver new",
-        add_completion=False,
+        add_completion=True,
         no_args_is_help=True,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,

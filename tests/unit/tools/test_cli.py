@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mstools.cli import COMMAND_ALIASES, COMMANDS, main
+from mstools.cli import COMMAND_ALIASES, COMMANDS, COMPLETION_VARIABLE, main
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,24 @@ def test_given_a_log_that_there_is_not_then_those_there_are_are_reported(
 def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -> None:
     assert set(COMMAND_ALIASES.values()) <= COMMANDS.keys()
     assert not COMMAND_ALIASES.keys() & COMMANDS.keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("modelserver qu", ["query"]),
+        ("modelserver query --exp", ["--explain", "--expressed-in"]),
+        ("modelserver up --em", ["--emulate"]),
+        ("modelserver key n", ["new"]),
+        ("modelserver xyzzy --a", []),
+    ],
+)
+def test_given_a_shell_that_completes_then_commands_and_their_options_are_offered(
+    words: str, expected: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert (ended.value.code, capsys.readouterr().out.split()) == (0, expected)
