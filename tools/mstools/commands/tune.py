@@ -266,13 +266,11 @@ def _open_pool(
     try:
         yield lambda jobs: [future.result() for future in _submit(pool, jobs)]
     except BaseException:
-        # running jobs take seconds and are useless now; the pool forgets its workers at shutdown
-        workers = list((getattr(pool, "_processes", None) or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for each in workers:
+        # running jobs take seconds and are useless now. Without workers the pool's thread ends at once; it must have
+        # ended before Python wakes the threads of all pools at exit
+        for each in list((getattr(pool, "_processes", None) or {}).values()):
             each.terminate()
-        for each in workers:
-            each.join()
+        pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
 
