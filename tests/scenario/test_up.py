@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -166,10 +167,16 @@ def test_given_an_installed_device_then_it_is_found_checked_emulated_and_fused(
     process = start_up(cart, lcm_url, "--emulate")
     try:
         text_until(process, r" *up \| pose valid")
-        status = json.loads(invoke(lcm_url, "status", "--json").stdout)
+        deadline = time.monotonic() + TIMEOUT_S
+        while not count_used(lcm_url, "sensor:radar"):
+            assert time.monotonic() < deadline, "no measurement of the radar was used"
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)
         close(process)
-    (radar,) = (each for each in status["channels"] if each["channel"] == "sensor:radar")
-    assert radar["used"] > 0
+
+
+def count_used(url: str, source: str) -> int:
+    """Return how many measurements of a source the service has used by its next report."""
+    status = json.loads(invoke(url, "status", "--json").stdout)
+    return sum(each["used"] for each in status["channels"] if each["channel"] == source)
