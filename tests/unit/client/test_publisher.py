@@ -123,7 +123,7 @@ def test_given_a_time_then_it_is_that_instant(time: Any) -> None:
     assert to_utime(time) == AT
 
 
-@pytest.mark.parametrize("time", [datetime(2027, 1, 15), 1.8e9, True, "2027", None, np.datetime64("NaT")])
+@pytest.mark.parametrize("time", [datetime(2027, 1, 15), 1.8e9, True, "2027", None, np.datetime64("NaT", "us")])
 def test_given_what_is_no_instant_then_it_is_rejected(time: Any) -> None:
     with pytest.raises(MalformedRequestError):
         to_utime(time)
