@@ -115,10 +115,11 @@ class CorrectionsClient:
         """Receive until the connection ends. Raises OSError, NtripError."""
         settings = self._settings
         host, port = split_address(settings.caster)
-        session = NtripSession(NtripRequest(host, settings.mountpoint, settings.user, settings.password))
+        request = NtripRequest(host, settings.mountpoint, settings.user, settings.password)
+        session = NtripSession(request)
         with contextlib.closing(socket.create_connection((host, port), CONNECT_TIMEOUT_S)) as connection:
             self._counts["connects"] += 1
-            connection.sendall(NtripRequest(host, settings.mountpoint, settings.user, settings.password).encode())
+            connection.sendall(request.encode())
             connection.settimeout(POLL_S)
             last_s, gga_s = self._monotonic(), -1e9
             while not self._is_stopping.is_set():

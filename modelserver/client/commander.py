@@ -10,6 +10,7 @@ from typing import Self
 
 import lcm
 
+from modelserver.client.publisher import check_source
 from modelserver.client.remote import load_signer
 from modelserver.messages import VehicleCommand
 from modelserver.wire.channels import DRIVE_SIGNED
@@ -38,8 +39,7 @@ class VehicleCommander:
     """
 
     def __init__(self, source: str, *, url: str = "", channel_prefix: str = "", key_file: str | os.PathLike[str] = ""):
-        if not source or len(source) > 64 or not source.isprintable():
-            raise ValueError(f"source is the name of the program, 1 to 64 printable characters, got {source!r}")
+        check_source(source, "program")
         self._source, self._prefix, self._seq = source, channel_prefix, 0
         self._signer = load_signer(os.fspath(key_file), channel_prefix, source)
         self._bus: lcm.LCM | None = open_lcm(resolve_url(url))

@@ -45,6 +45,12 @@ CHANNELS: Final = {"gps": "GPS", "imu": "IMU", "wheels": "WHEELS", "joints": "JO
 """Channel of each kind of sample, where the vehicle file names no other."""
 
 
+def check_source(source: str, what: str) -> None:
+    """Raise ValueError unless the name of a device or program can be sent."""
+    if not source or len(source) > 64 or not source.isprintable():
+        raise ValueError(f"source is the name of the {what}, 1 to 64 printable characters, got {source!r}")
+
+
 class SensorPublisher:
     """Publish samples of a device of one's own.
 
@@ -70,8 +76,7 @@ class SensorPublisher:
     def __init__(
         self, source: str, *, url: str = "", channel_prefix: str = "", channels: Mapping[str, str] | None = None
     ):
-        if not source or len(source) > 64 or not source.isprintable():
-            raise ValueError(f"source is the name of the device, 1 to 64 printable characters, got {source!r}")
+        check_source(source, "device")
         if unknown := set(channels or {}) - set(CHANNELS):
             raise ValueError(f"channels has the kinds {', '.join(CHANNELS)}, got {', '.join(sorted(unknown))}")
         self.source = source

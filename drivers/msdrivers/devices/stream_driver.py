@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from modelserver.messages import Sample, SensorHeader
+from modelserver.transforms.so3 import Vector3
 from msdrivers.devices.ranges import check_ranges
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.framing import FrameScanner
@@ -216,6 +217,15 @@ class StreamDriver(ABC, Generic[M]):
         if self._answer_deadline_ns is None and self._phase is not EndpointPhase.STREAMING:
             out += self._set_status(EndpointPhase.STREAMING, f"{self._product or 'a device'}, receiving {self.awaited}")
         return out
+
+    def _read_vector(self, values: tuple[float, ...] | None, most: float, scale: float = 1.0) -> Vector3 | None:
+        """Return a vector in SI units; None for one that is not measured, or beyond `most` in the device's unit."""
+        if values is None:
+            return None
+        if not all(abs(each) <= most for each in values):
+            self._counts["rejected.range"] += 1
+            return None
+        return (values[0] * scale, values[1] * scale, values[2] * scale)
 
     def _find_arrival(self, start: int, now: HostTime) -> int:
         """Return when the first byte of a message was received, utime; `start` is its offset in the stream."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.so3 import Quaternion
 from msdrivers.devices.ranges import check_ranges
 from msdrivers.devices.stream_driver import StreamDriver, check_stream_settings
 from msdrivers.endpoint import HostTime, Output
@@ -106,24 +106,15 @@ class VectornavDriver(StreamDriver[VnMessage]):
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
             ),
-            angular_velocity=self._check(rate, MAX_RATE),
-            specific_force=self._check(force, MAX_ACCELERATION),
-            magnetic_field=self._check(magnetic, MAX_ACCELERATION, vn.GAUSS),
+            angular_velocity=self._read_vector(rate, MAX_RATE),
+            specific_force=self._read_vector(force, MAX_ACCELERATION),
+            magnetic_field=self._read_vector(magnetic, MAX_ACCELERATION, vn.GAUSS),
             orientation=orientation,
             orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.NED,
             yaw_source=YawSource.NONE if orientation is None else self._yaw_source,
             temperature_celsius=celsius[0] if celsius is not None and math.isfinite(celsius[0]) else NAN,
         )
         return self._publish(sample, now)
-
-    def _check(self, values: tuple[float, ...] | None, most: float, scale: float = 1.0) -> Vector3 | None:
-        """Return a vector in SI units; None for one that is not measured, or not a number."""
-        if values is None:
-            return None
-        if not all(abs(each) <= most for each in values):
-            self._counts["rejected.range"] += 1
-            return None
-        return (values[0] * scale, values[1] * scale, values[2] * scale)
 
 
 def _to_quaternion(values: tuple[float, ...] | None) -> Quaternion | None:

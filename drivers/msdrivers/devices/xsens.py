@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.so3 import Quaternion
 from msdrivers.devices.ranges import check_ranges
 from msdrivers.devices.stream_driver import StreamDriver, check_stream_settings
 from msdrivers.endpoint import HostTime, Output
@@ -135,24 +135,17 @@ class XsensDriver(StreamDriver[XbusMessage]):
         orientation, reference = _find_orientation(data)
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
-            angular_velocity=self._check(rate, MAX_RATE),
-            specific_force=self._check(force, MAX_ACCELERATION),
-            magnetic_field=self._check(field, 100.0, self._own.field_strength) if self._own.field_strength else None,
+            angular_velocity=self._read_vector(rate, MAX_RATE),
+            specific_force=self._read_vector(force, MAX_ACCELERATION),
+            magnetic_field=self._read_vector(field, 100.0, self._own.field_strength)
+            if self._own.field_strength
+            else None,
             orientation=orientation,
             orientation_reference=reference,
             yaw_source=YawSource.NONE if orientation is None else _YAW_SOURCES[self._own.heading],
             temperature_celsius=self._celsius,
         )
         return self._publish(sample, now, xsens.TICK)
-
-    def _check(self, values: tuple[float, ...] | None, most: float, scale: float = 1.0) -> Vector3 | None:
-        """Return a vector in SI units; None for one that is not measured, or not a number."""
-        if values is None:
-            return None
-        if not all(abs(each) <= most for each in values):
-            self._counts["rejected.range"] += 1
-            return None
-        return (values[0] * scale, values[1] * scale, values[2] * scale)
 
 
 def _find_orientation(data: MtData) -> tuple[Quaternion | None, OrientationReference]:

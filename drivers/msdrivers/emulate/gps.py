@@ -7,13 +7,13 @@ and answers and prompts as it does. With `is_answering` off and `saved` logs it 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from modelserver.messages import FixType, GpsSample
+from msdrivers.emulate.sample_emulator import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol import gps_time
 from msdrivers.protocol.nmea import fields as nmea
@@ -220,18 +220,14 @@ class _LogRequest:
     last: int | None = None
 
 
-class GpsEmulator:
+class GpsEmulator(SampleEmulator[GpsSample]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
-        self._samples: Iterator[GpsSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples, self._unit.latency)
         self._logs: dict[str, _LogRequest] = {}
         self._line = bytearray()
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Commands accepted and rejected, logs by name."""
         for line in self._unit.saved:
             if error := self._execute(line):
                 raise ValueError(f"saved configuration, '{line}': {error}")
@@ -268,29 +264,9 @@ class GpsEmulator:
                 out.append(Send(f"\r\n{answer}\r\n".encode("ascii") + _PROMPT))
         return out
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the logs of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._get_send_utime(self._next) <= now.utime:
-            logs = self._make_logs(self._next)
-            if logs:
-                out.append(Send(logs))
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._get_send_utime(self._next) - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
-
-    def _get_send_utime(self, sample: GpsSample) -> int:
-        return sample.header.utime + round(self._unit.latency * 1e6)
+    def _send_sample(self, sample: GpsSample) -> list[Output[bytes]]:
+        data = self._make_logs(sample)
+        return [Send(data)] if data else []
 
     def _make_logs(self, sample: GpsSample) -> bytes:
         utime = sample.header.utime

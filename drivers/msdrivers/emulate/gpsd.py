@@ -4,35 +4,31 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from modelserver.messages import FixType, GpsSample
+from msdrivers.emulate.sample_emulator import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol.gpsd import WATCH
 
 RECEIVER = "/dev/ttyACM0"
 
-LATENCY_US = 30_000
-"""From the instant of a sample to its reports, microseconds."""
+LATENCY = 0.03
+"""From the instant of a sample to its reports, seconds."""
 
 _STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
 
 
-class GpsdEmulator:
+class GpsdEmulator(SampleEmulator[GpsSample]):
     """An `Endpoint` of bytes that speaks as gpsd does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], *, has_gst: bool = True) -> None:
-        self._samples: Iterator[GpsSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples, LATENCY)
         self._has_gst = has_gst
         self._line = b""
         self._is_watched = False
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Reports by class."""
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Greet a client."""
@@ -53,25 +49,8 @@ class GpsdEmulator:
                 out.append(self._report(**{"class": "WATCH", "enable": True, "json": True}))
         return out
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the reports of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._next.header.utime + LATENCY_US <= now.utime:
-            if self._is_watched:
-                out += self._report_sample(self._next)
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._next.header.utime + LATENCY_US - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
+    def _send_sample(self, sample: GpsSample) -> list[Output[bytes]]:
+        return self._report_sample(sample) if self._is_watched else []
 
     def _report(self, **fields: Any) -> Send[bytes]:
         self.counts[fields["class"]] += 1

@@ -2,57 +2,27 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 
 from modelserver.messages import ImuSample
-from msdrivers.endpoint import HostTime, Output, Send
+from msdrivers.emulate.sample_emulator import SampleEmulator
+from msdrivers.endpoint import Output, Send
 from msdrivers.protocol.text_lines import LineDescription, encode_line
 
 CELSIUS = 25.0
 
 
-class TextImuEmulator:
+class TextImuEmulator(SampleEmulator[ImuSample]):
     """An `Endpoint` of bytes that sends a line for each sample. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[ImuSample], settings: LineDescription) -> None:
-        self._samples: Iterator[ImuSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples)
         self._settings = settings
         self._first_utime: int | None = None
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Lines sent."""
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """The host's end of the line is open; a unit does not notice."""
-        self._now = now
-        return []
-
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Ignore what the host sends."""
-        self._now = now
-        return []
-
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the lines of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._next.header.utime <= now.utime:
-            out.append(Send(self._encode(self._next)))
-            self.counts["lines"] += 1
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._next.header.utime - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
+    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
+        self.counts["lines"] += 1
+        return [Send(self._encode(sample))]
 
     def _encode(self, sample: ImuSample) -> bytes:
         self._first_utime = sample.header.utime if self._first_utime is None else self._first_utime

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -13,6 +12,7 @@ from typing import Any, Final
 from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseError, UBXReader, UBXTypeError
 
 from modelserver.messages import FixType, GpsSample
+from msdrivers.emulate.sample_emulator import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol import gps_time
 from msdrivers.protocol.framing import FrameScanner, ParsedFrame, RejectedFrame
@@ -60,58 +60,30 @@ class _CommandFormat(UbxFormat):
         return found
 
 
-class UbloxEmulator:
+class UbloxEmulator(SampleEmulator[GpsSample]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: UbloxUnit | None = None) -> None:
         self._unit = UbloxUnit() if unit is None else unit
-        self._samples: Iterator[GpsSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples, self._unit.latency)
         self._scanner: FrameScanner[bytes] = FrameScanner((_CommandFormat(),))
         self._period_ms = _FACTORY_PERIOD_MS
         self._last_ms: int | None = None
         self._messages: set[str] = set()
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Commands accepted and rejected, messages by name."""
 
     @property
     def messages(self) -> frozenset[str]:
         """The messages that are on, e.g. "NAV-PVT"."""
         return frozenset(self._messages)
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """The host's end of the line is open; a receiver does not notice."""
-        self._now = now
-        return []
-
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process commands."""
         self._now = now
         return [output for frame in self._scanner.feed(unit) for output in self._execute(frame)]
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the messages of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._get_send_utime(self._next) <= now.utime:
-            if data := self._make_epoch(self._next):
-                out.append(Send(data))
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._get_send_utime(self._next) - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
-
-    def _get_send_utime(self, sample: GpsSample) -> int:
-        return sample.header.utime + round(self._unit.latency * 1e6)
+    def _send_sample(self, sample: GpsSample) -> list[Output[bytes]]:
+        data = self._make_epoch(sample)
+        return [Send(data)] if data else []
 
     # --- commands ---
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from modelserver.messages import ImuSample
+from msdrivers.emulate.sample_emulator import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol import vectornav as vn
 from msdrivers.protocol.vectornav import FIELD_BYTES, VnStream, VnText
@@ -26,27 +26,18 @@ class VectornavUnit:
     start_ns: int = 5_000_000_000
 
 
-class VectornavEmulator:
+class VectornavEmulator(SampleEmulator[ImuSample]):
     """An `Endpoint` of bytes that speaks as the unit does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[ImuSample], unit: VectornavUnit | None = None) -> None:
         self._unit = VectornavUnit() if unit is None else unit
-        self._samples: Iterator[ImuSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples)
         self._first_utime: int | None = None
         self._stream = VnStream()
         self._text_hz = {1: 40, 2: 0}
         self._keys: tuple[tuple[int, int], ...] = ()
         self._divisor = 0
         self._sent_us: int | None = None
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Commands accepted and rejected, messages."""
-
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """The host's end of the line is open; a unit does not notice."""
-        self._now = now
-        return []
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process commands."""
@@ -60,25 +51,9 @@ class VectornavEmulator:
                 out.append(Send(vn.encode_text(f"ERR,{error:02X}" if error else self._answer(message.words))))
         return out
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the messages of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._next.header.utime <= now.utime:
-            if data := self._encode(self._next):
-                out.append(Send(data))
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._next.header.utime - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
+    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
+        data = self._encode(sample)
+        return [Send(data)] if data else []
 
     def _answer(self, words: tuple[str, ...]) -> str:
         return "RRG,01,VN-100T-CR" if words[0] == "RRG" else ",".join(words)

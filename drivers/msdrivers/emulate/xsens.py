@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from modelserver.messages import ImuSample
+from msdrivers.emulate.sample_emulator import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol import xsens
 from msdrivers.protocol.xsens import ItemId, MessageId, XbusMessage, XbusStream
@@ -31,52 +31,27 @@ class XsensUnit:
     stored: tuple[tuple[int, int], ...] = ((ItemId.PACKET_COUNTER, 0xFFFF), (ItemId.QUATERNION, 100))
 
 
-class XsensEmulator:
+class XsensEmulator(SampleEmulator[ImuSample]):
     """An `Endpoint` of bytes that speaks as the unit does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[ImuSample], unit: XsensUnit | None = None) -> None:
         self._unit = XsensUnit() if unit is None else unit
-        self._samples: Iterator[ImuSample] = iter(samples)
-        self._next = next(self._samples, None)
+        super().__init__(samples)
         self._stream = XbusStream()
         self._outputs = dict(self._unit.stored)
         self._is_measuring = True
         self._counter = 0
         self._first_utime: int | None = None
         self._sent: dict[int, int] = {}
-        self._now: HostTime | None = None
-        self.counts: Counter[str] = Counter()
-        """Commands accepted and rejected, packets."""
-
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """The host's end of the line is open; a unit does not notice."""
-        self._now = now
-        return []
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process commands."""
         self._now = now
         return [Send(each) for message in self._stream.feed(unit) if (each := self._execute(message))]
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the packets of the samples up to now."""
-        self._now = now
-        out: list[Output[bytes]] = []
-        while self._next is not None and self._next.header.utime <= now.utime:
-            if data := self._encode(self._next):
-                out.append(Send(data))
-            self._next = next(self._samples, None)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
-        if self._now is None or self._next is None:
-            return None
-        return self._now.monotonic_ns + (self._next.header.utime - self._now.utime) * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
-        return []
+    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
+        data = self._encode(sample)
+        return [Send(data)] if data else []
 
     def _execute(self, message: XbusMessage) -> bytes:
         if message.id == MessageId.GO_TO_CONFIG:

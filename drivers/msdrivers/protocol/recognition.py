@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from binascii import crc_hqx
 from collections.abc import Callable
 from functools import reduce
 from operator import xor
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from msdrivers.protocol.ublox import SYNC as UBX_SYNC
-from msdrivers.protocol.ublox import compute_checksum
+from msdrivers.protocol.framing import FrameScanner
+from msdrivers.protocol.xsens import XbusStream
 
 MIN_FRAMES: Final = 2
 """Fewer valid frames may be chance."""
@@ -23,14 +24,17 @@ class KnownProtocol(NamedTuple):
     count: Callable[[bytes], int]
 
 
+def _count_frames(scanner: FrameScanner[Any], data: bytes) -> int:
+    """Return how many valid frames a scanner that is new finds."""
+    scanner.feed(data)
+    return sum(number for kind, number in scanner.counts.items() if not kind.startswith(("rejected.", "skipped")))
+
+
 def _count_ubx(data: bytes) -> int:
-    number = at = 0
-    while (at := data.find(UBX_SYNC, at)) >= 0 and at + 8 <= len(data):
-        end = at + 6 + int.from_bytes(data[at + 4 : at + 6], "little")
-        is_valid = end + 2 <= len(data) and compute_checksum(data[at + 2 : end]) == data[end : end + 2]
-        number += is_valid
-        at = end + 2 if is_valid else at + 2
-    return number
+    # loads pyubx2, which the drivers of other devices need for a line that is not theirs only
+    from msdrivers.protocol.ublox import UbxStream
+
+    return _count_frames(UbxStream(), data)
 
 
 _SENTENCE: Final = re.compile(rb"\$([A-Z]{2,6}[^*\r\n]{0,200})\*([0-9A-Fa-f]{2})")
@@ -51,7 +55,7 @@ def _count_vectornav(data: bytes) -> int:
     number, at = len(_VECTORNAV.findall(data)), 0
     while (at := data.find(b"\xfa", at)) >= 0:
         for size in range(8, min(200, len(data) - at)):
-            if size > 20 and data[at + size : at + size + 1] == b"\xfa" and _crc_ccitt(data[at + 1 : at + size]) == 0:
+            if size > 20 and data[at + size : at + size + 1] == b"\xfa" and crc_hqx(data[at + 1 : at + size], 0) == 0:
                 number += 1
                 at += size - 1
                 break
@@ -62,28 +66,11 @@ def _count_vectornav(data: bytes) -> int:
 
 
 def _count_xbus(data: bytes) -> int:
-    number = at = 0
-    while (at := data.find(b"\xfa\xff", at)) >= 0 and at + 5 <= len(data):
-        end = at + 4 + data[at + 3] + 1
-        is_valid = data[at + 3] < 255 and end <= len(data) and sum(data[at + 1 : end]) & 0xFF == 0
-        number += is_valid
-        at = end if is_valid else at + 2
-    return number
+    return _count_frames(XbusStream(), data)
 
 
 def _count_novatel(data: bytes) -> int:
     return data.count(b"\xaa\x44\x12\x1c") + len(_NOVATEL_ASCII.findall(data))
-
-
-def _crc_ccitt(data: bytes) -> int:
-    crc = 0
-    for byte in data:
-        crc = (crc >> 8 | crc << 8) & 0xFFFF
-        crc ^= byte
-        crc ^= (crc & 0xFF) >> 4
-        crc ^= crc << 12 & 0xFFFF
-        crc ^= (crc & 0xFF) << 5
-    return crc
 
 
 PROTOCOLS: Final = (
