@@ -39,6 +39,7 @@ from modelserver.messages import (
     JointSample,
     JointsSample,
     LocalizationHealth,
+    MeasurementSample,
     Mode,
     MotionAnswer,
     MotionReply,
@@ -198,6 +199,10 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "range_t": (
         RangeSample(_SENSOR, "Raptor:CG", "", (0.0, 0.0, 0.0), "World:UTM", 0.0),
         RangeSample(_SENSOR, "Raptor:CG", "gate", (12.5, -40.0, 3.0), "World:ENU", 41.25, 0.1),
+    ),
+    "measurement_t": (
+        MeasurementSample(_SENSOR, (1.25,)),
+        MeasurementSample(_SENSOR, (1.25, -0.5), "Raptor:CG", (0.04, 0.01, 0.01, 0.09)),
     ),
     "localization_mode_t": (SwitchMode(_SENSOR, Mode.FULL), SwitchMode(_SENSOR, Mode.DEAD_RECKONING)),
     "decisions_t": (

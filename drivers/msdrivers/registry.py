@@ -5,7 +5,7 @@ A kind's modules are imported on demand, so that a driver does not load those of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files.regular import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
+from modelserver.plugins import PluginRegistry
 from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault
 from msdrivers.endpoint import Endpoint
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
@@ -350,64 +351,17 @@ PLUGIN_GROUP = "modelserver.drivers"
 """Group of the entry points by which an installed package adds kinds of devices."""
 
 
-class DeviceRegistry(Mapping[str, DeviceKind]):
-    """Kinds of devices by name: those of this package, and those of installed packages.
-
-    A package adds one with an entry point of the group `modelserver.drivers`, whose name is that of the device and
-    whose object is a `DeviceKind`. The entry points are read when a name is not one of this package's own. `problems`
-    are those that cannot be used, by name; they do not affect the others.
-    """
-
-    def __init__(self, own: Iterable[DeviceKind], find_entry_points: Callable[[], Iterable[Any]] | None = None):
-        self._own = {kind.name: kind for kind in own}
-        self._find_entry_points = find_entry_points or _find_entry_points
-        self._all: Mapping[str, DeviceKind] | None = None
-        self._problems: dict[str, str] = {}
-
-    def __getitem__(self, name: str) -> DeviceKind:
-        return self._own[name] if name in self._own else self._load()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._load())
-
-    def __len__(self) -> int:
-        return len(self._load())
-
-    @property
-    def plugins(self) -> Mapping[str, DeviceKind]:
-        """The kinds of installed packages."""
-        return {name: kind for name, kind in self._load().items() if name not in self._own}
-
-    @property
-    def problems(self) -> Mapping[str, str]:
-        """Why entry points cannot be used, by name."""
-        self._load()
-        return self._problems
-
-    def _load(self) -> Mapping[str, DeviceKind]:
-        if self._all is None:
-            found = dict(self._own)
-            for entry in self._find_entry_points():
-                try:
-                    kind = entry.load()
-                except Exception as error:
-                    self._problems[entry.name] = f"{type(error).__name__}: {error}"
-                    continue
-                if not isinstance(kind, DeviceKind) or kind.name != entry.name:
-                    self._problems[entry.name] = f"{entry.value} is no DeviceKind of the name {entry.name}"
-                elif entry.name in found:
-                    self._problems[entry.name] = "there is a device of that name already"
-                else:
-                    found[entry.name] = kind
-            self._all = found
-        return self._all
+def _find_fault(name: str, loaded: Any) -> str:
+    """Return why an object is not the kind of device of a name; empty if it is."""
+    return "" if isinstance(loaded, DeviceKind) and loaded.name == name else f"is no DeviceKind of the name {name}"
 
 
-def _find_entry_points() -> Iterable[Any]:
-    from importlib.metadata import entry_points
+def make_registry(
+    own: Iterable[DeviceKind], find_entry_points: Callable[[], Iterable[Any]] | None = None
+) -> PluginRegistry[DeviceKind]:
+    """Make a registry of these kinds and of those of installed packages."""
+    return PluginRegistry(PLUGIN_GROUP, _find_fault, {kind.name: kind for kind in own}, find_entry_points)
 
-    return entry_points(group=PLUGIN_GROUP)
 
-
-KINDS = DeviceRegistry(_KINDS)
+KINDS = make_registry(_KINDS)
 """Kinds of devices by the name that a vehicle file gives as `device`."""

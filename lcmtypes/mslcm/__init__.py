@@ -31,6 +31,7 @@ from .imu_t import imu_t as imu_t
 from .joints_t import joints_t as joints_t
 from .localization_health_t import localization_health_t as localization_health_t
 from .localization_mode_t import localization_mode_t as localization_mode_t
+from .measurement_t import measurement_t as measurement_t
 from .model_snapshot_t import model_snapshot_t as model_snapshot_t
 from .name_list_reply_t import name_list_reply_t as name_list_reply_t
 from .navigation_state_t import navigation_state_t as navigation_state_t

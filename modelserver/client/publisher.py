@@ -19,6 +19,7 @@ from modelserver.messages import (
     ImuSample,
     JointSample,
     JointsSample,
+    MeasurementSample,
     OrientationReference,
     SensorHeader,
     VehicleStatusSample,
@@ -28,6 +29,7 @@ from modelserver.messages import (
 )
 from modelserver.transforms.so3 import Matrix3, Vector3
 from modelserver.wire.codec import encode
+from modelserver.wire.fields import MAX_VALUES
 from modelserver.wire.provider import open_lcm, resolve_url
 
 MAX_RATE: Final = 100.0
@@ -39,9 +41,16 @@ MAX_FORCE: Final = 2000.0
 MAX_SPEED: Final = 200.0
 """m/s; a larger number is in another unit."""
 
-S = TypeVar("S", GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample)
+S = TypeVar("S", GpsSample, ImuSample, JointsSample, MeasurementSample, VehicleStatusSample, WheelsSample)
 
-CHANNELS: Final = {"gps": "GPS", "imu": "IMU", "wheels": "WHEELS", "joints": "JOINTS", "status": "VEHICLE_STATUS"}
+CHANNELS: Final = {
+    "gps": "GPS",
+    "imu": "IMU",
+    "wheels": "WHEELS",
+    "joints": "JOINTS",
+    "status": "VEHICLE_STATUS",
+    "measurement": "MEASUREMENT",
+}
 """Channel of each kind of sample, where the vehicle file names no other."""
 
 
@@ -69,8 +78,8 @@ class SensorPublisher:
     channel_prefix
         Prefix of the vehicle's channels.
     channels
-        Channels by kind of sample (gps, imu, wheels, joints, status), where the vehicle file names others than GPS,
-        IMU, WHEELS, JOINTS and VEHICLE_STATUS.
+        Channels by kind of sample (gps, imu, wheels, joints, status, measurement), where the vehicle file names others
+        than GPS, IMU, WHEELS, JOINTS, VEHICLE_STATUS and MEASUREMENT.
     """
 
     def __init__(
@@ -243,6 +252,25 @@ class SensorPublisher:
         header = self._make_header("status", at)
         sample = VehicleStatusSample(header, forward_speed=float(forward_speed), steering_angle=float(steering_angle))
         return self._publish("status", sample)
+
+    def measurement(
+        self, values: Iterable[float], *, sigma: Iterable[float] | None = None, frame: str = "", at: Time = 0
+    ) -> MeasurementSample:
+        """Publish a measurement of a type of an installed package: its numbers, in that type's order and units.
+
+        `sigma`: their standard deviations. `frame`: the frame that measures, where the type needs one.
+        """
+        numbers = tuple(float(each) for each in values)
+        numbers = _read_numbers("values", numbers, min(max(len(numbers), 1), MAX_VALUES))
+        covariance: tuple[float, ...] = ()
+        if sigma is not None:
+            sigmas = _read_numbers("sigma", sigma, len(numbers))
+            if min(sigmas) <= 0.0:
+                raise ValueError(f"sigma is above 0, got {sigmas}")
+            covariance = tuple(s * s if i == j else 0.0 for i, s in enumerate(sigmas) for j in range(len(sigmas)))
+        return self._publish(
+            "measurement", MeasurementSample(self._make_header("measurement", at), numbers, frame, covariance)
+        )
 
     def _make_header(self, kind: str, at: Time) -> SensorHeader:
         now = time.time_ns() // 1000

@@ -201,8 +201,8 @@ class AidingConfig:
 
     channel: str
     """Channel of its messages."""
-    type: Literal["absolute_pose", "relative_pose", "range"]
-    """What it measures."""
+    type: str
+    """What it measures: `absolute_pose`, `relative_pose`, `range`, or a type of an installed package."""
     latency: float = 0.0
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
 

@@ -27,6 +27,7 @@ from modelserver.messages.generated import (
     HistoryReply,
     ImuSample,
     JointsSample,
+    MeasurementSample,
     Mode,
     MotionReply,
     NameListReply,
@@ -58,6 +59,7 @@ Sample: TypeAlias = (
     | AbsolutePoseSample
     | RelativePoseSample
     | RangeSample
+    | MeasurementSample
 )
 
 MAX_CHANNEL_LENGTH = 63

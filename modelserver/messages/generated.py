@@ -1096,6 +1096,29 @@ class SwitchMode:
 
 
 @dataclass(frozen=True, slots=True)
+class MeasurementSample:
+    """Measurement of a type that an installed package defines; the vehicle file names the type of each source.
+
+    Attributes
+    ----------
+    header
+        Time and source; header.utime is the instant of measurement.
+    frame
+        The frame of the vehicle that measures: full name, Body:Frame; 200 characters at most on each side of the colon.
+        Empty where the type needs none.
+    values
+        The numbers that were measured, in the order and units of the type; nan = not measured.
+    covariance
+        Their covariance, in the squared units of the values. The first number nan: not known.
+    """
+
+    header: SensorHeader
+    values: tuple[float, ...]
+    frame: str = ""
+    covariance: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class SnapshotPart:
     """A part of the geometry in use, for late subscribers and for logs. The concatenated parts of one revision are a
     zlib stream of UTF-8 JSON: vehicle, base_frame, rolling_frame, history_s, joints_channel, joints_latency_us,

@@ -47,7 +47,7 @@ AIDING_SAMPLES: Mapping[str, type[messages.Sample]] = {
     "relative_pose": messages.RelativePoseSample,
     "range": messages.RangeSample,
 }
-"""Samples of aiding sources, by their type in the vehicle file."""
+"""Samples of aiding sources, by their type in the vehicle file; other types are those of installed packages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +114,15 @@ class Vehicle:
         from modelserver.estimation.modes import LocalizerConfig
 
         return LocalizerConfig(
-            Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts
+            Setup(self.rig, self.config.localization.filter, own=self.own_measurements()),
+            self.config.localization.raw,
+            self.mounts,
         )
+
+    def own_measurements(self) -> dict[str, str]:
+        """Return the type of each source of measurements of installed packages."""
+        aiding = self.config.sensors.aiding
+        return {name: each.type for name, each in aiding.items() if each.type not in AIDING_SAMPLES}
 
     def find_unusable_sensors(self) -> tuple[messages.SensorFinding, ...]:
         """Find the configured sensors that localization cannot use in its initial mode, with the reasons."""
@@ -230,7 +237,10 @@ def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
         ("speedometer", sensors.speedometer, messages.VehicleStatusSample, ""),
         ("wheels.steering", sensors.steering, messages.VehicleStatusSample, ""),
         ("joints", sensors.joints, messages.JointsSample, ""),
-        *((f"aiding.{name}", each, AIDING_SAMPLES[each.type], name) for name, each in sensors.aiding.items()),
+        *(
+            (f"aiding.{name}", each, AIDING_SAMPLES.get(each.type, messages.MeasurementSample), name)
+            for name, each in sensors.aiding.items()
+        ),
     ]
     return [
         _ConfiguredSensor(key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, source)
@@ -292,6 +302,7 @@ def examine_vehicle(
         why = "raw mode needs a GPS and an IMU, and the section sensors does not have both"
         problems.append(_make_problem(file, "localization.mode", why, "write mode: full"))
     problems += _find_channel_problems(config, file)
+    problems += _find_type_problems(config, file)
     if config.localization.mode_channel and not config.commands.key_file:
         why = f"mode commands must be signed: {KEY_HINT}"
         problems.append(_make_problem(file, "localization.mode_channel", why))
@@ -398,6 +409,30 @@ def _find_channel_problems(config: VehicleConfig, file: str) -> list[errors.Prob
         why = f"with the reply prefix {reply_prefix} a request could make the server reply on {clashing[0]}"
         fix = "choose a prefix that no other channel has, e.g. REPLY_"
         problems.append(_make_problem(file, "lcm.reply_prefix", why, fix))
+    return problems
+
+
+def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem]:
+    """Check that the types of aiding sources are known here; packages are looked for only where one is not."""
+    problems: list[errors.Problem] = []
+    for name, given in ((name, each.type) for name, each in config.sensors.aiding.items()):
+        if given in AIDING_SAMPLES:
+            continue
+        from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP
+
+        if given in MEASUREMENT_TYPES:
+            continue
+        key = f"sensors.aiding.{name}.type"
+        if given in MEASUREMENT_TYPES.problems:
+            why = f"of an installed package cannot be used: {MEASUREMENT_TYPES.problems[given]}"
+            fix = "repair or reinstall that package"
+            problems.append(_make_problem(file, key, f"type {errors.quote(given)} {why}", fix))
+            continue
+        known = (*AIDING_SAMPLES, *MEASUREMENT_TYPES)
+        near = errors.suggest_name(given, known)
+        package = f"install the package that defines it (entry point group {PLUGIN_GROUP})"
+        fix = f"write {near[0]}" if near else f"{package}, or write one of {', '.join(known)}"
+        problems.append(_make_problem(file, key, f"unknown type {errors.quote(given)}", fix, near))
     return problems
 
 

@@ -76,6 +76,7 @@ CHANNELS = (
         ("ABSOLUTE_POSE", "absolute_pose_t", "as they come", "poses in the world by other means than GPS"),
         ("RELATIVE_POSE", "relative_pose_t", "as they come", "motion between two instants, e.g. by visual odometry"),
         ("RANGE", "range_t", "as they come", "distances to beacons at known positions"),
+        ("MEASUREMENT", "measurement_t", "as they come", "measurements of installed packages"),
         ("VEHICLE_STATUS", "vehicle_status_t", "1-20 Hz", "status of the vehicle controller"),
     ),
     *_channels(

@@ -43,6 +43,9 @@ MAX_DECISIONS: Final = 1024
 MAX_STATES: Final = 64
 """Error states of the filter, and numbers of one measurement."""
 
+MAX_VALUES: Final = 16
+"""Numbers of a measurement of an installed package."""
+
 MAX_SNAPSHOT_PARTS: Final = 100_000
 
 MAX_DISTANCE = 1e12

@@ -37,6 +37,7 @@ from modelserver.messages import (
     JointSample,
     JointsSample,
     LocalizationHealth,
+    MeasurementSample,
     Mode,
     MotionAnswer,
     MotionReply,
@@ -78,6 +79,7 @@ from modelserver.wire.fields import (
     MAX_MESSAGE_INSTANTS,
     MAX_PAIRS,
     MAX_STATES,
+    MAX_VALUES,
     NAN3,
     NAN4,
     NAN9,
@@ -156,6 +158,7 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "joints_t": bytes.fromhex("2f8bc69e04097f3d"),
     "localization_health_t": bytes.fromhex("bc81b19d57c85f38"),
     "localization_mode_t": bytes.fromhex("5862804cd0a8b608"),
+    "measurement_t": bytes.fromhex("a98787409a8c023c"),
     "model_snapshot_t": bytes.fromhex("0ed3b5078061bb8f"),
     "name_list_reply_t": bytes.fromhex("c14f1581c7c4db7b"),
     "navigation_state_t": bytes.fromhex("d8c235934651b218"),
@@ -1341,6 +1344,48 @@ def unpack_localization_mode(data: bytes, at: int) -> tuple[SwitchMode, int]:
     ), at + 1
 
 
+def pack_measurement(value: MeasurementSample) -> bytes:
+    """Return the bytes of a measurement_t without the fingerprint."""
+    return b"%b%b%b%b%b%b" % (
+        _S0.pack(
+            value.header.utime,
+            value.header.utime_sigma,
+            value.header.host_utime,
+            value.header.device_utime,
+            value.header.seq,
+        ),
+        pack_text(value.header.source),
+        pack_text(value.frame),
+        _S5.pack(len(value.values)),
+        pack_numbers("d", value.values),
+        pack_matrix(value.covariance, len(value.values)),
+    )
+
+
+def unpack_measurement(data: bytes, at: int) -> tuple[MeasurementSample, int]:
+    """Return the measurement_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    header_utime, header_utime_sigma, header_host_utime, header_device_utime, header_seq = _S0.unpack_from(data, at)
+    header_source, at = read_text(data, at + 40)
+    frame, at = read_text(data, at)
+    (num_values,) = _S5.unpack_from(data, at)
+    check_count(num_values, "num_values", MAX_VALUES, 1)
+    values, at = read_numbers("d", data, at + 4, num_values)
+    covariance, at = read_numbers("d", data, at, num_values * num_values)
+    return MeasurementSample(
+        SensorHeader(
+            check_sample_utime(header_utime, "utime"),
+            check_name(header_source, "source"),
+            header_seq,
+            check_utime(header_host_utime, "host_utime"),
+            header_device_utime,
+            header_utime_sigma,
+        ),
+        values,
+        check_name(frame, "frame", MAX_FRAME_NAME),
+        () if covariance and covariance[0] != covariance[0] else covariance,
+    ), at
+
+
 def pack_model_snapshot(value: SnapshotPart) -> bytes:
     """Return the bytes of a model_snapshot_t without the fingerprint."""
     return b"%b%b%b%b" % (
@@ -2048,6 +2093,7 @@ CODECS = (
         pack_localization_mode,
         unpack_localization_mode,
     ),
+    Codec("measurement_t", FINGERPRINTS["measurement_t"], MeasurementSample, pack_measurement, unpack_measurement),
     Codec(
         "model_snapshot_t", FINGERPRINTS["model_snapshot_t"], SnapshotPart, pack_model_snapshot, unpack_model_snapshot
     ),

@@ -208,7 +208,7 @@ def test_given_frame_names_of_63_characters_when_a_pose_is_encoded_then_one_pack
 
 
 def test_given_the_samples_of_further_sources_when_encoded_then_one_packet_holds_each() -> None:
-    for type_name in ("absolute_pose_t", "relative_pose_t", "range_t", "localization_mode_t"):
+    for type_name in ("absolute_pose_t", "relative_pose_t", "range_t", "measurement_t", "localization_mode_t"):
         assert all(len(encode(value, type_name)) + 72 < ONE_PACKET for value in EXAMPLES[type_name])
 
 

@@ -102,6 +102,15 @@ def relative_poses(draw: st.DrawFn) -> messages.RelativePoseSample:
 
 
 @st.composite
+def measurements(draw: st.DrawFn) -> messages.MeasurementSample:
+    n = draw(st.integers(1, 5))
+    values = tuple(draw(st.lists(numbers, min_size=n, max_size=n)))
+    return messages.MeasurementSample(
+        draw(sensor_headers), values, draw(frames), draw(st.just(()) | optional_numbers(n * n))
+    )
+
+
+@st.composite
 def decisions(draw: st.DrawFn) -> messages.Decision:
     n = draw(st.integers(0, 4))
     return messages.Decision(
@@ -214,6 +223,7 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "range_t": st.builds(
         messages.RangeSample, sensor_headers, frames, texts, places, frames, st.floats(0.0, 1e9), numbers
     ),
+    "measurement_t": measurements(),
     "localization_mode_t": st.builds(messages.SwitchMode, sensor_headers, st.sampled_from(messages.Mode)),
     "decisions_t": st.builds(messages.PublishDecisions, utimes, st.lists(decisions(), max_size=4).map(tuple)),
     "navigation_state_t": states(),

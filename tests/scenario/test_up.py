@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from support_lcm import MODELSERVER, TIMEOUT_S, invoke
 
+import modelserver as ms
 from tests.scenario.test_demo import close, list_running, text_until
 
 pytestmark = pytest.mark.slow
@@ -131,21 +132,31 @@ PLUGIN_DRIVER = """\
 
 
 def install_plugin(folder: Path, *entries: str) -> None:
-    """Install a package with the example of an own device: its module, and the metadata that pip writes."""
+    """Install a package with the examples of an own device and measurement, and the metadata that pip writes."""
     info = folder / "speed_device-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: speed-device\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("\n".join(["[modelserver.drivers]", *entries, ""]))
+    (info / "entry_points.txt").write_text("\n".join([*entries, ""]))
     shutil.copy(EXAMPLE, folder / "speed_device.py")
+    shutil.copy(EXAMPLE.with_name("own_measurement.py"), folder / "radar_measurement.py")
 
 
 def test_given_an_installed_device_then_it_is_found_checked_emulated_and_fused(
     cart: Path, tmp_path: Path, lcm_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packages = tmp_path / "packages"
-    install_plugin(packages, "speed = speed_device:KIND", "broken = no_such_module:KIND")
+    install_plugin(
+        packages,
+        "[modelserver.drivers]",
+        "speed = speed_device:KIND",
+        "broken = no_such_module:KIND",
+        "[modelserver.measurements]",
+        "ground_radar = radar_measurement:RADAR",
+        "lost = radar_measurement:Radar",
+    )
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(packages), *filter(None, [os.environ.get("PYTHONPATH")])]))
     wheels = 'sensors:\n  wheels: {frames: {middle: "Cart:Base"}}\n'
+    wheels += "  aiding: {doppler: {type: ground_radar, channel: DOPPLER}}\n"
     cart.write_text(VEHICLE.replace("sensors:\n", wheels) + PLUGIN_DRIVER)
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -156,6 +167,10 @@ def test_given_an_installed_device_then_it_is_found_checked_emulated_and_fused(
     listed = run("driver", "--list")
     assert "speed            device of an installed package: speed sensor that sends $SPD" in listed.stdout
     assert "broken           device of an installed package, not usable: ModuleNotFoundError" in listed.stderr
+    assert "ground_radar     measurement of an installed package: forward speed over ground, m/s" in listed.stdout
+    assert "lost             measurement of an installed package, not usable: radar_measurement:Radar is a class" in (
+        listed.stderr
+    )
     checked = run("check", str(cart))
     assert (checked.returncode, "clean" in checked.stdout) == (0, True), checked.stdout
     cart.write_text(cart.read_text().replace("device: speed", "device: broken"))
@@ -170,6 +185,10 @@ def test_given_an_installed_device_then_it_is_found_checked_emulated_and_fused(
         deadline = time.monotonic() + TIMEOUT_S
         while not count_used(lcm_url, "sensor:radar"):
             assert time.monotonic() < deadline, "no measurement of the radar was used"
+        with ms.SensorPublisher("doppler", url=lcm_url, channels={"measurement": "DOPPLER"}) as publisher:
+            while not count_used(lcm_url, "sensor:doppler"):
+                assert time.monotonic() < deadline, "no measurement of the installed type was used"
+                publisher.measurement([0.0], sigma=[5.0])
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)

@@ -387,7 +387,6 @@ def test_given_a_key_twice_then_both_lines_are_named(text: str, element: str, li
         ("sensors:\n  imu: {channel: G, frame: A:B, latency: 5.1}", "sensors.imu.latency", "between 0 and 5"),
         ("sensors:\n  wheels: {latency: .nan}", "sensors.wheels.latency", "finite"),
         ("sensors:\n  wheels: {kinematics: tank}", "sensors.wheels.kinematics", "'skid_steer'.*got 'tank'"),
-        ("sensors:\n  aiding: {vo: {channel: V, type: pose}}", "sensors.aiding.vo.type", "'absolute_pose'.*got 'pose'"),
         ("sensors:\n  aiding: {vo: {channel: V, type: range, latency: 9}}", "sensors.aiding.vo.latency", "0 and 5"),
         ("sensors:\n  aiding: {vo: {type: range}}", "sensors.aiding.vo.channel", "missing"),
         (f"sensors:\n  aiding: {{{'v' * 65}: {{channel: V, type: range}}}}", "sensors.aiding", "1 to 64"),

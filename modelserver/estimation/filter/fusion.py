@@ -15,6 +15,7 @@ from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.measurements.own import OwnMeasurement
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
@@ -24,6 +25,7 @@ from modelserver.messages import (
     Decision,
     GpsSample,
     ImuSample,
+    MeasurementSample,
     Mode,
     RangeSample,
     Sample,
@@ -93,6 +95,9 @@ def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
         if setup.rig.speedometer is not None and setup.wheels is not None:
             wheels = read_speedometer(sample, setup.rig.speedometer)
             items.append(Item(utime, source, seq, 1, setup.wheels.kind, setup.wheels, wheels))
+    elif isinstance(sample, MeasurementSample):
+        own = OwnMeasurement(setup.own.get(source, ""))
+        items.append(Item(utime, source, seq, 1, own.type or own.kind, own, sample))
     for part, measurement in enumerate(setup.measurements.get(type(sample), ()), start=1):
         instant = measurement.get_utime(sample)
         if instant is not None:
@@ -135,6 +140,8 @@ def uses_item(mode: Mode, item: Item) -> bool:
         return uses_gnss(mode)
     if isinstance(sample, ImuSample):
         return mode is not Mode.NO_IMU and (mode is not Mode.DEAD_RECKONING or item.kind == "imu_tilt")
+    if isinstance(item.measurement, OwnMeasurement):
+        return mode is not Mode.DEAD_RECKONING or not item.measurement.is_absolute
     return not (mode is Mode.DEAD_RECKONING and isinstance(sample, _WORLD_SAMPLES))
 
 

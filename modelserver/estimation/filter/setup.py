@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import ProcessNoise
 from modelserver.estimation.filter.measurements import REGISTRY, Measurement
 from modelserver.estimation.filter.measurements.gnss import gnss_states
+from modelserver.estimation.filter.measurements.own import get_type
 from modelserver.estimation.filter.measurements.wheels import WheelSpeed, wheel_states
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.findings import find_unusable
@@ -19,19 +21,33 @@ from modelserver.transforms import so3
 STATIONARY_ANGLE_WALK: Final = 1e-5
 """Angle random walk of a stationary vehicle, rad/sqrt(s): its tires give 0.02 deg in 10 minutes."""
 
+NO_TYPES: Final[Mapping[str, str]] = MappingProxyType({})
+
 
 class Setup:
     """A vehicle for the filter. Immutable.
 
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
     layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
-    the configured sensors that cannot be used. The process noises: `driving` on the IMU, `stationary`, `coasting`
-    without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone, `turning`
-    on a gyro of the turn rate alone.
+    the configured sensors that cannot be used. `own` has the sources of measurements of installed packages with their
+    types. The process noises: `driving` on the IMU, `stationary`, `coasting` without any measurement of the motion,
+    `interpolated` on made-up IMU samples, `rolling` on wheels alone, `turning` on a gyro of the turn rate alone.
     """
 
-    def __init__(self, rig: SensorRig, settings: FilterSettings | None = None, kinds: Iterable[type[Measurement]] = ()):
-        """Set up a vehicle; `kinds` are the measurements to use, by default all that are registered."""
+    def __init__(
+        self,
+        rig: SensorRig,
+        settings: FilterSettings | None = None,
+        kinds: Iterable[type[Measurement]] = (),
+        own: Mapping[str, str] = NO_TYPES,
+    ):
+        """Set up a vehicle.
+
+        Parameters
+        ----------
+        kinds: the measurements to use, by default all that are registered.
+        own: for each source of measurements of installed packages its type, see `measurements.own`.
+        """
         self.rig = rig
         self.settings = settings = settings or FilterSettings()
         self.kinds = tuple(kinds) or tuple(REGISTRY.values())
@@ -42,6 +58,8 @@ class Setup:
         if self.wheels is not None:
             extras += wheel_states(settings)
         extras += [state for each in present for state in each.states]
+        self.own = MappingProxyType(dict(own))
+        extras += [state for each in dict.fromkeys(own.values()) for state in get_type(each).states]
         self.has_imu = bool(rig.imu_frame)
         self.mount = rig.pose(rig.imu_frame).wxyz if rig.imu_frame else so3.IDENTITY
         self.layout = ErrorLayout(extras)

@@ -55,7 +55,7 @@ def _make_schema(measurements: tuple[type[Measurement], ...]) -> Schema:
 
 
 def detach(state: CoreState) -> CoreState:
-    """Copy what a state split_variance with its successors, with the history that is written."""
+    """Copy what a state shares with its successors, with the history that is written."""
     view = state.view
     view = view._replace(history=view.history.copy_recent(HISTORY_S), joints=view.joints.detach())
     return state._replace(view=view)

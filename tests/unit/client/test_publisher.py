@@ -64,6 +64,11 @@ def test_given_each_kind_of_sample_then_it_is_received_as_it_was_given(lcm_url: 
     with publishing(lcm_url, "robot/JOINTS", channel_prefix="robot/") as (publisher, receive):
         sent = publisher.joints({"Pan": 0.3, "Tilt": -0.1}, rates={"Pan": 0.1}, sigmas={"Tilt": 0.01})
         assert repr(receive("joints_t")) == repr(sent)
+    with publishing(lcm_url, "MEASUREMENT") as (publisher, receive):
+        sent = publisher.measurement([1.5, 2.0], sigma=(0.5, 2.0), frame="Cart:Radar")
+        assert repr(receive("measurement_t")) == repr(sent)
+        assert (sent.values, sent.covariance) == ((1.5, 2.0), (0.25, 0.0, 0.0, 4.0))
+        assert publisher.measurement((0.0,)).covariance == ()
     with publishing(lcm_url, "DRIVE", channels={"status": "DRIVE"}) as (publisher, receive):
         sent = publisher.status(forward_speed=2.0, steering_angle=0.1)
         assert repr(receive("vehicle_status_t")) == repr(sent)
@@ -86,6 +91,11 @@ def test_given_each_kind_of_sample_then_it_is_received_as_it_was_given(lcm_url: 
         (lambda p: p.joints({"Pan": 0.0}, rates={"Tilt": 0.0}), "Tilt"),
         (lambda p: p.status(steering_angle=20.0), "degrees"),
         (lambda p: p.imu((0, 0, 0), at=1.5e9), "write int"),
+        (lambda p: p.measurement(()), "values has 1 numbers, got 0"),
+        (lambda p: p.measurement(range(17)), "values has 16 numbers, got 17"),
+        (lambda p: p.measurement([math.nan]), "finite"),
+        (lambda p: p.measurement([1.0, 2.0], sigma=[1.0]), "sigma has 2 numbers"),
+        (lambda p: p.measurement([1.0], sigma=[0.0]), "above 0"),
     ],
 )
 def test_given_what_cannot_be_then_it_is_rejected_with_the_reason(

@@ -21,7 +21,7 @@ from msdrivers.emulate.faults import InjectedFault
 from msdrivers.endpoint import HostTime, Send
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.framing import FrameScanner
-from msdrivers.registry import KINDS, DeviceRegistry, EmulatorInputs
+from msdrivers.registry import KINDS, EmulatorInputs, make_registry
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
 
@@ -123,7 +123,7 @@ def test_given_entry_points_then_those_that_can_be_used_are_devices_and_the_othe
         FakeEntryPoint("other_name", kind),
         FakeEntryPoint("gx1", replace(kind, name="gx1")),
     ]
-    registry = DeviceRegistry([KINDS["gx1"]], lambda: entries)
+    registry = make_registry([KINDS["gx1"]], lambda: entries)
     assert registry["gx1"] is KINDS["gx1"]
     assert dict(registry) == {"gx1": KINDS["gx1"], "speed": kind}
     assert registry.plugins == {"speed": kind}
@@ -131,7 +131,7 @@ def test_given_entry_points_then_those_that_can_be_used_are_devices_and_the_othe
         "broken": "ImportError:",
         "number": "package:numb",
         "other_name": "package:othe",
-        "gx1": "there is a d",
+        "gx1": "there is one",
     }
     assert "nothing" not in registry
 

@@ -85,6 +85,19 @@ def test_given_aiding_sources_and_a_mode_channel_then_they_are_subscribed(tmp_pa
     }
 
 
+@pytest.mark.parametrize(
+    ("given", "fix"),
+    [
+        ("relative_pos", "write relative_pose"),
+        ("sonar", "install the package that defines it (entry point group modelserver.measurements), or write one of "),
+    ],
+)
+def test_given_an_unknown_type_of_aiding_then_the_fix_names_what_is_known(tmp_path: Path, given: str, fix: str) -> None:
+    (found,) = problems(tmp_path, f"{VEHICLE}{AIDING}".replace("type: relative_pose", f"type: {given}"))
+    assert (found.element, found.message) == ("sensors.aiding.vo.type", f"unknown type '{given}'")
+    assert found.fix.startswith(fix)
+
+
 @pytest.mark.parametrize("channel", ["GPS", "VO", "POSE", "LOCALIZATION_STATE", "POSE_GET_HISTORY", "VEHICLE_COMMAND"])
 def test_given_a_mode_channel_with_another_use_then_it_is_rejected(tmp_path: Path, channel: str) -> None:
     (found,) = problems(tmp_path, f"{VEHICLE}{AIDING}{KEY}localization: {{mode_channel: {channel}}}\n")

@@ -14,7 +14,17 @@ from tests.support_wire import EXAMPLES
 
 @pytest.mark.parametrize(
     "type_name",
-    ["gps_t", "imu_t", "wheels_t", "joints_t", "absolute_pose_t", "relative_pose_t", "range_t", "localization_mode_t"],
+    [
+        "gps_t",
+        "imu_t",
+        "wheels_t",
+        "joints_t",
+        "absolute_pose_t",
+        "relative_pose_t",
+        "range_t",
+        "measurement_t",
+        "localization_mode_t",
+    ],
 )
 def test_given_a_sample_then_only_its_two_stamps_move(type_name: str) -> None:
     for sample in EXAMPLES[type_name]:
@@ -48,7 +58,7 @@ def test_given_stamps_that_would_leave_64_bits_then_the_message_is_unchanged() -
 def test_given_a_recording_then_commands_and_samples_are_inputs_and_the_rest_is_of_the_service() -> None:
     inputs = {type_name for type_name, values in EXAMPLES.items() if not is_of_service(encode(values[0], type_name))}
     assert inputs == {
-        "gps_t", "imu_t", "wheels_t", "joints_t", "absolute_pose_t", "relative_pose_t", "range_t",
+        "gps_t", "imu_t", "wheels_t", "joints_t", "absolute_pose_t", "relative_pose_t", "range_t", "measurement_t",
         "localization_mode_t", "vehicle_status_t", "vehicle_command_t",
     }  # fmt: skip
     # A command keeps its instant, so that an old one has expired for every receiver: no recording drives a vehicle.

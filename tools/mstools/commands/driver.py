@@ -169,13 +169,18 @@ def show_ports() -> None:
 
 
 def show_plugins() -> None:
-    """Print the kinds of devices of installed packages, and why one of them cannot be used."""
+    """Print the devices and measurements of installed packages, and why one of them cannot be used."""
+    from modelserver.estimation.filter.measurements import MEASUREMENT_TYPES
     from msdrivers.registry import KINDS
 
     for name, kind in KINDS.plugins.items():
         typer.echo(escape(f"{name:<16} device of an installed package: {kind.description}"))
     for name, why in KINDS.problems.items():
         typer.echo(escape(f"{name:<16} device of an installed package, not usable: {why}"), err=True)
+    for name, found in MEASUREMENT_TYPES.plugins.items():
+        typer.echo(escape(f"{name:<16} measurement of an installed package: {'; '.join(found.values)}"))
+    for name, why in MEASUREMENT_TYPES.problems.items():
+        typer.echo(escape(f"{name:<16} measurement of an installed package, not usable: {why}"), err=True)
 
 
 def show_drivers(config: Path) -> None:

@@ -1,7 +1,7 @@
 """Measurement model: residual, Jacobian H and measurement noise R of a sample, for the update of the filter.
 
-A kind of measurement is a class with `@register`; `GpsPosition` in gnss.py is an example, and
-examples/python/own_measurement.py adds one from outside. Jacobians of points of the body for R_true = exp([theta]x) R:
+A kind of measurement is a class with `@register`; `GpsPosition` in gnss.py is an example. Installed packages add theirs
+as own.py describes. Jacobians of points of the body for R_true = exp([theta]x) R:
 
     position        p + R l          by position I, by attitude -[R l]x
     velocity        v + R (w x l)    by velocity I, by attitude -[R (w x l)]x, by gyro bias R [l]x
@@ -64,7 +64,7 @@ class MeasurementContext(NamedTuple):
 
 
 class Measurement(Protocol):
-    """One kind of measurement of a vehicle. Add your own with `@register`; see examples/python/own_measurement.py.
+    """One kind of measurement of a vehicle.
 
     Attributes
     ----------
