@@ -58,7 +58,7 @@ class Setup:
         if self.wheels is not None:
             extras += wheel_states(settings)
         extras += [state for each in present for state in each.states]
-        self.own = MappingProxyType(dict(own))
+        self.own: Mapping[str, str] = dict(own)
         extras += [state for each in dict.fromkeys(own.values()) for state in get_type(each).states]
         self.has_imu = bool(rig.imu_frame)
         self.mount = rig.pose(rig.imu_frame).wxyz if rig.imu_frame else so3.IDENTITY
