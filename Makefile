@@ -1,6 +1,7 @@
 # Two commands on a fresh machine with python3, python3-venv and make:
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
+# and: make deb        a Debian package of it in build/
 # and: make test-quick (without processes and long drives, for the inner loop: 50 seconds on two cores),
 #      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean.
 
@@ -14,10 +15,10 @@ RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test test-quick check format docs bench types clean help
+.PHONY: demo deb test test-quick check format docs bench types clean help
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -6
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -40,6 +41,9 @@ $(DOCS_STAMP): pyproject.toml | $(BIN)/python
 
 demo: $(RUN_STAMP)
 	$(BIN)/modelserver demo
+
+deb: $(RUN_STAMP)
+	$(BIN)/python tools/debian_package.py
 
 test: $(DEV_STAMP)
 	$(BIN)/python -m pytest -n auto $(TESTS)

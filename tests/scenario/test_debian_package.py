@@ -1,0 +1,107 @@
+"""The Debian package: what it contains, and that its environment runs by itself, wherever it is unpacked."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support_lcm import TIMEOUT_S, invoke
+from support_nspawn import build_wheel
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+INSTALLED_MB = 220.0
+"""Largest size of all files: half of an installation by pip with filterpy's plots, 441 MB."""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("dpkg-deb") is None, reason="dpkg-deb is not installed"),
+    pytest.mark.skipif(not Path(f"/usr/bin/{PYTHON}").exists(), reason=f"there is no /usr/bin/{PYTHON}"),
+]
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the package."""
+    pytest.importorskip("hatchling", reason="hatchling, which builds the wheel, is not installed")
+    folder = tmp_path_factory.mktemp("debian")
+    command = [sys.executable, ROOT / "tools" / "debian_package.py", "--output", folder, "--compression", "none"]
+    built = subprocess.run(
+        [*command, "--wheel", build_wheel(folder)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    (package,) = folder.glob("modelserver_*.deb")
+    assert f"install it: sudo apt install {package}" in built.stdout
+    subprocess.run(["dpkg-deb", "-R", package, folder / "root"], check=True, timeout=TIMEOUT_S)
+    return folder / "root"
+
+
+def run(unpacked: Path, *arguments: str, command: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the package's command; it finds its packages beside itself, and nothing of this environment."""
+    folder = unpacked / "usr/lib/modelserver/bin"
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    return subprocess.run(
+        [folder / "python", command or folder / "modelserver", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        env=clean,
+        cwd=unpacked,
+        check=False,
+    )
+
+
+def test_given_the_package_then_it_holds_what_a_vehicle_needs_and_no_plots(unpacked: Path) -> None:
+    site = unpacked / f"usr/lib/modelserver/lib/{PYTHON}/site-packages"
+    there = {path.name for path in site.iterdir()}
+    assert {"modelserver", "msdrivers", "mstools", "mslcm", "filterpy", "lcm", "numpy", "pyubx2"} <= there
+    assert not {"matplotlib", "scipy", "pytest", "mypy", "pip"} & there
+    size = sum(path.lstat().st_size for path in unpacked.rglob("*")) / 1e6
+    assert size < INSTALLED_MB
+    control = (unpacked / "DEBIAN/control").read_text()
+    assert f"\nDepends: {PYTHON}" in control
+    kilobytes = int(control.partition("\nInstalled-Size: ")[2].split()[0])
+    assert kilobytes * 1024 == pytest.approx(size * 1e6, rel=0.01)
+    completion = (unpacked / "usr/share/bash-completion/completions/modelserver").read_text()
+    assert "complete -o default -F _modelserver_completion modelserver" in completion
+    for path in unpacked.rglob("*"):
+        assert path.is_symlink() or path.stat().st_mode & 0o444 == 0o444, path
+
+
+def test_given_the_package_then_its_command_checks_queries_and_replays(unpacked: Path) -> None:
+    config = ROOT / "config" / "raptor"
+    assert run(unpacked, "--version").stdout.startswith("modelserver ")
+    checked = run(unpacked, "check", str(config / "vehicle.yaml"))
+    assert (checked.returncode, checked.stderr) == (0, "")
+    frames = ("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")
+    found = run(unpacked, "query", *frames, "--model", str(config / "geometry.xml"))
+    assert found.stdout == invoke("", "query", *frames, "--model", str(config / "geometry.xml")).stdout
+
+
+IMPORT_ALL = """
+import pkgutil, modelserver, msdrivers, mslcm, mstools
+for package in (modelserver, msdrivers, mslcm, mstools):
+    for each in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        try:
+            __import__(each.name)
+        except ModuleNotFoundError as error:
+            print(error.name)
+"""
+
+
+def test_given_the_package_then_every_module_finds_what_it_needs(unpacked: Path) -> None:
+    script = unpacked / "import_all.py"
+    script.write_text(IMPORT_ALL)
+    imported = run(unpacked, command=script)
+    # those of the extra "bags"
+    assert (imported.returncode, set(imported.stdout.split()) <= {"rosbags"}) == (0, True), imported
+
+
+@pytest.mark.parametrize("script", ["postinst", "prerm"])
+def test_given_a_script_of_the_package_then_the_shell_accepts_it(unpacked: Path, script: str) -> None:
+    checked = subprocess.run(["sh", "-n", unpacked / "DEBIAN" / script], capture_output=True, text=True, check=False)
+    assert (checked.returncode, checked.stderr) == (0, "")
