@@ -59,7 +59,9 @@ class Listener:
     def __init__(self, url: str, channel: str):
         self.received: list[bytes] = []
         self.bus = lcm.LCM(url)
-        self.bus.subscribe(re.escape(channel), lambda _, data: self.received.append(data))
+        received = self.received
+        # not self: a handler that refers to its bus keeps it open
+        self.bus.subscribe(re.escape(channel), lambda _, data: received.append(data))
 
     def wait(self, count: int = 1, seconds: float = TIMEOUT_S) -> bool:
         """Return whether `count` messages were received in time."""

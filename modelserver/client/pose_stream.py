@@ -12,6 +12,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Final, Self
 
+import lcm
+
 from modelserver.errors import WireError
 from modelserver.messages import PoseAnswer
 from modelserver.wire.channels import to_subscription_pattern
@@ -46,8 +48,8 @@ class PoseStream:
         self._wake: Callable[[], object] | None = None
         self._is_closed = False
         self._bus = open_lcm(url)
-        self._bus.subscribe(to_subscription_pattern(channel), self._receive)
-        self._thread = threading.Thread(target=self._run, name=f"poses of {channel}", daemon=True)
+        subscription = self._bus.subscribe(to_subscription_pattern(channel), self._receive)
+        self._thread = threading.Thread(target=self._run, args=(subscription,), name=f"poses of {channel}", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -103,9 +105,11 @@ class PoseStream:
                 self._wake = wake
             await event.wait()
 
-    def _run(self) -> None:
+    def _run(self, subscription: lcm.LCMSubscription) -> None:
         while not self._is_closed:
             handle_message(self._bus, POLL_MS)
+        # leaves the bus, which the handler would keep open
+        self._bus.unsubscribe(subscription)
 
     def _receive(self, _: str, data: bytes) -> None:
         try:

@@ -23,6 +23,8 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol, TypeAlias
 
+import lcm
+
 from modelserver.wire.channels import to_subscription_pattern
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 
@@ -166,22 +168,30 @@ class LcmInbox:
     def __init__(self, url: str, queue_bytes: int):
         self._queue_bytes = queue_bytes
         self.lcm = open_lcm(url)
+        self._subscriptions: list[lcm.LCMSubscription] = []
         self.fileno = self.lcm.fileno()
         self.expected: int | None = None
         """Messages that `LcmBus.wait` has found: 0, 1 (later ones are found by the next wait), None = unknown."""
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
-        limit = QueueLimit(self._queue_bytes)
+        limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
 
         def handle(name: str, data: bytes) -> None:
             if limit.update(len(data)):
-                subscription.set_queue_capacity(limit.capacity)
+                self._subscriptions[index].set_queue_capacity(limit.capacity)
             handler(name, data)
 
         subscription = self.lcm.subscribe(to_subscription_pattern(channel), handle)
         # LCM drops silently beyond it; the loop drops and counts long before, unless a flood is faster than that
         subscription.set_queue_capacity(limit.capacity)
+        self._subscriptions.append(subscription)
+
+    def close(self) -> None:
+        """End all subscriptions, whose handlers keep the instance in memory."""
+        for each in self._subscriptions:
+            self.lcm.unsubscribe(each)
+        self._subscriptions.clear()
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """See `Inbox`."""
@@ -234,3 +244,9 @@ class LcmBus:
         some = 1 if time.monotonic() - begin > MIN_SLEEP_S else None
         for inbox in (self.sensors, self.requests):
             inbox.expected = some if inbox.fileno in ready else 0
+
+    def close(self) -> None:
+        """Leave the bus: no handler is called any more, and nothing keeps the instances in memory."""
+        self._membership.close()
+        for inbox in (self.sensors, self.requests):
+            inbox.close()

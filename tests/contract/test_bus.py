@@ -69,9 +69,11 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
         return
     with reserved_url() as url:
-        rig = Rig(LcmBus(url), Clock())
+        bus = LcmBus(url)
+        rig = Rig(bus, Clock())
         rig.subscribe("LAST")
         yield rig
+        bus.close()
 
 
 def test_given_a_message_then_its_subscribers_receive_channel_and_bytes(rig: Rig) -> None:

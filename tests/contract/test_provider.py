@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import os
+import resource
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import lcm
 import pytest
-from support_lcm import reserved_url
+from support_lcm import TIMEOUT_S, reserved_url
 
+from modelserver import Platform, PlatformMirror, SensorPublisher
 from modelserver.errors import BusError
-from modelserver.wire.provider import handle_message, open_lcm
+from modelserver.server.bus import LcmBus
+from modelserver.wire.provider import SELECT_LIMIT, handle_message, open_lcm
 from modelserver.wire.urls import find_url_problem
+from mstools.commands.listener import DaemonListener
 
 WAIT_MS = 1000
 
@@ -124,3 +132,55 @@ def test_given_a_valid_url_then_it_is_not_rejected(ttl: str) -> None:
         other = url.replace("ttl=0", f"ttl={ttl}")
         assert not find_url_problem(other)
         assert open_lcm(other)
+
+
+def test_given_too_many_open_files_then_the_bus_is_refused_instead_of_memory_overwritten() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard if hard == resource.RLIM_INFINITY else max(soft, hard), hard))
+    opened: list[int] = []
+    try:
+        with contextlib.suppress(OSError):
+            while not opened or opened[-1] < SELECT_LIMIT:
+                opened.append(os.open(os.devnull, os.O_RDONLY))
+        with pytest.raises(BusError, match=r"open files|ulimit -n"):
+            open_lcm("udpm://239.255.76.67:7667?ttl=0")
+    finally:
+        for each in opened:
+            os.close(each)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def count_descriptors() -> int:
+    gc.collect()
+    return len(os.listdir("/proc/self/fd"))
+
+
+class OwnListener(DaemonListener):
+    """A listener whose handler refers to itself."""
+
+    def __init__(self, url: str):
+        super().__init__(open_lcm(url), "", {"POSE": self.on_pose})
+
+    def on_pose(self, _: object) -> None:
+        pass
+
+
+def test_given_what_has_left_the_bus_then_its_descriptors_are_closed(lcm_url: str) -> None:
+    def use_all() -> None:
+        bus = LcmBus(lcm_url)
+        bus.sensors.subscribe("GPS", lambda channel, data: bus.wait(0.0))
+        bus.close()
+        with Platform(lcm_url) as platform:
+            platform.subscribe_pose(print).close()
+        with PlatformMirror(lcm_url), SensorPublisher("imu", url=lcm_url):
+            pass
+        OwnListener(lcm_url).listen(0.0, lambda: True)
+
+    use_all()
+    before = count_descriptors()
+    for _ in range(3):
+        use_all()
+    # LCM closes some in a thread of its own
+    deadline = time.monotonic() + TIMEOUT_S
+    while count_descriptors() > before:
+        assert time.monotonic() < deadline

@@ -58,11 +58,13 @@ def answering(url: str, stop: threading.Event, ready: threading.Event) -> None:
             assert isinstance(each, SendReply)
             bus.publish(each.channel, encode(each.reply))
 
-    for channel in TYPES:
-        bus.subscribe(channel, answer)
+    subscriptions = [bus.subscribe(channel, answer) for channel in TYPES]
     ready.set()
     while not stop.is_set():
         bus.handle_timeout(20)
+    # the handlers refer to the bus, and keep it open
+    for each in subscriptions:
+        bus.unsubscribe(each)
 
 
 @pytest.fixture(scope="module")

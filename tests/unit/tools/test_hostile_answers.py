@@ -65,8 +65,7 @@ def false_daemon(status: Status) -> Iterator[str]:
 
             return answer
 
-        for kind in GOOD:
-            bus.subscribe(CHANNEL_OF[kind], answering(kind))
+        subscriptions = [bus.subscribe(CHANNEL_OF[kind], answering(kind)) for kind in GOOD]
 
         def run() -> None:
             while not ended.is_set():
@@ -79,6 +78,9 @@ def false_daemon(status: Status) -> Iterator[str]:
         finally:
             ended.set()
             thread.join()
+            # the handlers refer to the bus, and keep it open
+            for each in subscriptions:
+                bus.unsubscribe(each)
 
 
 @pytest.mark.parametrize("status", [Status.OK, Status.UNKNOWN_FRAME, Status.FORBIDDEN, Status.REJECTED])

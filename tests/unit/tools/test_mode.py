@@ -62,7 +62,7 @@ class Answering:
         self.mode, self.applies, self.decides, self.prefix = mode, applies, decides, prefix
         self.commands: list[SwitchMode] = []
         self.bus = lcm.LCM(url)
-        self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.on_command)
+        self.subscriptions = [self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.on_command)]
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self.run)
 
@@ -73,6 +73,8 @@ class Answering:
     def __exit__(self, *_: object) -> None:
         self.ended.set()
         self.thread.join()
+        # its handler refers to this object, and so to the bus
+        self.bus.unsubscribe(self.subscriptions.pop())
 
     def run(self) -> None:
         while not self.ended.is_set():

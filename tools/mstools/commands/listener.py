@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -29,19 +30,26 @@ class DaemonListener:
     def __init__(self, bus: lcm.LCM, prefix: str, handlers: Mapping[str, Callable[[Any], object]]):
         self.has_received = False
         self._bus = bus
+        self._handlers = dict(handlers)
+        # a weak reference, so that the bus is left with this object
+        receive = partial(_receive, weakref.ref(self))
         self.subscriptions = [
-            bus.subscribe(to_subscription_pattern(f"{prefix}{name}"), partial(self._receive, name, handler))
-            for name, handler in handlers.items()
+            bus.subscribe(to_subscription_pattern(f"{prefix}{name}"), partial(receive, name)) for name in handlers
         ]
 
-    def _receive(self, name: str, handler: Callable[[Any], object], _: str, data: bytes) -> None:
+    def _receive(self, name: str, data: bytes) -> None:
         self.has_received = True
         with suppress(WireError):
-            handler(decode(BY_NAME[name].type_name, data))
+            self._handlers[name](decode(BY_NAME[name].type_name, data))
 
     def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
         """Listen for up to `seconds` until a condition holds; return whether it does."""
         return handle_until(self._bus, seconds, until)
+
+
+def _receive(listener: weakref.ref[DaemonListener], name: str, _: str, data: bytes) -> None:
+    if (found := listener()) is not None:
+        found._receive(name, data)
 
 
 def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> bool:
