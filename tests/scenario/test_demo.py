@@ -127,7 +127,7 @@ def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_reports_whi
     finally:
         close(process)
     assert process.returncode == 1
-    assert "the driver imu was killed by SIGKILL. Its output:" in err
+    assert "process imu was killed by SIGKILL. Its output:" in err
     assert "imu: closed:" in err  # from before its device was there
     assert list_running(vehicle) == {}
 
@@ -164,7 +164,7 @@ def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_re
 
     with ChildProcesses() as children:
         children.start("daemon", "-c", "import sys; sys.exit('the geometry is wrong')")
-        with pytest.raises(LaunchError, match=r"the daemon ended with exit code 1(.|\n)*the geometry is wrong"):
+        with pytest.raises(LaunchError, match=r"process daemon ended with exit code 1(.|\n)*the geometry is wrong"):
             demo.wait_for_answer(nobody, children)
 
 

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +31,31 @@ DRIVERS = """
 drivers:
   gps: {{device: novatel, port: {folder}/gps, bauds: [38400], rate_hz: 20}}
   nmea: {{device: nmea, address: "127.0.0.1:{port}", rate_hz: 4}}
+  ublox: {{device: ublox, port: {folder}/ublox, rate_hz: 10}}
+  gpsd: {{device: gpsd, address: "127.0.0.1:{gpsd_port}"}}
   imu: {{device: gx1, port: {folder}/imu}}
+  vectornav: {{device: vectornav, port: {folder}/vectornav, rate_hz: 100}}
+  xsens: {{device: xsens, port: {folder}/xsens, rate_hz: 100}}
+  text_imu:
+    device: text_imu
+    port: {folder}/text_imu
+    baud: 115200
+    columns: 7
+    fields:
+      time: {{column: 0, scale: 0.001}}
+      specific_force_x: {{column: 1, scale: 9.80665}}
+      specific_force_y: {{column: 2, scale: 9.80665}}
+      specific_force_z: {{column: 3, scale: 9.80665}}
+      angular_velocity_x: {{column: 4, scale: 0.0174533}}
+      angular_velocity_y: {{column: 5, scale: 0.0174533}}
+      angular_velocity_z: {{column: 6, scale: 0.0174533}}
+  head:
+    device: text_joints
+    port: {folder}/head
+    baud: 57600
+    columns: 1
+    joints:
+      nod: {{column: 0, scale: 0.0174533}}
   wheels:
     device: wheels
     can: "239.74.163.2:{port}"
@@ -48,7 +72,7 @@ drivers:
         is_steered: true
   axis:
     device: axis
-    address: "127.0.0.1:{port}"
+    address: "127.0.0.1:{axis_port}"
     joint: nod
     registers:
       angle: {{address: 0, scale_deg: 0.01}}
@@ -77,13 +101,26 @@ drivers:
 CHANNELS = {
     "gps": ("GPS", "gps_t"),
     "nmea": ("GPS", "gps_t"),
+    "ublox": ("GPS", "gps_t"),
+    "gpsd": ("GPS", "gps_t"),
     "imu": ("IMU", "imu_t"),
+    "vectornav": ("IMU", "imu_t"),
+    "xsens": ("IMU", "imu_t"),
+    "text_imu": ("IMU", "imu_t"),
+    "head": ("JOINTS", "joints_t"),
     "wheels": ("WHEELS", "wheels_t"),
     "axis": ("JOINTS", "joints_t"),
     "raptor": ("VEHICLE_STATUS", "vehicle_status_t"),
 }
 
-RATES_HZ = {"gps": 20, "nmea": 4, "imu": 100, "wheels": 100, "axis": 50}
+RATES_HZ = {
+    "gps": 20, "nmea": 4, "ublox": 10, "gpsd": 4, "imu": 100, "vectornav": 100, "xsens": 100, "text_imu": 100,
+    "wheels": 100, "axis": 50, "head": 50,
+}  # fmt: skip
+"""Rate of each device, as it is configured or emulated."""
+
+GROUPS = (("gps", "nmea", "imu", "wheels", "axis"), ("ublox", "gpsd", "vectornav", "xsens", "text_imu", "head"))
+"""Devices that are unplugged together: each waits as long."""
 
 UNPLUGGED_S, BACK_S = 5.0, 2.0
 WHEEL_COUNTS = 256
@@ -97,6 +134,8 @@ class Bench:
     folder: Path
     url: str
     port: int
+    axis_port: int
+    gpsd_port: int
     samples: list[Any] = field(default_factory=list)
     received_at: list[float] = field(default_factory=list)
     """When each sample was received, seconds of the monotonic clock."""
@@ -107,7 +146,7 @@ class Bench:
             shutil.copy(ROOT / "config" / "raptor" / name, self.folder)
         # the drivers of the trial in place of the vehicle's own, which come last
         rest, _, _ = self.vehicle.read_text().partition("\ndrivers:")
-        self.vehicle.write_text(rest + DRIVERS.format(folder=self.folder, port=self.port))
+        self.vehicle.write_text(rest + DRIVERS.format(**vars(self)))
         self.bus = lcm.LCM(self.url)
         self.bus.subscribe("DRIVER_HEALTH", lambda _, data: self.reports.append(decode("driver_health_t", data)))
 
@@ -116,13 +155,19 @@ class Bench:
         return self.folder / "vehicle.yaml"
 
     def subscribe(self, name: str) -> None:
-        channel, type_name = CHANNELS[name]
+        self.subscribe_channel(*CHANNELS[name])
 
+    def subscribe_channel(self, channel: str, type_name: str) -> None:
         def handle(_: str, data: bytes) -> None:
             self.received_at.append(time.monotonic())
             self.samples.append(decode(type_name, data))
 
         self.bus.subscribe(channel, handle).set_queue_capacity(0)
+
+    def samples_of(self, name: str) -> list[tuple[float, Any]]:
+        """Return the samples of a driver, each with when it was received."""
+        rows = zip(self.received_at, self.samples, strict=True)
+        return [row for row in rows if row[1].header.source == name]
 
     def wait(self, arrived: Callable[[], bool], what: str) -> None:
         if not wait_until(self.bus, arrived, TIMEOUT_S):
@@ -148,15 +193,15 @@ class Bench:
     @contextmanager
     def device(self, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         """Run an emulator; the block begins when its line is open."""
+        pty = ("--pty", "--link", self.folder / name)
         lines = {
-            "gps": ("--pty", "--link", self.folder / "gps"),
-            "imu": ("--pty", "--link", self.folder / "imu"),
             "nmea": ("--tcp", str(self.port)),
-            "axis": ("--tcp", str(self.port)),
+            "axis": ("--tcp", str(self.axis_port)),
+            "gpsd": ("--tcp", str(self.gpsd_port)),
             "wheels": ("--can", f"239.74.163.2:{self.port}"),
             "raptor": ("--can", f"239.74.163.2:{self.port}"),
         }
-        command = (*MODELSERVER, "emulate", name, "-c", self.vehicle, *lines[name], *arguments)
+        command = (*MODELSERVER, "emulate", name, "-c", self.vehicle, *lines.get(name, pty), *arguments)
         with (
             (self.folder / "device.log").open("a") as log,
             run_process(command, self.url, stderr=log, stdout=subprocess.PIPE) as process,
@@ -188,8 +233,8 @@ def reserved_port() -> Iterator[int]:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    with reserved_url() as url, reserved_port() as port:
-        yield Bench(tmp_path, url, port)
+    with reserved_url() as url, reserved_port() as port, reserved_port() as axis_port, reserved_port() as gpsd_port:
+        yield Bench(tmp_path, url, port, axis_port, gpsd_port)
 
 
 @contextmanager
@@ -215,48 +260,65 @@ def counted_frames(bench: Bench) -> Iterator[list[float]]:
         link.close()
 
 
-@pytest.mark.parametrize("name", RATES_HZ)
-def test_given_a_device_unplugged_for_5_s_then_it_streams_within_2_s_of_its_return_and_nothing_is_lost(
-    bench: Bench, name: str
+@pytest.mark.parametrize("names", GROUPS, ids="-".join)
+def test_given_devices_unplugged_for_5_s_then_they_stream_within_2_s_of_their_return_and_nothing_is_lost(
+    bench: Bench, names: tuple[str, ...]
 ) -> None:
-    bench.subscribe(name)
-    enough = round(2.0 * RATES_HZ[name]) + 8
+    for channel in {CHANNELS[name] for name in names}:
+        bench.subscribe_channel(*channel)
+
+    def have_all(more: Mapping[str, int] | None = None) -> bool:
+        """Return whether there are samples of two seconds, and the first ones, of each device, since so many."""
+        enough = {name: round(2.0 * RATES_HZ[name]) + 8 for name in names}
+        return all(len(bench.samples_of(name)) >= enough[name] + (more or {}).get(name, 0) for name in names)
+
+    def are_streaming() -> bool:
+        last = {report.source: report.phase for report in bench.reports}
+        return all(last.get(name) is DriverPhase.STREAMING for name in names)
+
     with ExitStack() as stack:
-        frames = stack.enter_context(counted_frames(bench)) if name == "wheels" else None
-        driver = stack.enter_context(bench.driver(name))
-        bench.wait(lambda: bool(bench.reports), "a report without a device")
-        with bench.device(name) as device:
-            bench.wait(lambda: len(bench.samples) >= enough, "samples")
-            bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming")
-            device.kill()
-            device.wait(TIMEOUT_S)
-            # as the system does with the name of an unplugged adapter
-            (bench.folder / name).unlink(missing_ok=True)
+        frames = stack.enter_context(counted_frames(bench)) if "wheels" in names else None
+        drivers = [stack.enter_context(bench.driver(name)) for name in names]
+        bench.wait(lambda: {each.source for each in bench.reports} == set(names), "a report without a device")
+        with ExitStack() as plugged:
+            devices = [plugged.enter_context(bench.device(name)) for name in names]
+            bench.wait(have_all, "samples")
+            bench.wait(are_streaming, "streaming")
+            for name, device in zip(names, devices, strict=True):
+                device.kill()
+                device.wait(TIMEOUT_S)
+                # as the system does with the name of an unplugged adapter
+                (bench.folder / name).unlink(missing_ok=True)
         bench.elapse(UNPLUGGED_S)
-        before = len(bench.samples)
-        assert bench.phase() in (DriverPhase.CLOSED, DriverPhase.SILENT)
-        with bench.device(name):
-            back = time.monotonic()
-            bench.wait(lambda: len(bench.samples) >= before + enough, "samples after its return")
-            bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming after its return")
-        assert bench.received_at[before] - back < BACK_S
+        before = {name: len(bench.samples_of(name)) for name in names}
+        last = {report.source: report.phase for report in bench.reports}
+        assert set(last.values()) <= {DriverPhase.CLOSED, DriverPhase.SILENT}
+        back: dict[str, float] = {}
+        with ExitStack() as plugged:
+            for name in names:
+                plugged.enter_context(bench.device(name))
+                back[name] = time.monotonic()
+            bench.wait(lambda: have_all(before), "samples after their return")
+            bench.wait(are_streaming, "streaming after their return")
         if frames is not None:
-            bench.wait(lambda: len(bench.samples) >= len(frames), f"a sample for each of {len(frames)} frames")
-            assert len(bench.samples) == len(frames)
-        driver.send_signal(signal.SIGTERM)
-        assert driver.wait(TIMEOUT_S) == 0
-    bench.wait(lambda: bench.reports[-1].text == "ended", "the last report")
-    health = bench.reports[-1]
-    assert (health.source, health.text) == (name, "ended")
-    assert health.samples == len(bench.samples)
-    sequence = [sample.header.seq for sample in bench.samples]
-    assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))
-    for sample in bench.samples:
-        header = sample.header
-        assert header.source == name
-        assert 0 <= header.host_utime - header.utime < 1_000_000
-    for run in (bench.samples[8:before], bench.samples[before + 8 :]):
-        assert_rate(name, run)
+            wheels = bench.samples_of("wheels")
+            bench.wait(lambda: len(bench.samples_of("wheels")) >= len(frames), f"a sample for {len(frames)} frames")
+            assert len(bench.samples_of("wheels")) == len(frames), len(wheels)
+        for driver in drivers:
+            driver.send_signal(signal.SIGTERM)
+        assert [driver.wait(TIMEOUT_S) for driver in drivers] == [0] * len(names)
+    bench.wait(lambda: sum(each.text == "ended" for each in bench.reports) == len(names), "the last reports")
+    for name in names:
+        samples = bench.samples_of(name)
+        (health,) = (each for each in bench.reports if (each.source, each.text) == (name, "ended"))
+        assert health.samples == len(samples)
+        sequence = [sample.header.seq for _, sample in samples]
+        assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))
+        assert samples[before[name]][0] - back[name] < BACK_S, name
+        for _, sample in samples:
+            assert 0 <= sample.header.host_utime - sample.header.utime < 1_000_000
+        for run in (samples[8 : before[name]], samples[before[name] + 8 :]):
+            assert_rate(name, [sample for _, sample in run])
 
 
 def assert_rate(name: str, samples: list[Any]) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from modelserver import load_model
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Severity
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
@@ -36,6 +39,32 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 def find_problems(folder: Path) -> list[str]:
     _, problems = check_vehicle(str(folder / "vehicle.yaml"))
     return [str(each) for each in problems if each.severity is not Severity.NOTE]
+
+
+def test_given_a_pan_tilt_head_then_the_camera_moves_with_its_joints(tmp_path: Path, run: Run) -> None:
+    folder = tmp_path / "head"
+    code, out, err = run(folder, "--yes", "--pan-tilt", "/dev/ttyUSB7")
+    assert (code, err) == (0, "")
+    assert find_problems(folder) == []
+    model = load_model(folder / "geometry.yaml")
+    assert list(model.joints) == ["Pan", "Tilt"]
+    # to the left and up: what lies ahead of the lens
+    path = model.get_kinematic_path("Camera:Lens", "HeadVehicle:Base")
+    positions = {"Pan": (0.2,), "Tilt": (0.3,)}
+    ahead = path.compute_pose([positions[each.name] for each in path.joints])
+    x, y, z = np.subtract(ahead.transform((0.0, 0.0, 1.0)), ahead.xyz)
+    assert (math.atan2(y, x), math.asin(z)) == pytest.approx((0.2, 0.3))
+    head = load_config(folder / "vehicle.yaml").drivers["head"]
+    assert (head["device"], head["port"], set(head["joints"])) == ("text_joints", "/dev/ttyUSB7", {"Pan", "Tilt"})
+    assert ":49: port: its line" in out
+
+
+@pytest.mark.parametrize("options", [("--no-camera",), ("--from-urdf", "arm.urdf")])
+def test_given_a_head_without_a_camera_then_the_error_names_the_option(
+    options: tuple[str, ...], tmp_path: Path, run: Run
+) -> None:
+    code, _, err = run(tmp_path / "rover", "--yes", "--pan-tilt", "/dev/ttyUSB7", *options)
+    assert (code, "--camera" in err) == (2, True)
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)
@@ -150,7 +179,9 @@ def test_given_a_urdf_then_its_frames_are_found_or_asked_for(tmp_path: Path, run
 def test_given_a_terminal_then_it_asks_until_the_answer_is_known(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers = iter(["cart", "tank", "tracked", "novatel", "/dev/ttyUSB5", "gx1", "/dev/ttyUSB6", "none", "y"])
+    answers = iter(
+        ["cart", "tank", "tracked", "novatel", "/dev/ttyUSB5", "gx1", "/dev/ttyUSB6", "none", "y", "/dev/ttyUSB7"]
+    )
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
     monkeypatch.setattr("typer.prompt", lambda question, default: next(answers))
     monkeypatch.setattr("typer.confirm", lambda question, default: next(answers) == "y")
@@ -160,6 +191,6 @@ def test_given_a_terminal_then_it_asks_until_the_answer_is_known(
     assert "'tank' is none of these" in out
     config = load_config(tmp_path / "vehicle.yaml")
     drivers: Any = config.drivers
-    assert set(drivers) == {"gps", "imu"}
+    assert set(drivers) == {"gps", "imu", "head"}
     assert drivers["gps"]["port"] == "/dev/ttyUSB5"
     assert find_problems(tmp_path) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,15 +17,18 @@ from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
 from mstools.deployment.steps import get_examples_folder
-from mstools.launch.connections import EmulatedConnections, make_connections
-from mstools.launch.processes import MODELSERVER, ChildProcesses, LaunchError
+from mstools.launch.connections import (
+    EmulatedConnections,
+    get_start_utime,
+    make_connections,
+    start_devices,
+    start_programs,
+)
+from mstools.launch.processes import ChildProcesses, LaunchError
 from mstools.terminal.options import option
+from mstools.terminal.output import escape
 
 SEED = 20050901
-LEAD_SECONDS = 1.5
-LEAD_FACTOR = 0.5
-"""Time from the start of the devices to the drive, plus this fraction of the loading time of the processes before,
-which measures how slow the machine is. The vehicle is stationary at first, so a late device misses nothing."""
 START_TIMEOUT_S = 20.0
 """Timeout for the first message of daemon and drivers, seconds."""
 EXTRA_SECONDS = 60.0
@@ -40,7 +43,7 @@ def command(
     seconds: Annotated[float, option("--seconds S", "Duration of the drive.", min=7.0, max=600.0)] = 10.0,
     verbose: Annotated[bool, option("--verbose", "Show the logs of all processes.")] = False,
 ) -> None:
-    """Run the whole service on emulated devices and show its answers.
+    """Run the whole service on emulated devices and show its answers: `modelserver up --emulate`, and queries.
 
     Starts the daemon for the report's Raptor, the drivers of its vehicle file, and an emulator for each device: GPS and
     IMU on pseudo-terminals, the vehicle's controller on a CAN bus over UDP, the nodding axis on Modbus/TCP, all on one
@@ -62,6 +65,12 @@ def print_line(name: str, text: str) -> None:
     typer.echo(f"{name}: {text}", err=True)
 
 
+def show_commands(commands: Iterable[str]) -> None:
+    """Print command lines, which may be typed in a shell."""
+    for each in commands:
+        typer.echo(escape(each))
+
+
 def find_vehicle_file() -> Path:
     """Return the Raptor's vehicle file in the package. Raises LaunchError."""
     file = get_examples_folder() / "raptor" / "vehicle.yaml"
@@ -72,12 +81,9 @@ def find_vehicle_file() -> Path:
 
 def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesses) -> None:
     """Start all processes, query, and print. Raises LaunchError if something is missing."""
-    config = str(lines.vehicle)
     typer.echo(f"1. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to emulated devices")
     start = time.monotonic()
-    for name, words in (("daemon", ("run",)), *((f"driver {name}", ("driver", name)) for name in lines.devices)):
-        children.start(name, *MODELSERVER, *words, "-c", config, "--url", lines.url)
-        typer.echo(f"modelserver {' '.join(words)} -c {config} --url '{lines.url}'")
+    show_commands(start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url)))
     # heavy imports, while the child processes load
     from modelserver.client.remote import Platform
     from modelserver.config.vehicle_file import load_config
@@ -94,13 +100,9 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         platform.timeout, platform.retries = 1.0, 9
 
         typer.echo("\n2. Emulated devices, a process each, found by their drivers")
-        loading_time = time.monotonic() - start
-        start_utime = round((time.time() + LEAD_SECONDS + LEAD_FACTOR * loading_time) * 10) * 100_000
-        together = ("--start", str(start_utime), "--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
-        for name, line in lines.devices.items():
-            words = ("emulate", name, "-c", config, *line, *together)
-            children.start(f"device {name}", *MODELSERVER, *words, is_last=True)
-            typer.echo(f"modelserver emulate {name} -c {config} {' '.join((*line, *together))}")
+        start_utime = get_start_utime(time.monotonic() - start)
+        options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
+        show_commands(start_devices(children, lines, start_utime, options))
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
         typer.echo("\n3. Queries of the geometry")

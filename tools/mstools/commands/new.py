@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -54,6 +55,9 @@ def command(
     imu: Annotated[str, option("--imu DEVICE[@LINE]", "Inertial unit, e.g. gx1@/dev/ttyUSB1; none.")] = "",
     wheels: Annotated[str, option("--wheels CHANNEL", "CAN channel of the wheel encoders, e.g. can0; none.")] = "",
     camera: Annotated[bool | None, option("--camera/--no-camera", "Whether there is a camera.")] = None,
+    pan_tilt: Annotated[
+        str, option("--pan-tilt LINE", "Port of a pan-tilt head below the camera, e.g. /dev/ttyUSB2; none.")
+    ] = "",
     urdf: Annotated[
         Path | None, option("--from-urdf FILE", "Take the geometry from this URDF or geometry file.")
     ] = None,
@@ -77,6 +81,10 @@ def command(
     for option_name, given in (("--base-frame", base_frame), ("--gps-frame", gps_frame), ("--imu-frame", imu_frame)):
         if given and urdf is None:
             raise typer.BadParameter("goes with --from-urdf", param_hint=option_name)
+    has_head = pan_tilt not in ("", NONE)
+    if has_head and (camera is False or urdf is not None):
+        raise typer.BadParameter("goes with --camera, and without --from-urdf", param_hint="--pan-tilt")
+    camera = True if has_head else camera
     ask = Questions(is_asking=not yes and sys.stdin.isatty())
     model = None if urdf is None else _load_geometry(urdf)
     known = {name: f"{each.summary}" for name, each in TEMPLATES.items()}
@@ -89,8 +97,11 @@ def command(
         ask.device("Inertial unit", imu, list_kinds(KINDS, ImuSample), DEFAULT_IMU, "--imu"),
         None if model is not None else ask.wheels(wheels),
         model is None and ask.flag("Is there a camera?", camera),
+        None,
         None if model is None else find_frames(model, base_frame, gps_frame, imu_frame),
     )
+    if wanted.has_camera:
+        wanted = dataclasses.replace(wanted, head=ask.head(pan_tilt))
     files = {GEOMETRY_FILE: make_geometry(wanted) if model is None else save_model(model, "yaml").text}
     if wanted.wheels is not None:
         files[DBC_FILE] = make_dbc(wanted)
@@ -145,6 +156,12 @@ class Questions:
         line = self.text(f"{what}: its port", line, propose_line(kind, self._used))
         self._used.add(line)
         return Device(kind, line)
+
+    def head(self, given: str) -> Device | None:
+        """Return the pan-tilt head that carries the camera; None for none."""
+        question = "Port of the pan-tilt head below the camera (none: it is fixed)"
+        line = self.text(question, given, NONE)
+        return None if line == NONE else Device(KINDS["text_joints"], line)
 
     def wheels(self, given: str) -> Device | None:
         """Return the wheels on a CAN bus; None for none."""

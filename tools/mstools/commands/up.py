@@ -8,7 +8,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -23,8 +23,16 @@ from mstools.commands.driver import load_driver
 from mstools.commands.emulate import SCENARIOS
 from mstools.commands.run import LEVELS, check_log_options
 from mstools.commands.status import HealthListener
-from mstools.launch.connections import STATE_FOLDER, EmulatedConnections, make_connections
-from mstools.launch.processes import MODELSERVER, ChildProcesses
+from mstools.launch.connections import (
+    SERVICE,
+    STATE_FOLDER,
+    EmulatedConnections,
+    get_start_utime,
+    make_connections,
+    start_devices,
+    start_programs,
+)
+from mstools.launch.processes import ChildProcesses
 from mstools.terminal.health_text import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
 from mstools.terminal.output import escape, print_problems
@@ -35,17 +43,11 @@ DEFAULT_FILE: Final = Path("vehicle.yaml")
 EMULATED_FOLDER: Final = "emulated"
 """Folder beside the vehicle file for the copy that leads to emulated devices, with its state and journal."""
 
-SERVICE: Final = "service"
 SELF: Final = "up"
-"""Names of the service and of this command in the output."""
+"""Name of this command in the output."""
 
 REPORT_TIMEOUT_S: Final = 20.0
 """Timeout for the first report of every driver before the emulated devices start, seconds."""
-
-LEAD_S: Final = 1.0
-LEAD_FACTOR: Final = 0.5
-"""Time from the start of the emulated devices to their drive, plus this fraction of the time that the processes before
-took to load, which measures how slow the machine is."""
 
 POLL_S: Final = 0.5
 
@@ -94,15 +96,13 @@ def command(
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
         more = (*(("--url", url) if url else ()), "--log-level", log_level)
         began = time.monotonic()
-        children.start(SERVICE, *MODELSERVER, "run", "-c", str(lines.vehicle), *more)
-        for name in vehicle.drivers:
-            children.start(name, *MODELSERVER, "driver", name, "-c", str(lines.vehicle), *more)
+        start_programs(children, lines.vehicle, vehicle.drivers, more)
         listener = HealthListener(open_lcm(resolve_url(url or vehicle.lcm.url)), vehicle.lcm.channel_prefix)
         supervision = Supervision(children, listener, printer, stop.is_set, began + seconds)
         if emulate:
             supervision.run(REPORT_TIMEOUT_S, lambda: listener.has_drivers(tuple(vehicle.drivers)))
-            lead = LEAD_S + LEAD_FACTOR * (time.monotonic() - began)
-            start_devices(children, lines, lead, scenario, of_devices)
+            start_utime = get_start_utime(time.monotonic() - began)
+            start_devices(children, lines, start_utime, ("--scenario", scenario), of_devices)
         supervision.run(math.inf, lambda: False)
         printer.print(SELF, "stopping")
 
@@ -146,21 +146,6 @@ def assign_faults(
             raise typer.BadParameter(str(error), param_hint="--fault") from None
         options[name] = (*options.get(name, ()), "--fault", fault)
     return options
-
-
-def start_devices(
-    children: ChildProcesses,
-    lines: EmulatedConnections,
-    lead: float,
-    scenario: str,
-    faults: Mapping[str, tuple[str, ...]],
-) -> None:
-    """Start an emulator for each device, on one drive that begins `lead` seconds from now."""
-    start = round((time.time() + lead) * 10) * 100_000
-    options = ("--start", str(start), "--scenario", scenario)
-    for name, line in lines.devices.items():
-        words = ("emulate", name, "-c", str(lines.vehicle), *line, *options, *faults.get(name, ()))
-        children.start(f"{name} device", *MODELSERVER, *words, is_last=True)
 
 
 class LinePrinter:

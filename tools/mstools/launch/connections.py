@@ -1,19 +1,25 @@
-"""Connections to emulated devices: a copy of a vehicle file whose drivers use lines of this machine."""
+"""Service, drivers and emulated devices of a vehicle as processes, on lines of this machine.
+
+For emulated devices, the processes use a copy of the vehicle file whose drivers are connected to them.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import shlex
 import socket
 import struct
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 import yaml
 
 from modelserver.wire.urls import make_route_command
-from mstools.launch.processes import LaunchError
+from mstools.launch.processes import MODELSERVER, ChildProcesses, LaunchError
 
 BUS_GROUP = "239.255.76.67"
 """LCM's multicast group."""
@@ -38,6 +44,51 @@ class EmulatedConnections:
     url: str
     vehicle: Path
     devices: Mapping[str, tuple[str, ...]]
+
+
+LEAD_S: Final = 1.5
+LEAD_FACTOR: Final = 0.5
+"""Time from the start of the emulated devices to the drive, plus this fraction of the loading time of the processes
+before, which measures how slow the machine is. The vehicle is stationary at first, so a late device misses nothing."""
+
+SERVICE: Final = "service"
+"""Name of the daemon among the processes; a driver has its own, and its emulated device that name and " device"."""
+
+
+def start_programs(
+    children: ChildProcesses, vehicle: Path, drivers: Iterable[str], options: Sequence[str] = ()
+) -> list[str]:
+    """Start the service of a vehicle file and its drivers, a process each; return their command lines."""
+    words = {SERVICE: ("run",), **{name: ("driver", name) for name in drivers}}
+    return [_start(children, name, (*each, "-c", str(vehicle), *options)) for name, each in words.items()]
+
+
+def start_devices(
+    children: ChildProcesses,
+    lines: EmulatedConnections,
+    start_utime: int,
+    options: Sequence[str] = (),
+    faults: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
+) -> list[str]:
+    """Start an emulator for each device, a process each, on one drive; return their command lines.
+
+    `start_utime` is that of the drive, `faults` has more options for some devices.
+    """
+    together = ("-c", str(lines.vehicle), "--start", str(start_utime), *options)
+    return [
+        _start(children, f"{name} device", ("emulate", name, *line, *together, *faults.get(name, ())), is_last=True)
+        for name, line in lines.devices.items()
+    ]
+
+
+def get_start_utime(loading_time: float) -> int:
+    """Return when a drive may begin, if the processes before its devices took so many seconds to load."""
+    return round((time.time() + LEAD_S + LEAD_FACTOR * loading_time) * 10) * 100_000
+
+
+def _start(children: ChildProcesses, name: str, words: tuple[str, ...], *, is_last: bool = False) -> str:
+    children.start(name, *MODELSERVER, *words, is_last=is_last)
+    return shlex.join(("modelserver", *words))
 
 
 def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedConnections:

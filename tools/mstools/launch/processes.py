@@ -124,7 +124,7 @@ class ChildProcesses:
         for child, code in self._list_ended():
             self._finish(child)
             tail = "\n  ".join(child.tail) or "(nothing)"
-            raise LaunchError(f"the {child.name} {child.describe_end(code)}. Its output:\n  {tail}")
+            raise LaunchError(f"process {child.name} {child.describe_end(code)}. Its output:\n  {tail}")
 
     def restart_ended(self) -> Iterator[tuple[str, str]]:
         """Restart the processes that have ended, after a delay; yield the name and what happened to each, once."""

@@ -42,7 +42,10 @@ def find_line_key(kind: DeviceKind, line: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class NewVehicle:
-    """What is on a new vehicle. `frames` are those of base, gps and imu in a geometry that exists already."""
+    """What is on a new vehicle.
+
+    `head` is the pan-tilt head below the camera; `frames` are those of base, gps and imu in a geometry that exists.
+    """
 
     name: str
     template: VehicleTemplate
@@ -50,13 +53,15 @@ class NewVehicle:
     imu: Device | None = None
     wheels: Device | None = None
     has_camera: bool = False
+    head: Device | None = None
     frames: Mapping[str, str] | None = None
 
     @property
     def body(self) -> str:
         """Name of the vehicle's body."""
         words = "".join(character if character.isalnum() else " " for character in self.name).split()
-        return "".join(word[:1].upper() + word[1:] for word in words) or "Vehicle"
+        name = "".join(word[:1].upper() + word[1:] for word in words) or "Vehicle"
+        return f"{name}Vehicle" if name in ("Camera", "Head") else name
 
 
 def make_geometry(vehicle: NewVehicle) -> str:
@@ -96,7 +101,8 @@ def make_geometry(vehicle: NewVehicle) -> str:
         lines.append(frame("ImuUnit", template.imu, comment, more))
     if vehicle.has_camera:
         lines += [
-            frame("CameraMount", template.camera, f"{MARK}: where the camera is fixed"),
+            frame("CameraMount", template.camera, f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"),
+            *(_HEAD_BODY if vehicle.head else ()),
             "  Camera:",
             "    frames:",
             "      Mount: {}",
@@ -104,10 +110,33 @@ def make_geometry(vehicle: NewVehicle) -> str:
             f"      Lens: {{xyz: [0.03, 0, 0.02], rpy_deg: [-90, 0, -90]}}   # {MARK}: the entrance pupil",
             "",
             "constraints:",
-            "  CameraFixed:",
-            f'    {{from: "{body}:CameraMount", to: "Camera:Mount", rpy_deg: [0, 0, 0]}}   # {MARK}: its tilt',
+            *(_make_head_joints(body) if vehicle.head else _fix_camera(body)),
         ]
     return "\n".join(lines) + "\n"
+
+
+_HEAD_BODY: Final = (
+    "  Head:   # the part between the two axes of the pan-tilt head",
+    "    frames:",
+    "      Base: {}",
+    f"      TiltAxis: {{xyz: [0, 0, 0.05]}}   # {MARK}: height of the tilt axis above the mount",
+)
+
+
+def _fix_camera(body: str) -> Iterator[str]:
+    yield "  CameraFixed:"
+    yield f'    {{from: "{body}:CameraMount", to: "Camera:Mount", rpy_deg: [0, 0, 0]}}   # {MARK}: its tilt'
+
+
+def _make_head_joints(body: str) -> Iterator[str]:
+    yield "  # positions come from the driver head; positive turns about the axis: to the left, and up"
+    for name, ends, axis, limits in (
+        ("Pan", f'from: "{body}:CameraMount", to: "Head:Base"', "[0, 0, 1]", "[-170, 170]"),
+        ("Tilt", 'from: "Head:TiltAxis", to: "Camera:Mount"', "[0, -1, 0]", "[-60, 60]"),
+    ):
+        yield f"  {name}:   # {MARK}: sense of its axis, limits, accuracy"
+        yield f"    {ends}".replace(", ", "\n    ", 1)
+        yield f"    joint: {{type: revolute, axis: {axis}, limits_deg: {limits}, sigma_deg: 0.5}}"
 
 
 def _frame_of_wheel(name: str) -> str:
@@ -180,6 +209,16 @@ def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
             yield f"      {name}:"
             yield f"        count:   # {MARK}: the distance of one count is circumference / counts per turn"
             yield f"          {{signal: WheelCounts.{_signal_of_wheel(name)}, meters_per_count: 0.001}}"
+
+    if vehicle.head is not None:
+        yield f"  head:   # {vehicle.head.kind.description}"
+        yield f"    device: {vehicle.head.kind.name}"
+        yield f"    {vehicle.head.line_key}: {_quote(vehicle.head.line)}   # {MARK}: its line on this machine"
+        yield f"    baud: 57600   # {MARK}: its rate"
+        yield "    columns: 2"
+        yield f"    joints:   # {MARK}: the columns of its lines, here degrees such as 12.5,-3.25"
+        yield "      Pan: {column: 0, scale: 0.0174533}"
+        yield "      Tilt: {column: 1, scale: 0.0174533}"
 
 
 def _quote(line: str) -> str:
