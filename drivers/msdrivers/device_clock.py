@@ -10,7 +10,7 @@ exp(n * (envelope at the mean time) / D). The average over all b gives offset, d
 first sample on. Blocks of 2 s keep the lowest samples of the last 120 s, so cost and memory are bounded.
 
 Step detection (`DeviceClock.update`): a sample far below the line, or a second of samples far above it, means that one
-clock stepped; the fit restarts and `restarts` counts.
+clock stepped; the fit restarts and `restarts` counts. After the line was opened again, the first sample shows it.
 
 Limits: the minimum delay cannot be observed; it is configured (`delay`). A delay that grows for good cannot be
 distinguished from a device clock that was set back; half the difference is added to sigma: for one more window while
@@ -228,6 +228,8 @@ class DeviceClock:
     _edge_step_us: float = 0.0
     _edge_step_until_us: int = 0
     """Largest recent step of the lower edge above the line."""
+    _is_reconnected: bool = False
+    """Whether the line was opened again since the last sample: a large excess is then no delay, but another start."""
 
     @property
     def offset(self) -> float:
@@ -241,6 +243,10 @@ class DeviceClock:
         """Rate of the host's clock relative to the device's, minus 1; nan before the first sample."""
         return math.nan if self._fit is None else self._fit.drift
 
+    def reconnect(self) -> DeviceClock:
+        """Return the clock after the line was opened again: the device may have been switched off meanwhile."""
+        return replace(self, _is_reconnected=True)
+
     def update(self, device_us: int, host_us: int) -> tuple[DeviceClock, int, float]:
         """Process a sample; return the updated clock and when it was measured: host's microseconds, sigma in seconds.
 
@@ -252,7 +258,7 @@ class DeviceClock:
         offset, variance = self._fit.predict(device_us)
         excess = difference - offset
         usual = self.tick_us + self._fit.jitter + 3.0 * math.sqrt(variance)
-        if excess > MAX_DELAY_US:
+        if excess > (STEP_US if self._is_reconnected else MAX_DELAY_US):
             return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, 0.0)
         if excess < -usual - SLACK_US:
             return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, self._step_us + excess)
@@ -264,18 +270,19 @@ class DeviceClock:
                 return clock._restart(device_us, difference, self._step_us + excess)
             clock = replace(self, _delayed_count=late, _delayed_since_us=since, _last_us=device_us)
             return clock._estimate(device_us, excess)
-        clock = self
+        clock = replace(self, _is_reconnected=False) if self._is_reconnected else self
         if device_us != self._last_us:
             clipped = min(difference, round(offset + JITTER_CLIP * self._fit.jitter))
-            clock = self._add_sample(device_us, difference, clipped)
+            clock = clock._add_sample(device_us, difference, clipped)
         elif self._delayed_count:
-            clock = replace(self, _delayed_count=0)
+            clock = replace(clock, _delayed_count=0)
         return clock._estimate(device_us, excess if excess > JITTER_CLIP * usual else 0.0)
 
     def _restart(self, device_us: int, difference: int, step_us: float) -> tuple[DeviceClock, int, float]:
         block = _start_block(ClockOffsetSample(device_us, difference), difference)
         clock = replace(
             self,
+            _is_reconnected=False,
             _blocks=(block,),
             _fit=fit_lower_envelope((block,), device_us, 0.0, self.max_drift),
             _last_us=device_us,
@@ -364,6 +371,10 @@ class Stamper:
     def offset(self) -> float:
         """Host's UTC minus the device's time at the last stamp, seconds; nan before the first."""
         return self.clock.offset + self._utc_minus_monotonic_us * 1e-6
+
+    def reconnect(self) -> None:
+        """Expect another start of the device: its line was opened again."""
+        self.clock = self.clock.reconnect()
 
     def stamp(self, measured: MeasuredSample, now: HostTime) -> Sample:
         """Fill in utime and utime_sigma: from the device's time if the sample has one, else from the receive time."""

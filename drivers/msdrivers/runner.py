@@ -233,7 +233,9 @@ class Runner(Generic[U]):
         except LinkError as error:
             self._on_link_error(error)
             return
-        self.reconnects += self._was_open
+        if self._was_open:
+            self.reconnects += 1
+            self._stamper.reconnect()
         self._is_open = self._was_open = True
         now = self._time_source.now()
         self._received_ns = now.monotonic_ns

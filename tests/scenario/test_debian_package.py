@@ -25,7 +25,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of the package."""
     pytest.importorskip("hatchling", reason="hatchling, which builds the wheel, is not installed")
     folder = tmp_path_factory.mktemp("debian")
@@ -34,15 +34,15 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [*command, "--wheel", build_wheel(folder)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
     )
     assert built.returncode == 0, built.stderr
-    (package,) = folder.glob("modelserver_*.deb")
-    assert f"install it: sudo apt install {package}" in built.stdout
-    subprocess.run(["dpkg-deb", "-R", package, folder / "root"], check=True, timeout=TIMEOUT_S)
+    (built_file,) = folder.glob("modelserver_*.deb")
+    assert f"install it: sudo apt install {built_file}" in built.stdout
+    subprocess.run(["dpkg-deb", "-R", built_file, folder / "root"], check=True, timeout=TIMEOUT_S)
     return folder / "root"
 
 
-def run(unpacked: Path, *arguments: str, command: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run(package: Path, *arguments: str, command: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run the package's command; it finds its packages beside itself, and nothing of this environment."""
-    folder = unpacked / "usr/lib/modelserver/bin"
+    folder = package / "usr/lib/modelserver/bin"
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     return subprocess.run(
         [folder / "python", command or folder / "modelserver", *arguments],
@@ -50,35 +50,35 @@ def run(unpacked: Path, *arguments: str, command: Path | None = None) -> subproc
         text=True,
         timeout=TIMEOUT_S,
         env=clean,
-        cwd=unpacked,
+        cwd=package,
         check=False,
     )
 
 
-def test_given_the_package_then_it_holds_what_a_vehicle_needs_and_no_plots(unpacked: Path) -> None:
-    site = unpacked / f"usr/lib/modelserver/lib/{PYTHON}/site-packages"
+def test_given_the_package_then_it_holds_what_a_vehicle_needs_and_no_plots(package: Path) -> None:
+    site = package / f"usr/lib/modelserver/lib/{PYTHON}/site-packages"
     there = {path.name for path in site.iterdir()}
     assert {"modelserver", "msdrivers", "mstools", "mslcm", "filterpy", "lcm", "numpy", "pyubx2"} <= there
     assert not {"matplotlib", "scipy", "pytest", "mypy", "pip"} & there
-    size = sum(path.lstat().st_size for path in unpacked.rglob("*")) / 1e6
+    size = sum(path.lstat().st_size for path in package.rglob("*")) / 1e6
     assert size < INSTALLED_MB
-    control = (unpacked / "DEBIAN/control").read_text()
+    control = (package / "DEBIAN/control").read_text()
     assert f"\nDepends: {PYTHON}" in control
     kilobytes = int(control.partition("\nInstalled-Size: ")[2].split()[0])
     assert kilobytes * 1024 == pytest.approx(size * 1e6, rel=0.01)
-    completion = (unpacked / "usr/share/bash-completion/completions/modelserver").read_text()
+    completion = (package / "usr/share/bash-completion/completions/modelserver").read_text()
     assert "complete -o default -F _modelserver_completion modelserver" in completion
-    for path in unpacked.rglob("*"):
+    for path in package.rglob("*"):
         assert path.is_symlink() or path.stat().st_mode & 0o444 == 0o444, path
 
 
-def test_given_the_package_then_its_command_checks_queries_and_replays(unpacked: Path) -> None:
+def test_given_the_package_then_its_command_checks_queries_and_replays(package: Path) -> None:
     config = ROOT / "config" / "raptor"
-    assert run(unpacked, "--version").stdout.startswith("modelserver ")
-    checked = run(unpacked, "check", str(config / "vehicle.yaml"))
+    assert run(package, "--version").stdout.startswith("modelserver ")
+    checked = run(package, "check", str(config / "vehicle.yaml"))
     assert (checked.returncode, checked.stderr) == (0, "")
     frames = ("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")
-    found = run(unpacked, "query", *frames, "--model", str(config / "geometry.xml"))
+    found = run(package, "query", *frames, "--model", str(config / "geometry.xml"))
     assert found.stdout == invoke("", "query", *frames, "--model", str(config / "geometry.xml")).stdout
 
 
@@ -93,15 +93,15 @@ for package in (modelserver, msdrivers, mslcm, mstools):
 """
 
 
-def test_given_the_package_then_every_module_finds_what_it_needs(unpacked: Path) -> None:
-    script = unpacked / "import_all.py"
+def test_given_the_package_then_every_module_finds_what_it_needs(package: Path) -> None:
+    script = package / "import_all.py"
     script.write_text(IMPORT_ALL)
-    imported = run(unpacked, command=script)
+    imported = run(package, command=script)
     # those of the extra "bags"
     assert (imported.returncode, set(imported.stdout.split()) <= {"rosbags"}) == (0, True), imported
 
 
 @pytest.mark.parametrize("script", ["postinst", "prerm"])
-def test_given_a_script_of_the_package_then_the_shell_accepts_it(unpacked: Path, script: str) -> None:
-    checked = subprocess.run(["sh", "-n", unpacked / "DEBIAN" / script], capture_output=True, text=True, check=False)
+def test_given_a_script_of_the_package_then_the_shell_accepts_it(package: Path, script: str) -> None:
+    checked = subprocess.run(["sh", "-n", package / "DEBIAN" / script], capture_output=True, text=True, check=False)
     assert (checked.returncode, checked.stderr) == (0, "")

@@ -61,3 +61,28 @@ def test_given_the_hosts_clock_is_set_then_the_stamps_go_with_it_and_the_devices
     assert stamper.clock.restarts == 0
     assert stamper.sigma < 1e-3
     assert stamper.offset == pytest.approx((UTIME + step_us - 5_000_000) * 1e-6, abs=1e-3)
+
+
+@pytest.mark.parametrize("away", [-4_000_000, 700_000, 12_000_000])
+def test_given_a_line_opened_again_when_the_device_starts_anew_then_its_first_stamps_are_right(away: int) -> None:
+    stamper = run_stamper(1e-6)
+    stamper.reconnect()
+    errors, restarts = [], stamper.clock.restarts
+    for n in range(200, 400):
+        utime = UTIME + 12_000_000 + n * 10_000
+        # by its new clock, `away` behind the former one
+        header = SensorHeader(0, "imu", n, utime, 17_000_000 + n * 10_000 - away)
+        sample = stamper.stamp(MeasuredSample(ImuSample(header)), HostTime(12_000_000_000 + n * 10_000_000, utime))
+        errors.append(abs(sample.header.utime - utime))
+        assert errors[-1] * 1e-6 < 2.0 * sample.header.utime_sigma < 0.1
+    # until it has learnt how even the delays are now
+    assert max(errors) < 20_000
+    assert max(errors[20:]) < 1000
+    assert stamper.clock.restarts == restarts + 1
+
+
+def test_given_a_held_up_sample_on_an_open_line_then_it_is_still_taken_for_a_delay() -> None:
+    stamper = run_stamper(1e-6)
+    header = SensorHeader(0, "imu", 200, UTIME + 7_000_000, 7_000_000)
+    sample = stamper.stamp(MeasuredSample(ImuSample(header)), HostTime(7_000_000_000, header.host_utime))
+    assert UTIME + 1_990_000 < sample.header.utime < UTIME + 2_010_000

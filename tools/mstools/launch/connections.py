@@ -74,11 +74,12 @@ def start_devices(
 
     `start_utime` is that of the drive, `faults` has more options for some devices.
     """
-    together = ("-c", str(lines.vehicle), "--start", str(start_utime), *options)
-    return [
-        _start(children, f"{name} device", ("emulate", name, *line, *together, *faults.get(name, ())), is_last=True)
+    together = ("--start", str(start_utime), *options)
+    words = {
+        name: ("emulate", name, "-c", str(lines.vehicle), *line, *together, *faults.get(name, ()))
         for name, line in lines.devices.items()
-    ]
+    }
+    return [_start(children, f"{name} device", each, is_last=True) for name, each in words.items()]
 
 
 def get_start_utime(loading_time: float) -> int:
