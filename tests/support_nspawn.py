@@ -1,4 +1,4 @@
-"""A machine with a real systemd for tests: this host's /usr booted in a container, with a wheel of this project.
+"""A machine with a real systemd for tests: this host's /usr booted in a container, with this project's package.
 
 Nothing of the host is written: the container's root is a tmpfs of its own (`--volatile`), its network a loopback of its
 own, and all of it goes with its processes. What a test puts there comes through one folder.
@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,10 +24,9 @@ BOOT_S = 20.0
 HIDDEN = ("/root", "/home", "/tmp", "/var/tmp", "/run")
 """Where a hardened unit does not see what is installed (ProtectHome, PrivateTmp)."""
 
-DEPENDENCIES = "/opt/dependencies"
-PREFIX = "/opt/modelserver"
+PREFIX = "/usr/lib/modelserver"
 SHARED = "/opt/shared"
-"""In the container: the packages that this project needs, the environment with its wheel, the test's folder."""
+"""In the container: the environment of the Debian package, the test's folder."""
 
 CGROUPS = (Path("/sys/fs/cgroup/unified"), Path("/sys/fs/cgroup/systemd"), Path("/sys/fs/cgroup"))
 
@@ -51,9 +49,9 @@ def skip_reason() -> str:
         return "systemd is Linux's"
     if os.geteuid() != 0:
         return "systemd-nspawn needs root"
-    for program in ("systemd-nspawn", "systemd-analyze", "nsenter", "unshare", "ip"):
+    for program in ("systemd-nspawn", "systemd-analyze", "nsenter", "unshare", "ip", "dpkg-deb"):
         if shutil.which(program) is None:
-            return f"{program} is not installed (apt install systemd-container iproute2)"
+            return f"{program} is not installed (apt install systemd-container iproute2 dpkg)"
     if not os.path.exists("/lib/systemd/systemd"):
         return "systemd is not installed"
     if os.path.realpath("/lib") != "/usr/lib":
@@ -122,7 +120,8 @@ def boot_machine(folder: Path) -> Iterator[Machine]:
         *("systemd-nspawn", "--quiet", "--directory=/", "--volatile=yes", "--private-network", "--register=no"),
         *(() if booted_by_systemd else ("--keep-unit",)),
         *("--boot", f"--machine={name}", "--console=read-only", f"--bind={folder}:{SHARED}"),
-        f"--bind-ro={sysconfig.get_path('purelib')}:{DEPENDENCIES}",
+        # a Debian package can be installed: /usr is the host's, with what is written over it
+        "--overlay=/usr::/usr",
         *("systemd.unit=basic.target", "systemd.firstboot=off", "systemd.show_status=no"),
     ]
     groups = [] if booted_by_systemd else _own_groups(name)
@@ -202,14 +201,21 @@ def _remove_groups(group: Path) -> None:
             time.sleep(0.02)
 
 
-def install_wheel(booted: Machine, wheel: Path) -> str:
-    """Install a wheel into an environment of its own in the container; return the path of its command."""
-    python = f"{PREFIX}/bin/python"
-    booted.run(interpreter(), "-m", "venv", "--without-pip", PREFIX)
-    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    booted.run("sh", "-c", f"echo {DEPENDENCIES} > {PREFIX}/lib/{version}/site-packages/dependencies.pth")
-    booted.run(
-        *(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"),
-        *("--ignore-installed", "--no-warn-script-location", f"{SHARED}/{wheel.name}"),
-    )
-    return f"{PREFIX}/bin/modelserver"
+def build_package(folder: Path) -> Path:
+    """Return a Debian package of this project for the Python of these tests, built from its source."""
+    command = [sys.executable, ROOT / "tools" / "debian_package.py", "--compression", "none", "--output", folder]
+    wheel = build_wheel(folder)
+    done = subprocess.run([*command, "--wheel", wheel], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    (package,) = folder.glob("modelserver_*.deb")
+    return package
+
+
+def install_package(booted: Machine, package: Path) -> str:
+    """Install a Debian package in the container, beside those of the host; return the path of its command."""
+    database = "/var/lib/dpkg"
+    booted.run("mkdir", "-p", *(f"{database}/{each}" for each in ("info", "updates", "triggers")))
+    shutil.copy(f"{database}/status", booted.folder / "status")
+    booted.run("cp", f"{SHARED}/status", f"{database}/status")
+    booted.run("dpkg", "--install", f"{SHARED}/{package.name}", timeout=120.0)
+    return "/usr/bin/modelserver"

@@ -42,7 +42,7 @@ Version: {version}
 Architecture: {architecture}
 Maintainer: {maintainer}
 Installed-Size: {kilobytes}
-Depends: {python}, libexpat1
+Depends: {python}
 Recommends: iproute2, udev
 Section: misc
 Priority: optional

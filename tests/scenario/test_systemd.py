@@ -1,4 +1,4 @@
-"""The installed wheel under a real systemd, in a container: it starts, is killed, hangs, reloads, ends, and is removed.
+"""The Debian package under a real systemd, in a container: it starts, is killed, hangs, reloads, ends, and is removed.
 
 One container for the module; the tests follow the life of a service, and each leaves it serving.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
-from support_nspawn import PREFIX, ROOT, SHARED, Machine, boot_machine, build_wheel, install_wheel, skip_reason
+from support_nspawn import PREFIX, ROOT, SHARED, Machine, boot_machine, build_package, install_package, skip_reason
 
 pytestmark = [
     pytest.mark.skipif(bool(skip_reason()), reason=f"no systemd in a container here: {skip_reason()}"),
@@ -100,13 +100,13 @@ class Site:
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Machine, str]]:
-    """A machine with the wheel, where nothing is installed yet."""
+    """A machine with the Debian package, where no service is installed yet."""
     folder = tmp_path_factory.mktemp("systemd")
     # shared with the container
-    wheel = build_wheel(folder)
+    package = build_package(folder)
     shutil.copytree(ROOT / "config" / "raptor", folder / "raptor")
     with boot_machine(folder) as booted:
-        yield booted, install_wheel(booted, wheel)
+        yield booted, install_package(booted, package)
 
 
 @pytest.fixture(scope="module")
@@ -285,3 +285,16 @@ def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, 
     assert site.list_files() == before
     nothing = site.machine.run(site.program, "uninstall", check=False)
     assert (nothing.returncode, "nothing to uninstall" in nothing.stderr) == (1, True)
+
+
+def test_given_the_package_removed_then_the_service_ends_and_nothing_of_it_stays(site: Site, before: list[str]) -> None:
+    site.machine.run(site.program, "install", "--vehicle", f"{SHARED}/raptor/vehicle.yaml", "--drivers", "none")
+    assert site.measure_answer() > 0
+    site.probe.kill()
+    site.machine.run("dpkg", "--remove", "modelserver", timeout=60.0)
+    assert site.machine.get_property(SERVICE, "LoadState") == "not-found"
+    assert [line for line in site.list_files() if line.startswith("/etc")] == [
+        line for line in before if line.startswith("/etc")
+    ]
+    gone = site.machine.run("ls", "-d", site.program, PREFIX, check=False)
+    assert gone.stdout == ""

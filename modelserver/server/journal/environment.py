@@ -20,7 +20,7 @@ COMPARED_FACTS: Final = {
     "source": "source of modelserver",
     "python": "Python",
     "numpy": "numpy",
-    "scipy": "scipy",
+    "filterpy": "filterpy",
     "pyproj": "pyproj",
     "libc": "C library",
     "machine": "machine type",
@@ -39,7 +39,7 @@ def collect_facts() -> Mapping[str, str]:
         "python": f"{platform.python_implementation()} {platform.python_version()}",
         "numpy": np.__version__,
         # read from the metadata, without importing them
-        "scipy": version("scipy"),
+        "filterpy": version("filterpy"),
         "pyproj": version("pyproj"),
         "libc": " ".join(platform.libc_ver()),
         "machine": platform.machine(),
