@@ -64,7 +64,7 @@ def test_given_the_hosts_clock_is_set_then_the_stamps_go_with_it_and_the_devices
 
 
 @pytest.mark.parametrize("away", [-4_000_000, 700_000, 12_000_000])
-def test_given_a_line_opened_again_when_the_device_starts_anew_then_its_first_stamps_are_right(away: int) -> None:
+def test_given_a_line_opened_again_when_the_device_starts_again_then_its_first_stamps_are_right(away: int) -> None:
     stamper = run_stamper(1e-6)
     stamper.reconnect()
     errors, restarts = [], stamper.clock.restarts
@@ -81,7 +81,7 @@ def test_given_a_line_opened_again_when_the_device_starts_anew_then_its_first_st
     assert stamper.clock.restarts == restarts + 1
 
 
-def test_given_a_held_up_sample_on_an_open_line_then_it_is_still_taken_for_a_delay() -> None:
+def test_given_a_held_up_sample_on_an_open_line_then_it_is_taken_for_a_delay() -> None:
     stamper = run_stamper(1e-6)
     header = SensorHeader(0, "imu", 200, UTIME + 7_000_000, 7_000_000)
     sample = stamper.stamp(MeasuredSample(ImuSample(header)), HostTime(7_000_000_000, header.host_utime))
