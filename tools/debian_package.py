@@ -24,8 +24,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from pip._vendor.packaging.requirements import Requirement
-from pip._vendor.packaging.utils import canonicalize_name
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from mstools.cli import COMPLETION_VARIABLE
 

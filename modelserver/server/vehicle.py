@@ -114,15 +114,10 @@ class Vehicle:
         from modelserver.estimation.modes import LocalizerConfig
 
         return LocalizerConfig(
-            Setup(self.rig, self.config.localization.filter, own=self.own_measurements()),
+            Setup(self.rig, self.config.localization.filter, own=list_own_measurements(self.config)),
             self.config.localization.raw,
             self.mounts,
         )
-
-    def own_measurements(self) -> dict[str, str]:
-        """Return the type of each source of measurements of installed packages."""
-        aiding = self.config.sensors.aiding
-        return {name: each.type for name, each in aiding.items() if each.type not in AIDING_SAMPLES}
 
     def find_unusable_sensors(self) -> tuple[messages.SensorFinding, ...]:
         """Find the configured sensors that localization cannot use in its initial mode, with the reasons."""
@@ -412,12 +407,16 @@ def _find_channel_problems(config: VehicleConfig, file: str) -> list[errors.Prob
     return problems
 
 
+def list_own_measurements(config: VehicleConfig) -> dict[str, str]:
+    """Return the type of each source of measurements of installed packages."""
+    return {name: each.type for name, each in config.sensors.aiding.items() if each.type not in AIDING_SAMPLES}
+
+
 def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem]:
     """Check that the types of aiding sources are known here; packages are looked for only where one is not."""
     problems: list[errors.Problem] = []
-    for name, given in ((name, each.type) for name, each in config.sensors.aiding.items()):
-        if given in AIDING_SAMPLES:
-            continue
+    own = list_own_measurements(config)
+    for name, given in own.items():
         from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP
 
         if given in MEASUREMENT_TYPES:
@@ -433,6 +432,17 @@ def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem
         package = f"install the package that defines it (entry point group {PLUGIN_GROUP})"
         fix = f"write {near[0]}" if near else f"{package}, or write one of {', '.join(known)}"
         problems.append(_make_problem(file, key, f"unknown type {errors.quote(given)}", fix, near))
+    if own and not problems:
+        from modelserver.estimation.filter.measurements.own import find_repeated_state
+
+        repeated = find_repeated_state(dict.fromkeys(own.values()), config.localization.filter)
+        if repeated is not None:
+            (name, *_), (given, state) = [each for each in own if own[each] == repeated[0]], repeated
+            why = (
+                f"type {errors.quote(given)} of an installed package declares the state {state}, which there is already"
+            )
+            fix = "rename that state in the package"
+            problems.append(_make_problem(file, f"sensors.aiding.{name}.type", why, fix))
     return problems
 
 

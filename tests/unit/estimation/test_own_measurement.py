@@ -17,6 +17,7 @@ from support_filter import RIG, simulation
 from support_journal import OPEN, JournalRig
 
 from modelserver.errors import ConfigError, RecordingError
+from modelserver.estimation.filter.error_layout import ErrorState
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements import MEASUREMENT_TYPES, Innovation, MeasurementContext
 from modelserver.estimation.filter.measurements.own import OwnMeasurement, get_type, read_covariance
@@ -29,13 +30,14 @@ from modelserver.simulation import figure_eight
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[3] / "examples" / "python" / "own_measurement.py"))
 RADAR: Any = EXAMPLE["RADAR"]
+AIDING = "\n  aiding: {front: {channel: RADAR, type: radar}}\n"
 HEADER = SensorHeader(1_700_000_000_000_000, "radar")
 
 
 class Given:
     """A type whose `evaluate` does what a test gives it."""
 
-    states = ()
+    states: tuple[ErrorState, ...] = ()
     values = ("a number",)
     is_absolute = True
 
@@ -198,15 +200,24 @@ def test_given_an_incomplete_type_then_the_missing_part_is_named(types: Any) -> 
             types.add("wrong", made)
 
 
+@pytest.mark.parametrize("state", ["attitude_up", "wheel_scale", "radar_scale"])
+def test_given_a_state_that_there_is_already_then_the_vehicle_file_has_a_problem(
+    tmp_path: Path, types: Any, state: str
+) -> None:
+    second = Given(_fail)
+    second.states = (ErrorState((state,), sigma=1.0, walk=0.0),)
+    types.add("second", second)
+    more = AIDING.replace("}}", "}, rear: {channel: REAR, type: second}}")
+    with pytest.raises(ConfigError, match=f"type 'second' of an installed package declares the state {state}, which"):
+        JournalRig(tmp_path, OPEN.replace("sensors:\n", f"sensors:{more}", 1))
+
+
 @pytest.mark.parametrize(
     ("stated", "expected"),
     [((), 4.0), ((0.25,), 0.25), ((-1.0,), 4.0), ((0.0,), 4.0), ((math.inf,), 4.0)],
 )
 def test_given_a_stated_covariance_then_it_is_read_if_it_is_one(stated: tuple[float, ...], expected: float) -> None:
     assert read_covariance(MeasurementSample(HEADER, (1.0,), "", stated), sigma=2.0)[0, 0] == expected
-
-
-AIDING = "\n  aiding: {front: {channel: RADAR, type: radar}}\n"
 
 
 def test_given_a_journal_when_the_package_is_gone_then_the_message_names_the_type(tmp_path: Path, types: Any) -> None:
