@@ -148,7 +148,10 @@ class Bench:
         rest, _, _ = self.vehicle.read_text().partition("\ndrivers:")
         self.vehicle.write_text(rest + DRIVERS.format(**vars(self)))
         self.bus = lcm.LCM(self.url)
-        self.bus.subscribe("DRIVER_HEALTH", lambda _, data: self.reports.append(decode("driver_health_t", data)))
+        reports = self.bus.subscribe(
+            "DRIVER_HEALTH", lambda _, data: self.reports.append(decode("driver_health_t", data))
+        )
+        reports.set_queue_capacity(0)
 
     @property
     def vehicle(self) -> Path:

@@ -118,6 +118,9 @@ COURSE_FLOOR: Final = 0.03
 MIN_TURN_PATH: Final = 3.0
 """Meters of a path, at least, that fixes show a heading along."""
 
+LEAST_MOVED: Final = 0.5
+"""Way of the fixes relative to that of the path, at least, whose direction shows the heading."""
+
 AGREEMENT: Final = 2.45
 """Standard deviations of (1) within which a fix agrees: 95 % of good ones."""
 
@@ -252,7 +255,8 @@ class Discrepancy(NamedTuple):
     sigma: standard deviation of e along its longest axis, m.
     displacement: of the antenna by dead reckoning, along N, m.
     covariance: of dead reckoning alone: east, north, cross, m2.
-    turn, turn_sigma: angle by which the heading would explain it, and the angle's standard deviation, rad.
+    turn, turn_sigma: angle from the path to the way of the fixes, which the heading would explain, and its standard
+        deviation, rad.
     """
 
     node: PathNode
@@ -785,9 +789,11 @@ def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: F
     square_sum = (b * ex * ex - 2.0 * cross * ex * ey + a * ey * ey) / (a * b - cross * cross)
     turn = turn_sigma = 0.0
     if square > MIN_TURN_PATH**2:
-        turn = (error * d.conjugate()).imag / square
+        # the fixes moved by d + e; where they hardly moved, their direction means nothing
+        moved = 1.0 + error * d.conjugate() / square
+        turn = cmath.phase(moved) if abs(moved) > LEAST_MOVED else moved.imag
         side = (a * y * y - 2.0 * cross * x * y + b * x * x) / square
-        turn_sigma = math.sqrt(side / square)
+        turn_sigma = math.sqrt(side / square) / min(max(abs(moved), LEAST_MOVED), 1.0)
     longest = math.sqrt(compute_longest_axis(a, b, cross))
     return Discrepancy(
         start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma

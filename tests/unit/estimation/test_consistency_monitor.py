@@ -18,6 +18,7 @@ from modelserver.estimation.filter.consistency_monitor import (
     Inconsistency,
     PathNode,
     PathNoise,
+    compare_window,
     replay_path,
 )
 from modelserver.estimation.filter.settings import FilterSettings
@@ -339,3 +340,23 @@ def test_given_a_gap_in_the_fixes_then_the_path_begins_again() -> None:
     )
     assert monitor.begin == 9_000_000
     assert monitor.path == 0j
+
+
+@pytest.mark.parametrize("turned", [0.1, 1.0, 2.0, 3.0, math.pi, -3.0, -0.5])
+def test_given_a_path_that_is_turned_by_any_angle_then_that_angle_is_shown(turned: float) -> None:
+    *_, end = drive(20.0, Fault())
+    start = end.monitor.newest[0]
+    way = cmath.rect(abs(end.node.path - start.path), turned) * cmath.rect(1.0, cmath.phase(end.node.path - start.path))
+    fix = start.fix + cmath.rect(1.0, start.rotation) * way
+    found = compare_window(start._replace(latency=0.0), end.node._replace(fix=fix, latency=0.0), NOISE, SETTINGS)
+    assert math.remainder(found.turn - turned, math.tau) == pytest.approx(0.0, abs=1e-9)
+    assert 0.0 < found.turn_sigma < 0.2
+
+
+def test_given_fixes_that_hardly_move_then_their_direction_shows_no_heading() -> None:
+    *_, end = drive(20.0, Fault())
+    start = end.monitor.newest[0]
+    unmoved = compare_window(
+        start._replace(latency=0.0), end.node._replace(fix=start.fix + 0.01j, latency=0.0), NOISE, SETTINGS
+    )
+    assert abs(unmoved.turn) < 0.01
