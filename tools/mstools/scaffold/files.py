@@ -130,12 +130,13 @@ def _fix_camera(body: str) -> Iterator[str]:
 
 def _make_head_joints(body: str) -> Iterator[str]:
     yield "  # positions come from the driver head; positive turns about the axis: to the left, and up"
-    for name, ends, axis, limits in (
-        ("Pan", f'from: "{body}:CameraMount", to: "Head:Base"', "[0, 0, 1]", "[-170, 170]"),
-        ("Tilt", 'from: "Head:TiltAxis", to: "Camera:Mount"', "[0, -1, 0]", "[-60, 60]"),
+    for name, base, moved, axis, limits in (
+        ("Pan", f"{body}:CameraMount", "Head:Base", "[0, 0, 1]", "[-170, 170]"),
+        ("Tilt", "Head:TiltAxis", "Camera:Mount", "[0, -1, 0]", "[-60, 60]"),
     ):
         yield f"  {name}:   # {MARK}: sense of its axis, limits, accuracy"
-        yield f"    {ends}".replace(", ", "\n    ", 1)
+        yield f'    from: "{base}"'
+        yield f'    to: "{moved}"'
         yield f"    joint: {{type: revolute, axis: {axis}, limits_deg: {limits}, sigma_deg: 0.5}}"
 
 
