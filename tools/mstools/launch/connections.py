@@ -59,8 +59,9 @@ def start_programs(
     children: ChildProcesses, vehicle: Path, drivers: Iterable[str], options: Sequence[str] = ()
 ) -> list[str]:
     """Start the service of a vehicle file and its drivers, a process each; return their command lines."""
-    words = {SERVICE: ("run",), **{name: ("driver", name) for name in drivers}}
-    return [_start(children, name, (*each, "-c", str(vehicle), *options)) for name, each in words.items()]
+    # a driver may be named as the service is
+    programs = [(SERVICE, ("run",)), *((name, ("driver", name)) for name in drivers)]
+    return [_start(children, name, (*words, "-c", str(vehicle), *options)) for name, words in programs]
 
 
 def start_devices(
