@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support_lcm import TIMEOUT_S
 
 from modelserver.core import Instant
 from modelserver.messages import PersistedState, RestoredState
@@ -38,6 +39,9 @@ def store(tmp_path: Path) -> StateStore:
 
 def save(store: StateStore, state: PersistedState = PERSISTED) -> None:
     store.close(state)
+    if store._thread is not None:
+        # a disk may take longer than a service that ends waits for it
+        store._thread.join(TIMEOUT_S)
     assert store.path.is_file()
 
 
