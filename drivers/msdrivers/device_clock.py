@@ -252,13 +252,19 @@ class DeviceClock:
 
         `device_us`: the device's time without wraps. `host_us`: receive time on the host's monotonic clock.
         """
+        # no delay lasts as long as a line was closed
+        max_delay_us = STEP_US if self._is_reconnected else MAX_DELAY_US
+        clock = replace(self, _is_reconnected=False) if self._is_reconnected else self
+        return clock._update(device_us, host_us, max_delay_us)
+
+    def _update(self, device_us: int, host_us: int, max_delay_us: float) -> tuple[DeviceClock, int, float]:
         difference = host_us - device_us
         if self._fit is None:
             return self._restart(device_us, difference, 0.0)
         offset, variance = self._fit.predict(device_us)
         excess = difference - offset
         usual = self.tick_us + self._fit.jitter + 3.0 * math.sqrt(variance)
-        if excess > (STEP_US if self._is_reconnected else MAX_DELAY_US):
+        if excess > max_delay_us:
             return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, 0.0)
         if excess < -usual - SLACK_US:
             return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, self._step_us + excess)
@@ -270,19 +276,18 @@ class DeviceClock:
                 return clock._restart(device_us, difference, self._step_us + excess)
             clock = replace(self, _delayed_count=late, _delayed_since_us=since, _last_us=device_us)
             return clock._estimate(device_us, excess)
-        clock = replace(self, _is_reconnected=False) if self._is_reconnected else self
+        clock = self
         if device_us != self._last_us:
             clipped = min(difference, round(offset + JITTER_CLIP * self._fit.jitter))
-            clock = clock._add_sample(device_us, difference, clipped)
+            clock = self._add_sample(device_us, difference, clipped)
         elif self._delayed_count:
-            clock = replace(clock, _delayed_count=0)
+            clock = replace(self, _delayed_count=0)
         return clock._estimate(device_us, excess if excess > JITTER_CLIP * usual else 0.0)
 
     def _restart(self, device_us: int, difference: int, step_us: float) -> tuple[DeviceClock, int, float]:
         block = _start_block(ClockOffsetSample(device_us, difference), difference)
         clock = replace(
             self,
-            _is_reconnected=False,
             _blocks=(block,),
             _fit=fit_lower_envelope((block,), device_us, 0.0, self.max_drift),
             _last_us=device_us,

@@ -291,7 +291,7 @@ def examine_vehicle(
             why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
             problems.append(_make_problem(file, "geometry", why))
     if geometry.partial_model is not None:
-        problems += _find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
+        problems += find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
         why = "raw mode needs a GPS and an IMU, and the section sensors does not have both"
@@ -312,7 +312,7 @@ def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str,
     return errors.Problem(errors.Severity.ERROR, why, errors.Location(file, element=key), fix, near)
 
 
-def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[errors.Problem]:
+def find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[errors.Problem]:
     """Check the frames that the vehicle file names; only an `is_whole` model has constraints."""
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame), ("rolling_frame", config.rolling_frame)]
@@ -416,9 +416,11 @@ def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem
     """Check that the types of aiding sources are known here; packages are looked for only where one is not."""
     problems: list[errors.Problem] = []
     own = list_own_measurements(config)
-    for name, given in own.items():
-        from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP
+    if not own:
+        return problems
+    from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP, find_repeated_state
 
+    for name, given in own.items():
         if given in MEASUREMENT_TYPES:
             continue
         key = f"sensors.aiding.{name}.type"
@@ -432,17 +434,15 @@ def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem
         package = f"install the package that defines it (entry point group {PLUGIN_GROUP})"
         fix = f"write {near[0]}" if near else f"{package}, or write one of {', '.join(known)}"
         problems.append(_make_problem(file, key, f"unknown type {errors.quote(given)}", fix, near))
-    if own and not problems:
-        from modelserver.estimation.filter.measurements.own import find_repeated_state
-
-        repeated = find_repeated_state(dict.fromkeys(own.values()), config.localization.filter)
-        if repeated is not None:
-            (name, *_), (given, state) = [each for each in own if own[each] == repeated[0]], repeated
-            why = (
-                f"type {errors.quote(given)} of an installed package declares the state {state}, which there is already"
-            )
-            fix = "rename that state in the package"
-            problems.append(_make_problem(file, f"sensors.aiding.{name}.type", why, fix))
+    if problems:
+        return problems
+    repeated = find_repeated_state(dict.fromkeys(own.values()), config.localization.filter)
+    if repeated is not None:
+        given, state = repeated
+        name = next(each for each in own if own[each] == given)
+        why = f"type {errors.quote(given)} of an installed package declares the state {state}, which there is already"
+        fix = "rename that state in the package"
+        problems.append(_make_problem(file, f"sensors.aiding.{name}.type", why, fix))
     return problems
 
 

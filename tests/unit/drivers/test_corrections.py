@@ -187,7 +187,6 @@ def test_given_a_caster_then_its_frames_arrive_with_station_and_age(casters: Cal
     caster = casters(ANSWERS["version 2, chunks"])
     frames: list[bytes] = []
     with receiving(caster.address) as client:
-        assert client.counts["corrections.age_s"] == -1
         wait_for(lambda: frames.extend(client.pop_frames()) or len(frames) == len(FRAMES))
         assert client.counts | {"corrections.age_s": 0} == {
             "corrections.connects": 1, "corrections.frames": 4, "corrections.station": 1234, "corrections.age_s": 0,
@@ -237,6 +236,13 @@ def test_given_frames_then_a_runner_sends_them_to_its_device(casters: Callable[.
     assert [unit for _, unit in link.sent if unit[:1] == b"\xd3"] == FRAMES
     counters = dict(runner.make_health(clock.now()).counters)
     assert (counters["corrections.frames"], counters["corrections.station"]) == (4, 1234)
+
+
+def test_given_no_frame_yet_then_there_is_no_age() -> None:
+    client = CorrectionsClient(NtripSettings("127.0.0.1:1", "MOUNT"), "gps")
+    assert client.counts["corrections.age_s"] == -1
+    client._add(FRAMES[0], 1)
+    assert client.counts["corrections.age_s"] >= 0
 
 
 def test_given_a_driver_that_does_not_take_them_then_old_frames_are_lost_and_counted() -> None:

@@ -19,6 +19,7 @@ from modelserver.estimation.filter.measurements.measurement import (
     IMU_AVERAGING,
     MeasurementContext,
     body_velocity_jacobian,
+    choose_covariance,
     point_jacobian,
     register,
 )
@@ -62,12 +63,10 @@ def transform_to_site(context: MeasurementContext, reference: str, point: Vector
 
 def _read_covariance(stated: tuple[float, ...] | None, start: int, sigma: float) -> Array:
     """Return the 3 x 3 block of a reported 6 x 6 covariance if it is positive definite, else that of `sigma`."""
+    block = None
     if stated is not None and len(stated) == 36:
         block = np.array(stated).reshape(6, 6)[start : start + 3, start : start + 3]
-        block = 0.5 * (block + block.T)
-        if np.isfinite(block).all() and np.linalg.eigvalsh(block)[0] > 0.0:
-            return np.asarray(block)
-    return np.eye(3) * sigma * sigma
+    return choose_covariance(block, 3, sigma)
 
 
 @register

@@ -103,6 +103,15 @@ def register(kind: M) -> M:
     return kind
 
 
+def choose_covariance(stated: Array | None, size: int, sigma: float) -> Array:
+    """Return a stated covariance (size, size), made symmetric, if it is positive definite, else that of `sigma`."""
+    if stated is not None:
+        stated = 0.5 * (stated + stated.T)
+        if np.isfinite(stated).all() and np.linalg.eigvalsh(stated)[0] > 0.0:
+            return stated
+    return np.eye(size) * sigma * sigma
+
+
 def point_jacobian(nav: NavState, lever: Vector3, size: int) -> Array:
     """Return H (3, n) of the position of a point of the body in N; `lever` leads to it from the IMU, body axes, m."""
     H = np.zeros((3, size))

@@ -18,7 +18,12 @@ import numpy as np
 from modelserver.estimation.filter.error_layout import ErrorLayout, ErrorState
 from modelserver.estimation.filter.eskf import Innovation
 from modelserver.estimation.filter.measurements.gnss import gnss_states
-from modelserver.estimation.filter.measurements.measurement import REGISTRY, MeasurementContext, register
+from modelserver.estimation.filter.measurements.measurement import (
+    REGISTRY,
+    MeasurementContext,
+    choose_covariance,
+    register,
+)
 from modelserver.estimation.filter.measurements.wheels import wheel_states
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.sensor_rig import SensorRig
@@ -107,7 +112,7 @@ class OwnMeasurement:
 
     @classmethod
     def create(cls, rig: SensorRig, settings: FilterSettings) -> Self | None:
-        """Return None: `Setup` makes one for each source."""
+        """Return None: `split_sample` makes one by the type of a sample's source."""
         return None
 
     @property
@@ -154,6 +159,5 @@ def _is_covariance(given: Array) -> bool:
 def read_covariance(sample: MeasurementSample, sigma: float) -> Array:
     """Return the covariance (n, n) of a sample's values if it states one that is positive definite, else of `sigma`."""
     n = len(sample.values)
-    stated = np.array(sample.covariance).reshape(n, n) if sample.covariance else np.zeros((n, n))
-    stated = 0.5 * (stated + stated.T)
-    return stated if np.isfinite(stated).all() and _is_covariance(stated) else np.eye(n) * sigma * sigma
+    stated = np.array(sample.covariance).reshape(n, n) if sample.covariance else None
+    return choose_covariance(stated, n, sigma)
