@@ -20,6 +20,7 @@ from modelserver.earth.geodesy import (
     LocalFrame,
     compute_geodetic,
     ecef_from_geodetic,
+    geodesy_of,
     geodetic_from_ecef,
     make_origin,
     origin_at,
@@ -308,6 +309,17 @@ def test_geodetic_pose_equals_the_geodesic_to_a_point_ahead(reference, place, xy
     absolute = Geodesy(origin).enu_from_geodetic(*found[:3])
     as_enu = X.xyz if reference == "World:ENU" else Geodesy(origin).pose_in_enu(X).xyz
     assert absolute == pytest.approx(as_enu, abs=1e-6)
+
+
+@pytest.mark.parametrize("longitude", [-179.99, 179.99, 0.01, -3.0, -111.18, 8.4])
+@pytest.mark.parametrize("latitude", [-79.0, -33.0, 0.0, 0.0004, 50.27, 83.0])
+def test_given_places_around_an_origin_then_their_heading_has_the_exact_convergence(latitude, longitude):
+    origin = origin_at(latitude, longitude, 0.0)
+    geodesy = geodesy_of(origin)
+    for east, north in ((0.0, 0.0), (37.0, -81.0), (-4000.0, 2500.0), (9000.0, 9000.0)):
+        found = compute_geodetic(Pose.from_rpy((east, north, 0.0)), "World:UTM", origin)
+        expected = 90.0 + math.degrees(geodesy.convergence(found.latitude_deg, found.longitude_deg))
+        assert math.remainder(found.heading_deg - expected, 360.0) == pytest.approx(0.0, abs=math.degrees(3e-8))
 
 
 def test_given_a_vertical_axis_or_another_reference_then_there_is_no_heading_or_no_place():
