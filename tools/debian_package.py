@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from email import message_from_bytes
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
@@ -36,13 +36,16 @@ PYTHON: Final = f"python{sys.version_info.major}.{sys.version_info.minor}"
 NEEDED_OF: Final = {"filterpy": {"numpy"}}
 """For a package, those of its requirements that are needed: filterpy's KalmanFilter imports numpy only."""
 
+LIBRARIES: Final = "libglib2.0-0 | libglib2.0-0t64, libstdc++6, zlib1g"
+"""Debian's packages of the shared libraries that the wheels leave to the system: liblcm's GLib, C++, zlib."""
+
 CONTROL: Final = """\
 Package: modelserver
 Version: {version}
 Architecture: {architecture}
 Maintainer: {maintainer}
 Installed-Size: {kilobytes}
-Depends: {python}
+Depends: {python}, {libraries}
 Recommends: iproute2, udev
 Section: misc
 Priority: optional
@@ -94,10 +97,9 @@ def list_needed(wheel: Path) -> list[Distribution]:
         name = canonicalize_name(wanted.name)
         found[name] = distribution(name)
         for each in map(Requirement, found[name].requires or ()):
-            applies = each.marker is None or any(
-                each.marker.evaluate({"extra": extra}) for extra in ("", *wanted.extras)
-            )
-            if applies and canonicalize_name(each.name) in NEEDED_OF.get(name, {canonicalize_name(each.name)}):
+            if applies(each, wanted.extras) and canonicalize_name(each.name) in NEEDED_OF.get(
+                name, {canonicalize_name(each.name)}
+            ):
                 waiting.append(each)
     return sorted(found.values(), key=lambda each: canonicalize_name(each.name))
 
@@ -107,8 +109,13 @@ def read_requirements(wheel: Path) -> list[Requirement]:
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (each for each in archive.namelist() if each.endswith(".dist-info/METADATA"))
         metadata = message_from_bytes(archive.read(name))
-    required = map(Requirement, metadata.get_all("Requires-Dist") or ())
-    return [each for each in required if each.marker is None or each.marker.evaluate({"extra": ""})]
+    return [each for each in map(Requirement, metadata.get_all("Requires-Dist") or ()) if applies(each)]
+
+
+def applies(requirement: Requirement, extras: Iterable[str] = ()) -> bool:
+    """Return whether a requirement counts here, of a package with these extras."""
+    marker = requirement.marker
+    return marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *extras))
 
 
 def copy_distribution(source: Distribution, site: Path) -> None:
@@ -140,9 +147,7 @@ def make_environment(folder: Path, wheel: Path) -> None:
     (folder / "bin" / "python").symlink_to(f"/usr/bin/{PYTHON}")
     version = platform.python_version()
     (folder / "pyvenv.cfg").write_text(f"home = /usr/bin\ninclude-system-site-packages = false\nversion = {version}\n")
-    command = folder / "bin" / "modelserver"
-    command.write_text(COMMAND)
-    command.chmod(0o755)
+    write_script(folder / "bin" / "modelserver", COMMAND)
 
 
 def read_output(*command: str, environment: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -182,6 +187,7 @@ def build(output: Path, maintainer: str, wheel: Path | None = None, compression:
             maintainer=maintainer,
             kilobytes=size // 1024,
             python=PYTHON,
+            libraries=LIBRARIES,
         )
         (root / "DEBIAN/control").write_text(control)
         write_script(root / "DEBIAN/postinst", POSTINST)
