@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Draw the diagrams of the documentation: python tools/docs_images.py writes docs/images/*.svg.
 
-The frames of the Raptor are drawn from its geometry file, the drive from a simulation; the other diagrams are boxes and
-arrows. All are plain SVG without scripts, fonts or links.
+The frames of the Raptor are drawn from its geometry file; the other diagrams are boxes and arrows. All are plain SVG
+without scripts, fonts or links.
 """
 
 from __future__ import annotations
@@ -13,14 +13,31 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from mstools.report import charts
-
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 
 INK, LINE, PAPER = "#22303c", "#607d8b", "#ffffff"
 BLUE, GREEN, RED, AMBER, GRAY = "#1e6fb8", "#2e8b57", "#c0392b", "#d98200", "#9aa5ae"
 FILL = {LINE: "#eef2f5", BLUE: "#e3eefa", GREEN: "#e2f3e9", AMBER: "#fcf0db"}
+
+
+def element(name: str, content: str = "", /, **attributes: str | float) -> str:
+    """Return an XML element; `_` in an attribute's name becomes `-`."""
+    words = [name]
+    for key, each in attributes.items():
+        value = html.escape(each) if isinstance(each, str) else f"{each:.1f}".removesuffix(".0")
+        words.append(f'{key.replace("_", "-")}="{value}"')
+    return f"<{' '.join(words)}>{content}</{name}>" if content else f"<{' '.join(words)}/>"
+
+
+def format_points(points: Iterable[tuple[float, float]]) -> str:
+    """Return points as an attribute of a polyline or a polygon has them."""
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+
+
+def render_text(x: float, y: float, words: str, **attributes: str | float) -> str:
+    """Return words at a baseline."""
+    return element("text", html.escape(words), x=x, y=y, **attributes)
 
 
 class Drawing:
@@ -34,12 +51,12 @@ class Drawing:
         """Write words at a baseline; larger ones than 12 are bold."""
         bold = {"font_weight": "600"} if size > 12 else {}
         style = {"fill": color, "text_anchor": anchor} | bold
-        self.parts.append(charts.render_text(x, y, words, font_size=size, **style))
+        self.parts.append(render_text(x, y, words, font_size=size, **style))
 
     def box(self, x: float, y: float, width: float, height: float, words: str, color: str = LINE) -> None:
         """Draw a box with lines of words; the first is its title."""
         style = {"fill": FILL[color], "stroke": color}
-        self.parts.append(charts.element("rect", x=x, y=y, width=width, height=height, rx=6, **style))
+        self.parts.append(element("rect", x=x, y=y, width=width, height=height, rx=6, **style))
         lines = words.splitlines()
         top = y + height / 2 - (len(lines) - 1) * 8 + 4.5
         for number, line in enumerate(lines):
@@ -47,8 +64,8 @@ class Drawing:
 
     def line(self, *points: tuple[float, float], color: str = LINE, width: float = 1.6, dash: str = "none") -> None:
         """Draw a polyline."""
-        style = {"points": charts.format_points(points), "fill": "none", "stroke": color, "stroke_dasharray": dash}
-        self.parts.append(charts.element("polyline", **style, stroke_width=width))
+        style = {"points": format_points(points), "fill": "none", "stroke": color, "stroke_dasharray": dash}
+        self.parts.append(element("polyline", **style, stroke_width=width))
 
     def arrow(self, *points: tuple[float, float], words: str = "", color: str = LINE) -> None:
         """Draw an arrow through points with words above the middle of its ends."""
@@ -63,12 +80,12 @@ class Drawing:
 
     def polygon(self, points: Iterable[tuple[float, float]], fill: str, color: str = "none") -> None:
         """Draw a closed shape."""
-        style = {"points": charts.format_points(points), "fill": fill, "stroke": color}
-        self.parts.append(charts.element("polygon", **style, stroke_width=1.2))
+        style = {"points": format_points(points), "fill": fill, "stroke": color}
+        self.parts.append(element("polygon", **style, stroke_width=1.2))
 
     def dot(self, x: float, y: float, radius: float, fill: str, color: str = "none") -> None:
         """Draw a disk, with an outline in `color`."""
-        self.parts.append(charts.element("circle", cx=x, cy=y, r=radius, fill=fill, stroke=color))
+        self.parts.append(element("circle", cx=x, cy=y, r=radius, fill=fill, stroke=color))
 
     def svg(self) -> str:
         """Return the image as text."""
@@ -239,70 +256,11 @@ def raptor_frames() -> Drawing:
     return d
 
 
-OUTAGE = (40.0, 70.0)
-"""Seconds of the drawn drive without GPS."""
-
-
-def drive() -> Drawing:
-    """Draw a simulated drive of the Raptor with GPS and IMU: track, fixes, estimate; error and protection level."""
-    from modelserver.config.vehicle_file import load_config
-    from modelserver.earth.geodesy import Geodesy, origin_at
-    from modelserver.estimation.filter.localizer import FilterLocalizer
-    from modelserver.estimation.filter.setup import Setup
-    from modelserver.messages import GpsSample, ImuSample
-    from modelserver.server.vehicle import load_vehicle
-    from modelserver.simulation import GpsModel, ImuModel, Timing
-    from mstools.launch.drive import SUFFIELD, make_simulation
-
-    vehicle = load_vehicle(load_config(ROOT / "config" / "raptor" / "vehicle.yaml"))
-    config, geodesy = vehicle.config, Geodesy(origin_at(*SUFFIELD))
-    models = {"gps_model": GpsModel(outages=(OUTAGE,)), "imu_model": ImuModel(Timing(50.0))}
-    simulation = make_simulation(config, 10**15, 96.0, "city", seed=8, sensors=(GpsSample, ImuSample), **models)
-    X_rolling_base = vehicle.model.get_transformation(config.base_frame, config.rolling_frame).pose
-    localizer = FilterLocalizer.start(Setup(vehicle.rig), geodesy.origin)
-    fixes, truth, rows = [], [], []
-    for sample in simulation.events(96.0):
-        localizer, _ = localizer.process(sample)
-        if isinstance(sample, GpsSample):
-            if math.isfinite(sample.latitude_deg) and sample.header.seq % 4 == 0:
-                fixes.append(geodesy.enu_from_geodetic(sample.latitude_deg, sample.longitude_deg, SUFFIELD[2]))
-        elif sample.header.seq % 10 == 0:
-            estimate, true = localizer.estimate(localizer.utime), simulation.truth(localizer.utime).enu.xyz
-            truth.append(true)
-            if estimate.enu is not None and not estimate.invalid:
-                x, y, _ = (estimate.enu @ X_rolling_base).xyz
-                seconds = localizer.utime * 1e-6 - 1e9
-                rows.append((seconds, x, y, math.dist((x, y), true[:2]), estimate.horizontal_protection_level))
-    t, x, y, error, bound = zip(*rows, strict=True)
-    hidden = [each if OUTAGE[0] <= at <= OUTAGE[1] else math.nan for at, each in zip(t, x, strict=True)]
-    drawn = [
-        charts.Series("truth", [each[0] for each in truth], [each[1] for each in truth], "#cfd8dc", 8.0),
-        charts.dots("fixes", fixes, charts.GREEN, 6.0),
-        charts.Series("estimate", x, y, charts.BLUE, 2.0),
-        charts.Series("without GPS", hidden, y, charts.AMBER, 2.0),
-    ]
-    track = charts.render_map("Track", "east, m", "north, m", drawn, heights=(300, 300))
-    top = 2.0 * math.ceil(0.5 * max(bound))
-    errors = [
-        charts.Series("without GPS", OUTAGE, (0.0, 0.0), charts.AMBER, shape="band", high=(top, top)),
-        charts.Series("protection level (10^-5 per hour)", t, bound, charts.RED, 2.0),
-        charts.Series("true error", t, error, charts.BLUE, 2.0),
-    ]
-    panel = charts.Panel("Horizontal error and protection level", charts.Axis("m", 0.0, top), errors, 150.0)
-    error_chart = charts.render_panels("Error", charts.Axis("seconds", 0.0, 98.0), [panel])
-    d = Drawing(charts.WIDTH, 592, "A simulated drive with 30 s without GPS")
-    d.parts.append(charts.element("style", charts.CHART_STYLE))
-    for y, height, chart in ((4, 366, track), (374, 216, error_chart)):
-        d.parts.append(chart.replace("<svg ", f'<svg y="{y}" width="{charts.WIDTH}" height="{height}" ', 1))
-    return d
-
-
 DRAWINGS: dict[str, Callable[[], Drawing]] = {
     "data-flow": data_flow,
     "filter": filter_flow,
     "delayed-measurement": delayed_measurement,
     "raptor-frames": raptor_frames,
-    "drive": drive,
 }
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from support_recordings import HUSKY, drive, write_log
 from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
+from modelserver.errors import ModelServerError
 from modelserver.simulation import EncoderModel, WheelsModel
 from mstools import cli
 from mstools.report import charts
@@ -50,8 +55,13 @@ def whole(page: str) -> str:
     parser.feed(page)
     parser.close()
     assert parser.open == []
-    assert not re.search(r"(src|href)=(?!\"#)|url\(|@import|<script|<link", page)
-    assert not re.search(r'[ ",](nan|inf)\b', page)
+    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert not re.search(r"(src|href)=(?!\"#)|url\(|@import|<link|<script", shown)
+    assert not re.search(r'[ ",](nan|inf)\b', shown)
+    for script in re.findall(r'<script type="application/json">(.*?)</script>', page):
+        figure = json.loads(script, parse_constant=pytest.fail)
+        assert figure["data"]
+        assert figure["layout"]["height"] > 50
     return page
 
 
@@ -73,7 +83,7 @@ def test_given_a_drive_when_reported_then_the_page_is_whole_and_the_swapped_whee
     assert (code, err) == (0, "")
     assert "Wheel front_left counts backward" in words
     page = whole(out.read_text())
-    assert len(page) < 1_000_000
+    assert len(page) < 3_000_000
     for text in ("Wheel front_left counts backward", "gps_position, east, m", "Gyro bias", "Wheel scale", "fixes used"):
         assert text in page
     assert "phase aligned" in page
@@ -147,23 +157,60 @@ def test_given_a_report_over_what_is_read_or_written_then_it_is_rejected(tmp_pat
 # --- drawing ------------------------------------------------------------------------------------------------
 
 
+def read_figure(drawn: str) -> dict[str, Any]:
+    """Return the figure of a chart."""
+    figure: dict[str, Any] = json.loads(drawn.partition('json">')[2].partition("</script>")[0])
+    return figure
+
+
+def read_numbers(encoded: dict[str, str]) -> np.ndarray:
+    assert encoded["dtype"] == "f4"
+    return np.frombuffer(base64.b64decode(encoded["bdata"]), "<f4")
+
+
 def test_given_many_points_then_a_curve_keeps_its_peaks_and_little_else() -> None:
-    points = [(n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)]
+    points = [(n / 100.0, n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)]
     drawn = charts.decimate(points)
     assert len(drawn) <= 4 * 101
-    assert (33.33, 5.0) in drawn
+    assert (33.33, 33.33, 5.0) in drawn
 
 
-def test_given_many_dots_then_a_pixel_has_one() -> None:
+def test_given_a_curve_with_a_gap_then_the_gap_stays() -> None:
+    t = np.arange(100_000) / 1000.0
+    y = np.where((t > 40.0) & (t < 60.0), np.nan, np.sin(t))
+    panel = charts.Panel("p", charts.Axis("m", -1.0, 1.0), [charts.Series("line", t, y)])
+    (trace,) = read_figure(charts.render_panels("a", charts.Axis("s", 0.0, 100.0), [panel]))["data"]
+    x, drawn = read_numbers(trace["x"]), read_numbers(trace["y"])
+    assert len(x) <= 4 * charts.COLUMNS + 8
+    assert np.isnan(drawn[(x > 40.1) & (x < 59.9)]).all()
+    assert np.isfinite(drawn[(x < 39.9) | (x > 60.1)]).all()
+    assert drawn[np.isfinite(drawn)] == pytest.approx(np.sin(x[np.isfinite(drawn)]), abs=1e-3)
+
+
+def test_given_many_dots_then_a_cell_has_one_and_those_beyond_are_at_the_edge() -> None:
     axis = charts.Axis("m", -1.0, 1.0)
-    many = charts.Series("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 100_000, shape="dots")
+    many = charts.Series("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 99_999 + [7.0], shape="dots")
     drawn = charts.render_panels("a", charts.Axis("s", 0.0, 100.0), [charts.Panel("p", axis, [many])])
-    assert len(drawn) < 30_000
+    y = read_numbers(read_figure(drawn)["data"][0]["y"])
+    assert len(y) <= charts.COLUMNS + 2
+    assert y.max() == 1.0
 
 
 def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
-    drawn = charts.render_strip(
-        "<b>", charts.Axis("<s>", 0.0, 1.0), [charts.StripRow("<i>", [(0.0, 1.0, '"&<')], charts.RED)]
-    )
-    assert "<b>" not in drawn
-    assert "<i>" not in drawn
+    row = charts.StripRow("<i>", [(0.0, 1.0, '"&<')], charts.RED)
+    drawn = charts.render_strip('<b>"', charts.Axis("</script>", 0.0, 1.0), [row])
+    assert drawn.count("</script>") == 1
+    assert 'aria-label="&lt;b&gt;&quot;"' in drawn
+    figure = read_figure(drawn)
+    # the library knows some tags
+    assert figure["data"][0]["y"] == ["&lt;i&gt;"]
+    assert figure["layout"]["xaxis"]["title"]["text"] == "&lt;/script&gt;"
+
+
+def test_given_no_plotly_then_the_error_has_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    def find(name: str) -> object:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(charts, "files", find)
+    with pytest.raises(ModelServerError, match=r"pip install 'modelserver\[report\]'"):
+        charts.render_page("a", "b")

@@ -147,8 +147,14 @@ def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken
     log, config = noisy
     out = tmp_path / "proposal.yaml"
     before = config.read_bytes()
-    code, words, err = run(log, "-c", config, "--quick", "--processes", 1, "-o", out)
+    page = tmp_path / "scores.html"
+    code, words, err = run(log, "-c", config, "--quick", "--processes", 1, "-o", out, "--plot", page)
     assert code == 0
+    figure = json.loads(page.read_text().partition('<script type="application/json">')[2].partition("</script>")[0])
+    tried, proposed = figure["data"][:2]
+    assert tried["text"][0] == "the vehicle file's"
+    assert any(each.startswith("gps_white_share 0.15 -&gt; 0.3") for each in tried["text"])
+    assert proposed["text"][0].startswith("gps_white_share 0.15 -&gt; ")
     assert "NIS, gps_position" in words
     assert "gps_white_share: 0.15 -> 0.3" in err
     proposed = yaml.safe_load(out.read_text())["localization"]["filter"]
@@ -243,6 +249,7 @@ def test_given_a_proposal_that_exists_then_it_stays(tmp_path: Path, run: Run) ->
     assert "--force" in err
     assert out.read_text() == "precious"
     assert run(log, "-c", HUSKY, "-o", log)[0] == 2
+    assert run(log, "-c", HUSKY, "--plot", log)[0] == 2
     assert run(log, "-c", HUSKY, "-o", "-", "--json")[0] == 2
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -186,13 +185,7 @@ def render_noise_page(log: str, noise: ImuNoise) -> str:
         _render_allan_chart("Gyro", "rad/s", noise.gyro, QUANTITIES[0].propose(noise)),
         _render_allan_chart("Accelerometer", "m/s²", noise.accelerometer, QUANTITIES[3].propose(noise)),
     ]
-    return _render_page(f"Allan deviation: {escape(log)}", format_noise(escape(log), noise, None), drawn)
-
-
-def _render_page(title: str, lines: Sequence[str], drawn: Sequence[str]) -> str:
-    text = html.escape("\n".join(lines))
-    figures = "".join(f"<figure>{each}</figure>" for each in drawn)
-    return charts.render_page(title, f"<h1>{html.escape(title)}</h1>\n<pre>{text}</pre>\n{figures}")
+    return charts.render_text_page(f"Allan deviation: {escape(log)}", format_noise(escape(log), noise, None), drawn)
 
 
 def _render_allan_chart(name: str, unit: str, axes: Sequence[AxisNoise], white: float) -> str:
@@ -302,7 +295,7 @@ def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up
     chart = charts.render_map(
         "Field during rotation", f"along in {plane}, µT", f"across in {plane}, µT", drawn, heights=(600, 600)
     )
-    return _render_page(f"Magnetometer: {escape(log)}", words, [chart])
+    return charts.render_text_page(f"Magnetometer: {escape(log)}", words, [chart])
 
 
 def _format_proposal(log: str, how: str, section: str, lines: Sequence[str]) -> str:

@@ -22,6 +22,7 @@ from mstools.calibration import imu_recording as calibrate_log
 from mstools.calibration import report as calibrate_report
 from mstools.calibration.imu_recording import ImuRecording
 from mstools.calibration.report import AxisNoise, ImuNoise
+from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, write_file
 
@@ -258,6 +259,8 @@ def _check_options(begin: float, end: float, log: Path, plot: str, output: str, 
         raise typer.BadParameter("LOG, --plot and --output must be different files")
     for target in named:
         check_writable(target, force)
+    if plot:
+        charts.check_installed()
     if as_json and output == "-":
         raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
 

@@ -191,6 +191,10 @@ def replay_offline(
         )
     times = None if at_times is None else read_times(at_times)
     inputs = [log, config, Path(vehicle.config.geometry), *([] if at_times is None else [at_times])]
+    if report:
+        from mstools.report import charts
+
+        charts.check_installed()
     _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
     with LogFile(log) as recording:
         run = OfflineRun(vehicle, _filter_channels(recording, channels), frame or vehicle.config.base_frame)

@@ -18,9 +18,11 @@ import typer
 
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.messages import FixType, GpsSample
+from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
 from mstools.terminal.progress import show_progress
+from mstools.tuning import report as tuning_report
 from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
 
 if TYPE_CHECKING:
@@ -60,6 +62,7 @@ def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
+    plot: Annotated[str, option("--plot HTML", "Write a page with the scores of all settings that were tried.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
     rounds: Annotated[int, option("--rounds N", "Rounds over all settings, at most.", min=1, max=5)] = 2,
     processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
@@ -76,15 +79,19 @@ def command(
     \b
     Examples:
       modelserver tune drive.lcm -c config/husky/vehicle.yaml --quick
-      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml
+      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml --plot scores.html
     """
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
     if as_json and output == "-":
         raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
-    if output and os.path.realpath(output) in {os.path.realpath(each) for each in (log, config)}:
-        raise typer.BadParameter("LOG, --config and --output must be different files")
-    check_writable(output, force)
+    named = [each for each in (output, plot) if each and each != "-"]
+    if len({os.path.realpath(each) for each in (*named, str(log), str(config))}) < len(named) + 2:
+        raise typer.BadParameter("LOG, --config, --plot and --output must be different files")
+    for target in named:
+        check_writable(target, force)
+    if plot:
+        charts.check_installed()
     from mstools.tuning import evaluation as tune_runs
 
     vehicle = tune_runs.load(config)
@@ -114,11 +121,17 @@ def command(
             )
         found = search(begin, first, chosen, trials, rounds, _print_step)
         after = trials.outcomes(found.settings)
+        attempts = trials.list_attempts()
     result = TuningResult(begin, first, before, found, after, trials.count)
     if as_json:
         typer.echo(json.dumps(as_data(result), indent=2, allow_nan=False))
     else:
         typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
+    if plot:
+        lines = format_result(escape(str(log)), result)
+        write_file(
+            plot, tuning_report.render_page(escape(str(log)), lines, begin, attempts, found.settings), replace=force
+        )
     write_file(output, format_proposal(str(log), result), replace=force)
 
 
@@ -161,6 +174,10 @@ class Trials:
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
         """Return the results of evaluated settings, one for each part."""
         return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
+
+    def list_attempts(self) -> list[tuning_report.Attempt]:
+        """Return all settings that were tried, in order, with their scores."""
+        return [tuning_report.Attempt(dict(key), self._score(found)) for key, found in self.results.items()]
 
     def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]

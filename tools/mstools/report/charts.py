@@ -1,31 +1,42 @@
-"""Charts as SVG text, and an HTML page for them: self-contained, without scripts.
+"""Charts that one can touch, and an HTML page for them: one file that opens without internet.
 
-Lines and bands are decimated to at most four points per pixel column (first, lowest, highest, last) and dots to one per
-pixel, so that the page stays small for a long recording.
+A chart is a figure of plotly.js as JSON; the library's script is in the page, compressed (`page.js` draws the figures,
+links their time axes and shows one time on all of them). Numbers are in single precision. Lines and bands are decimated
+to at most four points in each of `COLUMNS` (first, lowest, highest, last) and dots to one per cell, so that the page
+stays small for a long recording.
 """
 
 from __future__ import annotations
 
+import base64
+import gzip
 import html
+import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from itertools import groupby
-from typing import Literal, TypeAlias
+from typing import Any, Literal
+
+import numpy as np
+
+from modelserver.errors import ModelServerError
 
 WIDTH = 1060
-LEFT, RIGHT = 74, 14
+"""Width of a chart in pixels for which its height is chosen; it follows the page's."""
+
+LEFT, RIGHT, BELOW = 80, 16, 46
 INNER = WIDTH - LEFT - RIGHT
-GAP = 10
-HEADER = 22
+HEADER = 32
+COLUMNS = 2000
+ROWS = 400
 
 BLUE, ORANGE, GREEN, PINK, SKY, AMBER, GRAY, RED = PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7"),
     *("#56b4e9", "#e69f00", "#8a8f98", "#c22f2f"),
 )
 """Distinguishable with color blindness: M. Okabe and K. Ito, "Color Universal Design", 2008; gray and red added."""
-
-Place: TypeAlias = Callable[[float], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +55,13 @@ class Axis:
             value, low, high = math.log10(value) if value > 0.0 else math.nan, math.log10(low), math.log10(high)
         return (value - low) / (high - low)
 
-    def ticks(self) -> list[float]:
-        """Return the ticks: powers of ten, or even steps of 1, 2 or 5."""
-        if self.is_logarithmic:
-            return [10.0**n for n in range(round(math.log10(self.low)), round(math.log10(self.high)) + 1)]
-        rough = (self.high - self.low) / 6.0
-        power = 10.0 ** math.floor(math.log10(rough))
-        step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= rough)
-        return [n * step for n in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)]
-
 
 @dataclass(frozen=True, slots=True)
 class Series:
     """Values over x, named in the legend; non-finite ones interrupt lines and bands.
 
-    `high` are the upper values of a band, whose lower ones are `y`. Dots beyond the panel are drawn at its edge.
+    `high` are the upper values of a band, whose lower ones are `y`. `times` are the seconds of the points of a track on
+    a map, `texts` what is shown on dots. Dots beyond the panel are drawn at its edge.
     """
 
     name: str
@@ -68,6 +71,8 @@ class Series:
     width: float = 1.4
     shape: Literal["line", "dashes", "dots", "band"] = "line"
     high: Sequence[float] = ()
+    times: Sequence[float] = ()
+    texts: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,237 +127,257 @@ def dots(name: str, points: Iterable[Sequence[float]], color: str, size: float) 
 
 
 def render_panels(label: str, x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]] = ()) -> str:
-    """Return an SVG of panels above one another; `events` are vertical lines through all of them."""
-    parts: list[str] = []
-    top = float(HEADER)
-    for panel in panels:
-        parts += _render_panel(panel, x, top, events)
-        top += panel.height + GAP + HEADER
-    bottom = top - GAP - HEADER
-    return _render_svg(label, bottom + 44, [*parts, *_render_x_axis(x, LEFT, INNER, bottom)])
+    """Return panels above one another as HTML; `events` are vertical lines through all of them."""
+    return _render_figure(label, *_make_panels(x, panels, events), is_over_time=x.label.startswith("seconds"))
 
 
 def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tuple[float, float] = (420, 900)) -> str:
-    """Return an SVG map with one scale for both axes, whose labels are `x` and `y`; its height fits within limits."""
+    """Return a map with one scale for both axes, whose labels are `x` and `y`; its height fits within limits."""
     (west, east), (south, north) = spans = [
         value_range((value for each in series for value in getattr(each, axis)), min_width=2.0) for axis in "xy"
     ]
     height = min(max(INNER * (north - south) / (east - west), heights[0]), heights[1])
-    scale = max((east - west) / INNER, (north - south) / height)
-    axes = [
-        Axis(name, 0.5 * (low + high - scale * pixels), 0.5 * (low + high + scale * pixels))
-        for name, (low, high), pixels in zip((x, y), spans, (INNER, height), strict=True)
-    ]
-    return render_panels(label, axes[0], [Panel("", axes[1], series, height)])
+    axes = [Axis(name, low, high) for name, (low, high) in zip((x, y), spans, strict=True)]
+    traces, layout = _make_panels(axes[0], [Panel("", axes[1], series, height)], ())
+    layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
+    layout["hovermode"] = "closest"
+    return _render_figure(label, traces, layout)
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
-    """Return an SVG of rows with intervals."""
-    pitch, left = 24.0, 190.0
-    width, bottom = WIDTH - left - RIGHT, 4.0 + pitch * len(rows)
-
-    def at(value: float) -> float:
-        return left + min(max(x.fraction(value), 0.0), 1.0) * width
-
-    parts = _render_verticals(at, 2.0, bottom, x.ticks(), ())
-    for number, row in enumerate(rows):
-        y = 8.0 + pitch * number
-        parts.append(render_text(left - 8, y + 11, row.name, text_anchor="end"))
-        parts.append(element("rect", x=left, y=y, width=width, height=14, class_="track"))
-        parts += [
-            element("rect", _title(words), x=at(a), y=y, width=max(at(b) - at(a), 1.5), height=14, fill=row.color)
-            for a, b, words in row.intervals
-        ]
-    parts += _render_verticals(at, 2.0, bottom, (), events)
-    return _render_svg(label, bottom + 38, [*parts, *_render_x_axis(x, left, width, bottom)])
-
-
-# --- parts --------------------------------------------------------------------------------------------------
-
-
-def element(name: str, content: str = "", /, **attributes: str | float) -> str:
-    """Return an XML element; `_` in an attribute's name becomes `-`, and one at its end goes, as in `class_`."""
-    words = [name]
-    for key, each in attributes.items():
-        value = html.escape(each) if isinstance(each, str) else f"{each:.1f}".removesuffix(".0")
-        words.append(f'{key.removesuffix("_").replace("_", "-")}="{value}"')
-    return f"<{' '.join(words)}>{content}</{name}>" if content else f"<{' '.join(words)}/>"
-
-
-def format_points(points: Iterable[tuple[float, float]]) -> str:
-    """Return points as an attribute of a polyline or a polygon has them."""
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-
-
-def render_text(x: float, y: float, words: str, **attributes: str | float) -> str:
-    """Return words at a baseline."""
-    return element("text", html.escape(words), x=x, y=y, **attributes)
-
-
-def _title(words: str) -> str:
-    return element("title", html.escape(words)) if words else ""
-
-
-def _render_svg(label: str, height: float, parts: Iterable[str]) -> str:
-    head = {"xmlns": "http://www.w3.org/2000/svg", "viewBox": f"0 0 {WIDTH} {height:.0f}", "aria-label": label}
-    return element("svg", "\n".join(parts), **head, role="img")
-
-
-def _render_verticals(
-    at: Place, top: float, bottom: float, ticks: Iterable[float], events: Iterable[tuple[float, str]]
-) -> list[str]:
-    lines = [(at(tick), "", "grid") for tick in ticks] + [(at(when), words, "event") for when, words in events]
-    return [element("line", _title(words), x1=x, y1=top, x2=x, y2=bottom, class_=kind) for x, words, kind in lines]
-
-
-def _render_x_axis(x: Axis, left: float, width: float, bottom: float) -> list[str]:
-    places = [(left + x.fraction(tick) * width, 15, _format_number(tick)) for tick in x.ticks()]
-    places.append((left + width / 2, 32, x.label))
-    return [render_text(at, bottom + below, words, text_anchor="middle") for at, below, words in places]
-
-
-def _render_panel(panel: Panel, x: Axis, top: float, events: Sequence[tuple[float, str]]) -> list[str]:
-    """Return title, box, y axis with its ticks, legend at the right above the box, and the series, clipped to it."""
-    y, height = panel.y, panel.height
-
-    def at_x(value: float) -> float:
-        return x.fraction(value) * INNER
-
-    def at_y(value: float) -> float:
-        return (1.0 - y.fraction(value)) * height
-
-    parts = [
-        render_text(LEFT, top - 7, panel.title, class_="title"),
-        element("rect", x=LEFT, y=top, width=INNER, height=height, class_="box"),
+    """Return rows with intervals."""
+    traces: list[dict[str, Any]] = [
+        {
+            "type": "bar",
+            "orientation": "h",
+            "base": [round(a, 3) for a, _, _ in row.intervals],
+            "x": [round(b - a, 3) for a, b, _ in row.intervals],
+            "y": [_to_text(row.name)] * len(row.intervals),
+            "text": [_to_text(words) for _, _, words in row.intervals],
+            "textposition": "none",
+            "hovertemplate": "%{base:.1f} s, for %{x:.1f} s<br>%{text}<extra>%{y}</extra>",
+            "marker": {"color": row.color},
+            "showlegend": False,
+        }
+        for row in rows
     ]
-    for tick in y.ticks()[:: 1 if height > 100.0 else 2]:
-        line = top + at_y(tick)
-        parts.append(element("line", x1=LEFT, y1=line, x2=LEFT + INNER, y2=line, class_="grid"))
-        parts.append(render_text(LEFT - 6, line + 4, _format_number(tick), text_anchor="end"))
-    middle = top + 0.5 * height
-    parts.append(render_text(13, middle, y.label, text_anchor="middle", transform=f"rotate(-90 13 {middle:.1f})"))
-    right = float(LEFT + INNER)
-    for each in reversed([each for each in panel.series if each.name]):
-        right -= 6.3 * len(each.name)
-        parts += [render_text(right, top - 7, each.name), *_render_legend(each, right - 20.0, top - 11.0)]
-        right -= 38.0
-    box = {"height": f"{height:.1f}", "viewBox": f"0 0 {INNER} {height:.1f}", "overflow": "hidden"}
-    inner = [part for each in panel.series for part in _render_series(each, at_x, at_y, height)]
-    parts += _render_verticals(lambda value: LEFT + at_x(value), top, top + height, x.ticks(), ())
-    parts.append(element("svg", "".join(inner), x=LEFT, y=top, width=INNER, **box))
-    return parts + _render_verticals(lambda value: LEFT + at_x(value), top, top + height, (), events)
+    layout = {
+        "height": 24 * len(rows) + BELOW + 12,
+        "margin": {"l": 190, "r": RIGHT, "t": 8, "b": BELOW},
+        "barmode": "overlay",
+        "bargap": 0.35,
+        "hovermode": "closest",
+        "xaxis": _make_axis(x),
+        "yaxis": {
+            "categoryarray": [_to_text(row.name) for row in rows],
+            "categoryorder": "array",
+            "autorange": "reversed",
+            "fixedrange": True,
+        },
+        "shapes": [_make_event_line(when) for when, _ in events],
+    }
+    return _render_figure(label, traces, layout, is_over_time=True)
 
 
-def _render_legend(series: Series, x: float, y: float) -> list[str]:
+# --- parts of a figure ---
+
+
+def _make_panels(
+    x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]]
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return traces and layout of panels with a common x axis, the first at the top."""
+    inner = sum(each.height for each in panels) + HEADER * (len(panels) - 1)
+    traces: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {
+        "height": round(inner + HEADER + BELOW),
+        "margin": {"l": LEFT, "r": RIGHT, "t": HEADER, "b": BELOW},
+        "hovermode": "x unified",
+        "annotations": [],
+        "shapes": [_make_event_line(when) for when, _ in events],
+    }
+    top = 1.0
+    for number, panel in enumerate(panels, 1):
+        suffix = "" if number == 1 else str(number)
+        bottom = max(top - panel.height / inner, 0.0)
+        layout[f"yaxis{suffix}"] = _make_axis(panel.y) | {"domain": [bottom, top], "anchor": "x"}
+        layout[f"legend{suffix}"] = {"orientation": "h", "x": 1, "xanchor": "right", "y": top, "yanchor": "bottom"}
+        title = {"text": f"<b>{_to_text(panel.title)}</b>", "x": 0, "xanchor": "left", "y": top, "yanchor": "bottom"}
+        layout["annotations"].append(title | {"xref": "paper", "yref": "paper", "showarrow": False})
+        place = {"xaxis": "x", "yaxis": f"y{suffix}", "legend": f"legend{suffix}"}
+        traces += [trace | place for series in panel.series for trace in _make_traces(series, x, panel.y)]
+        top = bottom - HEADER / inner
+    if events:
+        where = [panels[0].y.high] * len(events)
+        marks = {"x": [when for when, _ in events], "y": where, "text": [_to_text(words) for _, words in events]}
+        style = {"mode": "markers", "marker": {"symbol": "triangle-down", "size": 9, "color": EVENT_COLOR}}
+        traces.append(marks | style | {"hovertemplate": "%{text}<extra></extra>", "showlegend": False})
+    layout["xaxis"] = _make_axis(x) | {"anchor": f"y{len(panels) if len(panels) > 1 else ''}"}
+    return traces, layout
+
+
+EVENT_COLOR = "#7a4fb5"
+
+
+def _make_event_line(when: float) -> dict[str, Any]:
+    ends = {"x0": when, "x1": when, "y0": 0, "y1": 1, "yref": "paper"}
+    return {"type": "line", **ends, "line": {"color": EVENT_COLOR, "width": 1, "dash": "dot"}}
+
+
+def _make_axis(axis: Axis) -> dict[str, Any]:
+    title = {"title": {"text": _to_text(axis.label), "standoff": 8}}
+    if axis.is_logarithmic:
+        return title | {
+            "type": "log",
+            "range": [math.log10(axis.low), math.log10(axis.high)],
+            "exponentformat": "power",
+        }
+    return title | {"range": [axis.low, axis.high], "zeroline": False}
+
+
+def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
+    """Return the traces of a series: one, for a band its two edges."""
+    name = {"name": _to_text(series.name), "showlegend": bool(series.name)}
+    if not series.name:
+        name["hoverinfo"] = "skip" if series.shape == "band" else "y"
+    points = np.column_stack([np.asarray(series.x, float), np.asarray(series.y, float)])
     if series.shape == "dots":
-        return [element("circle", cx=x + 10, cy=y, r=3, fill=series.color)]
-    ends = [(x, y - 4.0), (x + 16.0, y - 4.0)] if series.shape == "band" else [(x, y), (x + 16.0, y)]
-    return [_render_run(series, [(a, b, b + 8.0) for a, b in ends])]
-
-
-def _render_series(series: Series, at_x: Place, at_y: Place, height: float) -> list[str]:
-    rows = [
-        (at_x(a), at_y(low), at_y(high))
-        for a, low, high in zip(series.x, series.y, series.high or series.y, strict=True)
-    ]
-    runs = [list(group) for known, group in groupby(rows, lambda row: all(map(math.isfinite, row))) if known]
-    if series.shape != "dots":
-        return [_render_run(series, run) for run in runs if len(run) > 1]
-    pixels = {(round(a), round(min(max(b, 1.0), height - 1.0))): None for run in runs for a, b, _ in run}
-    # zero-length strokes with round caps: one element for thousands of points
-    path = "".join(f"M{a} {b}h0" for a, b in pixels)
-    return [element("path", d=path, stroke=series.color, stroke_width=series.width, stroke_linecap="round")]
-
-
-def _render_run(series: Series, run: Sequence[tuple[float, float, float]]) -> str:
-    """Return a line, or the area of a band, through points (x, y, upper y)."""
-    points = decimate([(a, low) for a, low, _ in run])
+        chosen = _select_dots(points, x, y)
+        points = points[chosen]
+        points[:, 1] = np.clip(points[:, 1], y.low, y.high)
+        style: dict[str, Any] = {"mode": "markers", "marker": {"color": series.color, "size": series.width + 1.0}}
+        if series.texts:
+            name |= {"text": [_to_text(series.texts[n]) for n in chosen]}
+        return [_make_trace(points) | name | style]
     if series.shape == "band":
-        points += reversed(decimate([(a, high) for a, _, high in run]))
-        return element("polygon", points=format_points(points), fill=series.color, class_="band")
-    style: dict[str, str] = {"stroke_dasharray": "5 3"} if series.shape == "dashes" else {}
-    style |= {"points": format_points(points), "fill": "none", "stroke": series.color}
-    return element("polyline", **style, stroke_width=series.width)
+        upper = np.column_stack([points[:, 0], np.asarray(series.high, float)])
+        edge = {"mode": "lines", "line": {"width": 0, "color": series.color}, "hoverinfo": "skip"}
+        fill = {"fill": "tonexty", "fillcolor": _make_translucent(series.color)}
+        shown = {"showlegend": False, "legendgroup": series.name}
+        return [
+            _make_trace(_decimate(points, x)) | edge | shown,
+            _make_trace(_decimate(upper, x)) | name | edge | fill | {"legendgroup": series.name},
+        ]
+    line = {"color": series.color, "width": series.width, "dash": "dash" if series.shape == "dashes" else "solid"}
+    if series.times:
+        # a track goes to and fro: no column of it can be decimated
+        return [_make_trace(points) | name | {"mode": "lines", "line": line} | _make_times(series)]
+    return [_make_trace(_decimate(points, x)) | name | {"mode": "lines", "line": line}]
 
 
-def decimate(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return a curve with at most the first, lowest, highest and last point of each run within one pixel column."""
-    drawn: list[tuple[float, float]] = []
-    for _, column in groupby(points, lambda point: math.floor(point[0])):
-        run = list(column)
-        heights = [each[1] for each in run]
+def _make_trace(points: np.ndarray[Any, Any]) -> dict[str, Any]:
+    return {"type": "scatter", "x": _encode(points[:, 0]), "y": _encode(points[:, 1])}
+
+
+def _make_times(series: Series) -> dict[str, Any]:
+    # a point that interrupts a line has no time
+    times = [None if math.isnan(each) else round(each, 2) for each in series.times]
+    hover = "%{customdata} s<br>%{x:.2f}, %{y:.2f} m<extra>%{fullData.name}</extra>"
+    return {"customdata": times, "hovertemplate": hover}
+
+
+def _encode(values: np.ndarray[Any, Any]) -> dict[str, str]:
+    """Return numbers as plotly.js reads them: base64 of single precision, whose nan interrupts a line."""
+    finite = np.where(np.isfinite(values), values, np.nan).astype("<f4")
+    return {"dtype": "f4", "bdata": base64.b64encode(finite.tobytes()).decode()}
+
+
+def _make_translucent(color: str) -> str:
+    red, green, blue = (int(color[n : n + 2], 16) for n in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.22)"
+
+
+def _to_text(words: str) -> str:
+    """Return words as plotly.js reads them, which knows some tags."""
+    return html.escape(words, quote=False)
+
+
+def _select_dots(points: np.ndarray[Any, Any], x: Axis, y: Axis) -> list[int]:
+    """Return the numbers of the finite points, one of each cell of the panel."""
+    cells: dict[tuple[int, int], int] = {}
+    for number, (a, b) in enumerate(points.tolist()):
+        column, row = x.fraction(a) * COLUMNS, min(max(y.fraction(b), 0.0), 1.0) * ROWS
+        if math.isfinite(column) and math.isfinite(b) and math.isfinite(row):
+            cells.setdefault((round(column), round(row)), number)
+    return list(cells.values())
+
+
+def _decimate(points: np.ndarray[Any, Any], x: Axis) -> np.ndarray[Any, Any]:
+    if len(points) <= COLUMNS:
+        return points
+    columns = [(x.fraction(a) * COLUMNS, a, b) for a, b in points.tolist()]
+    return np.array([each[1:] for each in decimate(columns)])
+
+
+def decimate(points: Iterable[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    """Return at most the first, lowest, highest and last point of each run within one column; nan stays a gap.
+
+    A point is column, x, y.
+    """
+    drawn: list[tuple[float, float, float]] = []
+    for _, group in groupby(
+        points, lambda each: (math.floor(each[0]) if math.isfinite(each[0]) else -1, each[2] == each[2])
+    ):
+        run = list(group)
+        heights = [each[2] for each in run]
         chosen = {0, heights.index(min(heights)), heights.index(max(heights)), len(run) - 1}
         drawn += run if len(run) <= 4 else [run[n] for n in sorted(chosen)]
     return drawn
 
 
-def _format_number(value: float) -> str:
-    return f"{value:.6g}" if value == 0.0 or 1e-4 <= abs(value) < 1e5 else f"{value:.0e}"
+def _render_figure(
+    label: str, traces: Sequence[dict[str, Any]], layout: dict[str, Any], is_over_time: bool = False
+) -> str:
+    """Return a chart as HTML: an element of its height with the figure in JSON."""
+    figure = json.dumps({"data": traces, "layout": layout}, allow_nan=False, separators=(",", ":"))
+    time = " data-time" if is_over_time else ""
+    attributes = f'class="chart" role="img" aria-label="{html.escape(label)}"{time} style="height:{layout["height"]}px"'
+    # within HTML nothing may look like the end of the script
+    inside = figure.replace("<", "\\u003c")
+    return f'<div {attributes}><script type="application/json">{inside}</script></div>'
 
 
 # --- page ---------------------------------------------------------------------------------------------------
 
 
+def check_installed() -> None:
+    """Raise ModelServerError if the extra `report` is not installed."""
+    _find_library()
+
+
+def _find_library() -> Any:
+    try:
+        return files("plotly") / "package_data" / "plotly.min.js"
+    except ModuleNotFoundError:
+        text = "reports need plotly, which is not installed: pip install 'modelserver[report]'"
+        raise ModelServerError(text) from None
+
+
+def render_text_page(title: str, lines: Sequence[str], figures: Sequence[str]) -> str:
+    """Return an HTML page with lines of text above charts. Raises as `render_page`."""
+    text = html.escape("\n".join(lines))
+    drawn = "".join(f"<figure>{each}</figure>" for each in figures)
+    return render_page(title, f"<h1>{html.escape(title)}</h1>\n<pre>{text}</pre>\n{drawn}")
+
+
 def render_page(title: str, body: str) -> str:
-    """Return an HTML page; `title` is text, `body` HTML."""
+    """Return an HTML page; `title` is text, `body` HTML. Raises ModelServerError without the extra `report`."""
+    library = base64.b64encode(gzip.compress(_find_library().read_bytes(), 9, mtime=0)).decode()
+    own = files("mstools.report")
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(title)}</title>
-<style>{CHART_STYLE}{PAGE_STYLE}</style>
+<style>
+{(own / "page.css").read_text()}</style>
 </head>
 <body>
+<button id="theme" type="button">Dark</button>
 {body}
+<script id="plotly" type="text/plain">{library}</script>
+<script>
+{(own / "page.js").read_text()}</script>
 </body>
 </html>
-"""
-
-
-CHART_STYLE = """
-svg text { font: 11.5px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; fill: #3c4654; }
-svg .title { font-weight: 600; font-size: 13px; fill: #1c2430; }
-svg .box { fill: #fbfcfd; stroke: #c6cdd6; }
-svg .grid { stroke: #e6eaef; }
-svg .track { fill: #f0f2f5; }
-svg .band { opacity: .22; }
-svg .event { stroke: #7a4fb5; stroke-dasharray: 2 2; }
-"""
-
-PAGE_STYLE = """
-:root { --ink: #1c2430; --soft: #5b6675; --line: #dfe4ea; --paper: #ffffff; --wash: #f5f7f9; }
-* { box-sizing: border-box; }
-body { font: 15px/1.5 system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; color: var(--ink);
-  background: var(--paper); max-width: 1120px; margin: 0 auto; padding: 0 24px 40px; }
-header { padding: 28px 0 8px; border-bottom: 1px solid var(--line); }
-header p { margin: 0; color: var(--soft); }
-.kicker { text-transform: uppercase; letter-spacing: .1em; font-size: 12px; }
-h1 { margin: 2px 0; font-size: 30px; }
-h2 { margin: 38px 0 12px; font-size: 20px; }
-h3 { margin: 0 0 2px; font-size: 15px; }
-nav { margin: 14px 0 8px; display: flex; flex-wrap: wrap; gap: 4px 18px; }
-nav a { color: #0072b2; text-decoration: none; }
-nav a:hover { text-decoration: underline; }
-.figures { display: flex; flex-wrap: wrap; gap: 10px; margin: 18px 0 6px; }
-.figures div { flex: 1 1 130px; background: var(--wash); border-radius: 8px; padding: 10px 14px; }
-.figures strong { display: block; font-size: 20px; font-variant-numeric: tabular-nums; }
-.figures span { color: var(--soft); font-size: 13px; }
-.finding { border-left: 4px solid var(--tone); background: var(--wash); border-radius: 0 8px 8px 0;
-  padding: 10px 16px; margin: 8px 0; }
-.finding p { margin: 2px 0; }
-.finding p + p { color: var(--soft); }
-.finding h3 span { color: var(--tone); text-transform: uppercase; font-size: 11px; letter-spacing: .06em;
-  margin-right: 6px; }
-.error { --tone: #c22f2f; } .warning { --tone: #b36b00; } .note { --tone: #0072b2; }
-.good { border-left: 4px solid #009e73; background: var(--wash); padding: 10px 16px; }
-figure { margin: 14px 0; }
-figcaption { color: var(--soft); font-size: 13px; margin: 4px 0 0 8px; max-width: 90ch; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 10px 0; }
-th, td { text-align: left; padding: 4px 18px 4px 4px; border-bottom: 1px solid var(--line); }
-th { font-weight: 600; color: var(--soft); font-size: 13px; }
-.n { text-align: right; }
-figure > svg { width: 100%; height: auto; display: block; }
-footer { margin-top: 40px; color: var(--soft); font-size: 13px; border-top: 1px solid var(--line); padding-top: 10px; }
-@media print { body { max-width: none; } section { break-inside: avoid; } nav { display: none; } }
 """

@@ -22,7 +22,7 @@ HOLD_S = 1.0
 
 NIS_WINDOW_S = 20.0
 
-BREAK = (math.nan, math.nan)
+BREAK = (math.nan, math.nan, math.nan)
 """Point that interrupts a line."""
 
 COMPONENTS: dict[str, tuple[str, ...]] = {
@@ -192,10 +192,11 @@ def _render_track(data: ReplayData) -> str:
         there = [each.position for each in data.fixes if each.verdict == verdict and each.position is not None]
         if there:
             drawn.append(charts.dots(f"fixes {words}", there, color, 4.4))
-    for name, bad, color, width in (("pose", False, "#12344d", 1.1), ("pose, not valid", True, charts.ORANGE, 2.2)):
+    for name, bad, color, width in (("pose", False, charts.BLUE, 1.2), ("pose, not valid", True, charts.ORANGE, 2.2)):
         points = _track_points(placed, bad)
         if any(math.isfinite(each[0]) for each in points):
-            drawn.append(Series(name, [each[0] for each in points], [each[1] for each in points], color, width))
+            x, y, t = zip(*points, strict=True)
+            drawn.append(Series(name, x, y, color, width, times=t))
     words = "Path of the antenna, and the fixes."
     if data.origin is not None:
         words += (
@@ -206,9 +207,9 @@ def _render_track(data: ReplayData) -> str:
     return _render_figure(chart, words)
 
 
-def _track_points(placed: Sequence[StateSample], bad: bool) -> list[tuple[float, ...]]:
-    """Return the track of the valid, or invalid (`bad`), states; nan interrupts it at gaps and new epochs."""
-    points: list[tuple[float, ...]] = [BREAK]
+def _track_points(placed: Sequence[StateSample], bad: bool) -> list[tuple[float, float, float]]:
+    """Return x, y and time of the valid, or invalid (`bad`), states; nan interrupts them at gaps and new epochs."""
+    points: list[tuple[float, float, float]] = [BREAK]
     for a, b in pairwise(placed):
         assert a.position is not None
         assert b.position is not None
@@ -217,9 +218,9 @@ def _track_points(placed: Sequence[StateSample], bad: bool) -> list[tuple[float,
         if b.t - a.t > HOLD_S or a.epoch != b.epoch:
             points.append(BREAK)
             continue
-        if points[-1] != a.position:
-            points += [BREAK, a.position]
-        points.append(b.position)
+        if points[-1][2] != a.t:
+            points += [BREAK, (*a.position[:2], a.t)]
+        points.append((*b.position[:2], b.t))
     return points
 
 

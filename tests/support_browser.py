@@ -1,0 +1,102 @@
+"""A headless browser for tests of pages: Chromium, as the machine has it, driven by playwright."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page
+
+    from mstools.view.editor import Editing
+    from mstools.view.sources import Source
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+
+needs_browser = pytest.mark.skipif(
+    not CHROMIUM, reason="no Chromium: sudo apt install chromium; pages are not tested in a browser without it"
+)
+
+# software rendering, as a machine without a graphics card has it; root needs no-sandbox
+OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+LOCAL = ("http://127.0.0.1:", "ws://127.0.0.1:", "file:", "blob:", "data:")
+WIDTH, HEIGHT = 1400, 900
+TIMEOUT_MS = 30_000
+
+
+@contextmanager
+def open_browser(link: str) -> Iterator[Page]:
+    """Open a link in a headless browser; errors of its console fail the test."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright, TemporaryDirectory() as folder:
+        # drawing without a graphics card takes all processors, which the tests beside it need
+        polite = Path(folder) / "chromium"
+        polite.write_text(f'#!/bin/sh\nexec nice -n 15 {CHROMIUM} "$@"\n')
+        polite.chmod(0o700)
+        browser = playwright.chromium.launch(executable_path=polite, args=OPTIONS, env=dict(os.environ))
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.set_default_timeout(TIMEOUT_MS)
+        errors: list[str] = []
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        # nothing is loaded from the internet
+        page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
+        page.goto(link)
+        yield page
+        browser.close()
+        assert not errors, errors
+
+
+@contextmanager
+def show(source: Source, editing: Editing | None = None) -> Iterator[Page]:
+    """Show a source of the viewer in a browser, with the viewer in a thread."""
+    from mstools.view.page import open_page
+    from mstools.view.viewer import Viewer
+
+    served = open_page(port=0)
+    viewer = Viewer(served, source, editing)
+    stop = threading.Event()
+    thread = threading.Thread(target=viewer.run, args=(stop.is_set,))
+    thread.start()
+    try:
+        with open_browser(served.link) as page:
+            page.get_by_role("tab", name="Query").wait_for()
+            yield page
+    finally:
+        stop.set()
+        thread.join(10.0)
+        served.close()
+        source.close()
+
+
+def choose(page: Page, label: str, option: str) -> None:
+    """Choose an option of a dropdown, by typing as a person does."""
+    box = page.get_by_role("combobox", name=label, exact=True)
+    box.click()
+    box.fill(option)
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def find_fields(page: Page, label: str) -> Locator:
+    """Return the inputs of a row, three for a vector, two for a slider."""
+    labels = page.locator("label").filter(has_text=re.compile(f"^{re.escape(label)}$"))
+    return labels.locator("xpath=ancestor::div[contains(@class, 'Flex-root')][1]").locator("input")
+
+
+def select_item(page: Page, kind: str, name: str) -> None:
+    """Select what the editor edits, and wait until its fields are there."""
+    from playwright.sync_api import expect
+
+    choose(page, "Kind", kind)
+    choose(page, "Item", name)
+    expect(find_fields(page, "Name")).to_have_value(name.rpartition(":")[2], timeout=TIMEOUT_MS)
