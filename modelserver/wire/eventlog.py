@@ -64,10 +64,11 @@ def encode_event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
     return _HEAD.pack(_SYNC_WORD, number, utime, len(channel), len(data)) + channel + data
 
 
-def scan(data: Buffer) -> Iterator[LogEvent | LogDamage]:
-    """Yield the events in the bytes of a log, and the damaged regions between them."""
+def scan(data: Buffer, start: int = 0) -> Iterator[LogEvent | LogDamage]:
+    """Yield the events in the bytes of a log from `start` on, and the damaged regions between them."""
     size = len(data)
-    at = bad = good = 0
+    at = bad = start
+    good = 0
     while at < size:
         event = _event_at(data, at, size)
         if event is None:
@@ -141,8 +142,12 @@ class LogFile:
         self._data = b""
 
     def __iter__(self) -> Iterator[LogEvent]:
+        return self.read_from(0)
+
+    def read_from(self, offset: int) -> Iterator[LogEvent]:
+        """Yield the events from an offset on, such as the `end` of one."""
         self.damage.clear()
-        for each in scan(self._data):
+        for each in scan(self._data, offset):
             if isinstance(each, LogEvent):
                 yield each
             else:

@@ -6,7 +6,7 @@ Reading stops once later samples cover the instant plus a correction window; del
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -26,6 +26,12 @@ CORRECTION_WINDOW_US: Final = 2_000_000
 MAX_OUTSIDE_US: Final = 1_000_000
 """Time by which an instant may lie outside the log."""
 
+OFFSET_PERIOD_US: Final = 5_000_000
+"""Time between two stored offsets of poses."""
+
+OFFSET_MARGIN_US: Final = 20_000_000
+"""Time before a query's history from which a log is read: JOINTS_HELD and the geometry come every 5 s by default."""
+
 TIME_UNITS: Final = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
 """Units in which a time may be given by mistake, with the factor to microseconds."""
 
@@ -34,7 +40,8 @@ class LogContents(NamedTuple):
     """Contents of a log: the first complete snapshot, and its time range in microseconds.
 
     `begin` and `end` are the first and last stamp of a pose, without poses of a snapshot; `base_frame` and `revision`
-    are those of the first pose; `parts` describes an incomplete snapshot.
+    are those of the first pose; `parts` describes an incomplete snapshot. `offsets` has the stamp of a pose and its
+    offset in the file about every `OFFSET_PERIOD_US`.
     """
 
     snapshot: ModelSnapshot | None
@@ -43,21 +50,27 @@ class LogContents(NamedTuple):
     base_frame: str
     revision: str
     parts: str
+    offsets: tuple[tuple[int, int], ...] = ()
 
 
 class LogPlatform(LocalPlatform):
     """`Platform` on a log. `prefix` is that of the channels.
 
-    `model` replaces the log's own geometry. Raises RecordingError where geometry is missing, OSError.
+    `model` replaces the log's own geometry; `contents` are those of `scan_log`, if it was read already. Raises
+    RecordingError where geometry is missing, OSError.
     """
 
-    def __init__(self, path: Path, prefix: str = "", model: ModelSnapshot | None = None):
+    def __init__(
+        self, path: Path, prefix: str = "", model: ModelSnapshot | None = None, contents: LogContents | None = None
+    ):
         self.where = f"in {path}"
         self._path = path
         self._prefix = prefix
         self._given_model = model
-        with LogFile(path) as log:
-            self._contents = scan_log(log, prefix, with_geometry=model is None)
+        if contents is None:
+            with LogFile(path) as log:
+                contents = scan_log(log, prefix, with_geometry=model is None)
+        self._contents = contents
         if model is not None and self._contents.base_frame:
             base = self._contents.base_frame
             self._given_model = ModelSnapshot(
@@ -80,6 +93,11 @@ class LogPlatform(LocalPlatform):
     def revision(self) -> str:
         """Geometry revision of the first pose, empty without poses."""
         return self._contents.revision
+
+    @property
+    def base_frame(self) -> str:
+        """The frame whose pose the log has, empty without poses."""
+        return self._contents.base_frame
 
     def read_state(self) -> tuple[MirrorState, int]:
         """Return what was known at the time that was read up to."""
@@ -113,7 +131,7 @@ class LogPlatform(LocalPlatform):
         oldest = (at or end) - history_us
         now = 0
         with LogFile(self._path) as log:
-            for event in log:
+            for event in log.read_from(self._find_start(oldest)):
                 if event.channel not in channels:
                     continue
                 stamp = _stamp(event)
@@ -127,6 +145,11 @@ class LogPlatform(LocalPlatform):
                 knowledge.feed(event.channel, event.data, now)
                 channels.update(knowledge.channels)
         self._read = (knowledge.state, now)
+
+    def _find_start(self, oldest: int) -> int:
+        """Return the offset in the file from which poses from `oldest` on are read."""
+        earlier = [offset for stamp, offset in self._contents.offsets if stamp < oldest - OFFSET_MARGIN_US]
+        return earlier[-1] if earlier else 0
 
     def _is_complete(self, known: MirrorState, at: int, ends: Sequence[str], history_us: int) -> bool:
         """Return whether later messages cannot change the result at a time."""
@@ -158,8 +181,9 @@ def _stamp(event: LogEvent) -> int:
     return int.from_bytes(event.data[8:16], "big", signed=True) if len(event.data) >= 16 else 0
 
 
-def scan_log(log: LogFile, prefix: str, with_geometry: bool = True) -> LogContents:
+def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -> LogContents:
     """Return the contents of a log; `with_geometry` includes the snapshot."""
+    offsets: list[tuple[int, int]] = []
     first: PoseAnswer | None = None
     poses: list[int] = []
     sent: list[int] = []
@@ -170,7 +194,10 @@ def scan_log(log: LogFile, prefix: str, with_geometry: bool = True) -> LogConten
         try:
             if event.channel == f"{prefix}POSE":
                 first = first or decode("pose_transform_t", event.data)
-                _extend(poses, _stamp(event))
+                stamp = _stamp(event)
+                _extend(poses, stamp)
+                if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
+                    offsets.append((stamp, event.end))
             elif event.channel == f"{prefix}MODEL_SNAPSHOT":
                 _extend(sent, _stamp(event))
                 if not with_geometry or snapshot is not None:
@@ -188,7 +215,7 @@ def scan_log(log: LogFile, prefix: str, with_geometry: bool = True) -> LogConten
     base_frame, revision = (
         ("", "") if transformation is None else (transformation.frame_of_interest, transformation.model_revision)
     )
-    return LogContents(snapshot, begin, end, base_frame, revision, parts)
+    return LogContents(snapshot, begin, end, base_frame, revision, parts, tuple(offsets))
 
 
 def _extend(span: list[int], stamp: int) -> None:

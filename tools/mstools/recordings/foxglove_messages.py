@@ -1,0 +1,380 @@
+"""A drive in Foxglove's schemas: frames, poses, fixes, the geometry's shapes, health and events; and the LCM messages.
+
+`FoxgloveWriter.feed` takes the messages of the service, from a log or a bus, and logs to a context of the Foxglove SDK,
+which writes an MCAP file or serves a websocket. Topics:
+
+    /tf            FrameTransforms   the base frame in World:UTM; each other frame in the base frame
+    /pose          PoseInFrame       POSE
+    /pose/fix      LocationFix       POSE as latitude and longitude, at most 5 Hz
+    /fix/SOURCE    LocationFix       fixes, stamped by their measurement
+    /model         SceneUpdate       shapes of the bodies
+    /diagnostics   DiagnosticArray   MODELSERVER_HEALTH, with the names of ROS for the Diagnostics panel, as JSON
+    /events        Log               validity, rejections, resets, mode, geometry
+    /lcm/CHANNEL   bytes             each LCM message as it is, with its .lcm definition as the schema
+
+Foxglove's frames are those of the geometry, by their full names.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from foxglove import Channel, Context, Schema
+from foxglove.channels import (
+    FrameTransformsChannel,
+    LocationFixChannel,
+    LogChannel,
+    PoseInFrameChannel,
+    SceneUpdateChannel,
+)
+from foxglove.messages import (
+    Color,
+    CubePrimitive,
+    CylinderPrimitive,
+    FrameTransform,
+    FrameTransforms,
+    LocationFix,
+    LocationFixPositionCovarianceType,
+    Log,
+    LogLevel,
+    ModelPrimitive,
+    PoseInFrame,
+    Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneEntityDeletionType,
+    SceneUpdate,
+    SpherePrimitive,
+    Timestamp,
+    Vector3,
+)
+from foxglove.messages import Pose as FoxglovePose
+
+from modelserver.earth.geodesy import GeodesyError
+from modelserver.errors import WireError
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
+from modelserver.geometry.shape import Shape, ShapeKind
+from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
+from modelserver.transforms.pose import Pose
+from modelserver.wire.codec import decode, fingerprint_of, get_type_names
+from mstools.view.drive import Drive, DriveEvent, EventKind
+from mstools.view.frames import FramePoses
+
+FIX_PERIOD_US: Final = 200_000
+STATIC_PERIOD_US: Final = 5_000_000
+"""Time between two messages with all frames and shapes: a viewer that connects later needs them."""
+
+BODY_COLOR: Final = (0.42, 0.55, 0.69, 1.0)
+MAX_SOURCES: Final = 100
+
+_LEVELS: Final[Mapping[EventKind, LogLevel]] = {
+    EventKind.INVALID: LogLevel.Warning,
+    EventKind.REJECTION: LogLevel.Warning,
+    EventKind.RESET: LogLevel.Warning,
+}
+_TYPE_OF: Final = {fingerprint_of(name): name for name in get_type_names()}
+_OK, _WARN, _ERROR, _STALE = range(4)
+"""Levels of diagnostic_msgs/DiagnosticStatus."""
+
+DIAGNOSTICS_SCHEMA: Final = {
+    "title": "diagnostic_msgs/DiagnosticArray",
+    "type": "object",
+    "properties": {
+        "header": {
+            "type": "object",
+            "properties": {
+                "stamp": {
+                    "type": "object",
+                    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+                },
+                "frame_id": {"type": "string"},
+            },
+        },
+        "status": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "level": {"type": "integer"},
+                    "name": {"type": "string"},
+                    "message": {"type": "string"},
+                    "hardware_id": {"type": "string"},
+                    "values": {
+                        "type": "array",
+                        "items": {
+                            "type": "object",
+                            "properties": {"key": {"type": "string"}, "value": {"type": "string"}},
+                        },
+                    },
+                },
+            },
+        },
+    },
+}
+
+
+def find_definitions() -> Path:
+    """Return the folder of the .lcm files: in the installed package, or in the source tree beside it."""
+    spec = importlib.util.find_spec("mslcm")
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parent
+    return folder / "lcm" if (folder / "lcm").is_dir() else folder.parent
+
+
+class FoxgloveWriter:
+    """Log a drive to a context of the Foxglove SDK.
+
+    Parameters
+    ----------
+    prefix : of the service's channels
+    definitions : folder of the .lcm files; with it the LCM messages are logged too, None for none
+    """
+
+    def __init__(self, context: Context, prefix: str = "", definitions: Path | None = None):
+        self._context = context
+        self._drive = Drive(prefix)
+        self._definitions = definitions
+        self._model: Model | None = None
+        self._frames: FramePoses | None = None
+        self._joints: Mapping[str, float] = {}
+        self._next_static = self._next_fix = 0
+        self._events: list[DriveEvent] = []
+        self._tf = FrameTransformsChannel("/tf", context=context)
+        self._pose = PoseInFrameChannel("/pose", context=context)
+        self._place = LocationFixChannel("/pose/fix", context=context)
+        self._scene = SceneUpdateChannel("/model", context=context)
+        self._log = LogChannel("/events", context=context)
+        self._diagnostics = Channel("/diagnostics", schema=DIAGNOSTICS_SCHEMA, context=context)
+        self._fixes: dict[str, LocationFixChannel] = {}
+        self._raw: dict[str, Channel | None] = {}
+        self._gps = fingerprint_of("gps_t")
+        self.skipped = 0
+        """Messages that could not be read."""
+
+    @property
+    def has_geometry(self) -> bool:
+        """Whether a complete geometry was received."""
+        return self._model is not None
+
+    def feed(self, channel: str, data: bytes, now: int) -> None:
+        """Log what a message received at `now`, microseconds, holds."""
+        drive = self._drive
+        if not channel.startswith(drive.prefix):
+            return
+        drive.feed(channel, data, now)
+        name = channel[len(drive.prefix) :]
+        if self._definitions is not None:
+            self._log_raw(channel, data, now)
+        try:
+            if drive.model is not None and (drive.model is not self._model or now >= self._next_static):
+                self._log_geometry(drive.model, now)
+            if name == "POSE":
+                self._log_pose(decode("pose_transform_t", data), now)
+            elif name == "MODELSERVER_HEALTH":
+                self._log_health(decode("health_t", data), now)
+            elif data[:8] == self._gps:
+                self._log_gps(decode("gps_t", data), now)
+            elif name.startswith("JOINTS") or channel == drive.joints_channel:
+                self._log_joints(now)
+        except (WireError, GeodesyError, OverflowError):
+            # the last one is a stamp that Foxglove's cannot hold
+            self.skipped += 1
+        self._log_events(now)
+
+    # --- frames
+
+    def _log_geometry(self, model: Model, now: int) -> None:
+        """Log all frames and shapes."""
+        if model is not self._model:
+            if self._model is not None:
+                everything = SceneEntityDeletion(type=SceneEntityDeletionType.All)
+                self._scene.log(SceneUpdate(deletions=[everything]), log_time=now * 1000)
+            self._model = model
+            self._frames = FramePoses(model, self._drive.base_frame)
+        self._next_static = now + STATIC_PERIOD_US
+        assert self._frames is not None
+        everything_in_base = self._frames.compute(self._joints)
+        self._log_frames(everything_in_base, now)
+        entities = [
+            _make_entity(body.frames[0].full_name, body.frames[0].pose, body.visuals or body.collisions, now)
+            for body in model.bodies
+            if body.frames and (body.visuals or body.collisions) and body.frames[0].full_name in everything_in_base
+        ]
+        if entities:
+            self._scene.log(SceneUpdate(entities=entities), log_time=now * 1000)
+
+    def _log_joints(self, now: int) -> None:
+        """Log the frames behind joints that moved."""
+        joints = self._drive.get_joints(now)
+        if self._frames is None or joints == self._joints:
+            return
+        moved = {name for name, value in joints.items() if self._joints.get(name) != value}
+        self._joints = joints
+        self._log_frames(self._frames.compute(joints, moved), now)
+
+    def _log_frames(self, frames: Mapping[str, Pose], now: int) -> None:
+        base = self._drive.base_frame
+        transforms = [_make_transform(base, name, pose, now) for name, pose in frames.items() if name != base]
+        if transforms:
+            self._tf.log(FrameTransforms(transforms=transforms), log_time=now * 1000)
+
+    def _log_pose(self, answer: PoseAnswer, now: int) -> None:
+        found = answer.transformation
+        stamp, pose = found.utime, found.pose
+        transform = _make_transform(found.frame_of_reference, found.frame_of_interest, pose, stamp)
+        self._tf.log(FrameTransforms(transforms=[transform]), log_time=now * 1000)
+        message = PoseInFrame(timestamp=_stamp(stamp), frame_id=found.frame_of_reference, pose=_convert_pose(pose))
+        self._pose.log(message, log_time=now * 1000)
+        if answer.origin is None or stamp < self._next_fix <= stamp + FIX_PERIOD_US:
+            return
+        self._next_fix = stamp + FIX_PERIOD_US
+        place = answer.geodetic
+        if place is None:
+            return
+        covariance = None if found.covariance is None else found.covariance[:3, :3].ravel().tolist()
+        fix = _make_fix(
+            stamp, found.frame_of_interest, (place.latitude_deg, place.longitude_deg, place.height), covariance
+        )
+        self._place.log(fix, log_time=now * 1000)
+
+    # --- fixes, health, events
+
+    def _log_gps(self, sample: GpsSample, now: int) -> None:
+        place = (sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal)
+        source = sample.header.source
+        if sample.fix_type is FixType.NONE or not all(map(math.isfinite, place[:2])):
+            return
+        if source not in self._fixes:
+            if len(self._fixes) >= MAX_SOURCES:
+                return
+            self._fixes[source] = LocationFixChannel(f"/fix/{source}", context=self._context)
+        covariance = sample.position_covariance
+        known = None if covariance is None else list(covariance)
+        self._fixes[source].log(_make_fix(sample.header.utime, source, place, known), log_time=now * 1000)
+
+    def _log_health(self, health: Health, now: int) -> None:
+        invalid = health.invalid_reasons.explain() if health.invalid_reasons else "the pose is valid"
+        status = [_make_status("pose", _WARN if health.invalid_reasons else _OK, invalid)]
+        for each in health.channels:
+            level = _STALE if each.silent else _OK
+            message = "silent" if each.silent else f"{each.rate_hz:.1f} Hz"
+            values = {"count": each.count, "used": each.used, "measured": each.measured, "age": f"{each.age:.3f}"}
+            status.append(_make_status(each.channel, level, message, values))
+        status += [_make_status(subject, _WARN, text) for subject, text in health.warnings]
+        if health.handler_errors:
+            status.append(_make_status("internal errors", _ERROR, str(health.handler_errors)))
+        sec, usec = divmod(health.utime, 1_000_000)
+        header = {"stamp": {"sec": sec, "nsec": usec * 1000}, "frame_id": ""}
+        self._diagnostics.log({"header": header, "status": status}, log_time=now * 1000)
+
+    def _log_events(self, now: int) -> None:
+        """Log the events that the drive has found since the last call."""
+        events = self._drive.events
+        if not events or (self._events and events[-1] is self._events[-1]):
+            return
+        known = {id(each) for each in self._events}
+        self._events = list(events)
+        for each in events:
+            if id(each) not in known:
+                level = _LEVELS.get(each.kind, LogLevel.Info)
+                message = Log(timestamp=_stamp(each.utime), level=level, message=each.text, name=each.kind)
+                self._log.log(message, log_time=now * 1000)
+
+    def _log_raw(self, channel: str, data: bytes, now: int) -> None:
+        if channel not in self._raw:
+            self._raw[channel] = self._make_raw_channel(channel, data)
+        raw = self._raw[channel]
+        if raw is not None:
+            raw.log(data, log_time=now * 1000)
+
+    def _make_raw_channel(self, channel: str, data: bytes) -> Channel | None:
+        """Return a channel for LCM messages; None where there are too many."""
+        if len(self._raw) >= MAX_SOURCES:
+            return None
+        name, text = _TYPE_OF.get(data[:8], ""), b""
+        if name and self._definitions is not None:
+            text = (self._definitions / f"{name}.lcm").read_bytes()
+        schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
+        return Channel(f"/lcm/{channel}", schema=schema, message_encoding="lcm", context=self._context)
+
+
+def _stamp(utime: int) -> Timestamp:
+    seconds, microseconds = divmod(utime, 1_000_000)
+    return Timestamp(seconds, microseconds * 1000)
+
+
+def _convert_pose(pose: Pose) -> FoxglovePose:
+    (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
+    return FoxglovePose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def _make_transform(parent: str, child: str, pose: Pose, utime: int) -> FrameTransform:
+    (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
+    return FrameTransform(
+        timestamp=_stamp(utime),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )
+
+
+def _make_fix(utime: int, frame: str, place: tuple[float, float, float], covariance: list[float] | None) -> LocationFix:
+    """Return a fix at latitude and longitude in degrees and a height, with its covariance along east, north, up."""
+    latitude, longitude, height = place
+    kind = LocationFixPositionCovarianceType
+    return LocationFix(
+        timestamp=_stamp(utime),
+        frame_id=frame,
+        latitude=latitude,
+        longitude=longitude,
+        altitude=height if math.isfinite(height) else 0.0,
+        position_covariance=covariance,
+        position_covariance_type=kind.Unknown if covariance is None else kind.Known,
+    )
+
+
+def _make_entity(frame: str, X_body_frame: Pose, shapes: tuple[Shape, ...], now: int) -> SceneEntity:
+    """Return the shapes of a body, in its first frame."""
+    to_frame = X_body_frame.inverse()
+    cubes, cylinders, spheres, models = [], [], [], []
+    for shape in shapes:
+        pose = _convert_pose(to_frame @ shape.pose)
+        material = shape.material.color if shape.material is not None else None
+        r, g, b, a = material or BODY_COLOR
+        color = Color(r=r, g=g, b=b, a=a)
+        if shape.kind is ShapeKind.BOX:
+            x, y, z = shape.size
+            cubes.append(CubePrimitive(pose=pose, size=Vector3(x=x, y=y, z=z), color=color))
+        elif shape.kind is ShapeKind.CYLINDER:
+            radius, length = shape.size
+            size = Vector3(x=2.0 * radius, y=2.0 * radius, z=length)
+            cylinders.append(CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=color))
+        elif shape.kind is ShapeKind.SPHERE:
+            width = 2.0 * shape.size[0]
+            spheres.append(SpherePrimitive(pose=pose, size=Vector3(x=width, y=width, z=width), color=color))
+        else:
+            x, y, z = shape.size
+            scale = Vector3(x=x, y=y, z=z)
+            models.append(ModelPrimitive(pose=pose, scale=scale, color=color, url=shape.file))
+    return SceneEntity(
+        timestamp=_stamp(now),
+        frame_id=frame,
+        id=names.split(frame)[0],
+        frame_locked=True,
+        cubes=cubes,
+        cylinders=cylinders,
+        spheres=spheres,
+        models=models,
+    )
+
+
+def _make_status(name: str, level: int, message: str, values: Mapping[str, object] | None = None) -> dict[str, object]:
+    pairs = [{"key": key, "value": str(value)} for key, value in (values or {}).items()]
+    return {"level": level, "name": name, "message": message, "hardware_id": "modelserver", "values": pairs}
