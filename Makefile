@@ -1,9 +1,10 @@
-# Two commands on a fresh machine with python3, python3-venv and make:
+# Two commands on a fresh machine with python3, python3-venv, libglib2.0-0 and make:
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
-# and: make deb        a Debian package of it in build/
+#   make deb      a Debian package of it in build/
 # and: make test-quick (without processes and long drives, for the inner loop: 50 seconds on two cores),
-#      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean.
+#      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean,
+#      make screenshots (of the viewer, for the docs).
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -15,20 +16,22 @@ RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo deb test test-quick check format docs bench types clean help
+.PHONY: demo deb test test-quick check format screenshots docs bench types clean help
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -6
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -7
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "ModelServer needs Python 3.11 or later; choose one with: make PYTHON=/path/to/python3.11 ..." >&2; exit 2; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
 	  { echo "python3-venv is missing: sudo apt install python3-venv" >&2; exit 2; }
+	@$(PYTHON) -c 'import ctypes; ctypes.CDLL("libglib-2.0.so.0")' 2>/dev/null || \
+	  { echo "libglib-2.0, which LCM needs, is missing: sudo apt install libglib2.0-0" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
 $(RUN_STAMP): pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[report]'
 	@touch $@
 
 $(DEV_STAMP): pyproject.toml | $(BIN)/python
@@ -59,6 +62,9 @@ check: $(DEV_STAMP)
 format: $(DEV_STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+screenshots: $(DEV_STAMP)
+	$(BIN)/python tests/make_screenshots.py
 
 # The variable silences an announcement of the theme about a later mkdocs; it is no warning about these pages.
 docs: $(DOCS_STAMP)

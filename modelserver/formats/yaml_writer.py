@@ -121,7 +121,16 @@ def _format_shape(shape: Shape, exact: bool) -> list[str]:
 def _format_joint(joint: Joint) -> list[str]:
     if not joint.is_movable:
         return []
-    fields = []
+    fields = format_joint_fields(joint)
+    if len(fields) == 1:
+        return [f"joint: {joint.type}"]
+    short = f"joint: {{{', '.join(fields)}}}"
+    return [short] if len(short) <= WIDTH - 4 else ["joint:", *(f"  {field}" for field in fields)]
+
+
+def format_joint_fields(joint: Joint) -> list[str]:
+    """Return the entries `key: value` of a joint."""
+    fields = [f"type: {joint.type}"]
     if joint.type in (JointType.REVOLUTE, JointType.PRISMATIC) or joint.axis != _Z_AXIS:
         fields.append(f"axis: {_format_list(joint.axis)}")
     if joint.lower or joint.upper:
@@ -137,11 +146,7 @@ def _format_joint(joint: Joint) -> list[str]:
             fields.append(_format_quantity(key, joint, [(value,) for value in values]))
     if joint.mimic is not None:
         fields.append(_format_mimic(joint))
-    if not fields:
-        return [f"joint: {joint.type}"]
-    fields.insert(0, f"type: {joint.type}")
-    short = f"joint: {{{', '.join(fields)}}}"
-    return [short] if len(short) <= WIDTH - 4 else ["joint:", *(f"  {field}" for field in fields)]
+    return fields
 
 
 def _format_quantity(key: str, joint: Joint, values: Sequence[Coordinates | None]) -> str:
@@ -230,10 +235,11 @@ def _format_sigma(sigma: Sigma | None) -> list[str]:
         return []
     degrees = to_degrees(sigma.rotation)
     key, angles = ("rpy", sigma.rotation) if degrees is None else ("rpy_deg", degrees)
-    return [f"sigma: {{xyz: {_format_scalar_or_list(sigma.position)}, {key}: {_format_scalar_or_list(angles)}}}"]
+    return [f"sigma: {{xyz: {format_scalar_or_list(sigma.position)}, {key}: {format_scalar_or_list(angles)}}}"]
 
 
-def _format_scalar_or_list(values: tuple[float, ...]) -> str:
+def format_scalar_or_list(values: tuple[float, ...]) -> str:
+    """Return three numbers as a list, or as one number where all are equal."""
     return format_number(values[0]) if values[0] == values[1] == values[2] else _format_list(values)
 
 

@@ -9,6 +9,9 @@ import shutil
 import signal
 import subprocess
 import time
+import urllib.error
+import urllib.request
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -50,13 +53,13 @@ def cart(tmp_path: Path) -> Path:
     return path
 
 
-def start_up(cart: Path, url: str, *options: str) -> subprocess.Popen[str]:
+def start_up(cart: Path, url: str, *options: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*MODELSERVER, "up", "-c", str(cart), "--url", url, *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        env=os.environ | {"PYTHONUNBUFFERED": "1"} | environment,
     )
 
 
@@ -86,6 +89,23 @@ def test_given_emulated_devices_then_the_pose_becomes_valid_and_all_end_with_ctr
     assert re.search(r"gps \| .*closed: ended", rest)
     assert "restored" not in rest
     assert not (cart.parent / "state").exists()
+
+
+@pytest.mark.skipif(find_spec("viser") is None, reason="the extra view is not installed")
+def test_given_the_viewer_then_its_page_is_served_and_ends_with_all_others(cart: Path, lcm_url: str) -> None:
+    process = start_up(cart, lcm_url, "--emulate", "--view", BROWSER="true")
+    try:
+        shown = text_until(process, r" *view \| live: http")
+        link = shown.split()[shown.split().index("live:") + 1]
+        with urllib.request.urlopen(link, timeout=TIMEOUT_S) as page:
+            assert b"<html" in page.read()
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=TIMEOUT_S)
+    finally:
+        close(process)
+    assert process.returncode == 0
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(link, timeout=TIMEOUT_S)
 
 
 def test_given_real_devices_that_are_missing_then_up_waits_for_them_and_ends_after_its_time(

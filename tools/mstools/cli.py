@@ -39,8 +39,11 @@ COMMANDS = {
     "tune": "Tune the filter's noise settings on a log, with withheld fixes.",
     "calibrate": "Calibrate an IMU's noise, or its magnetometer, from a log.",
     "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
+    "export": "Convert an LCM log to an MCAP file for Foxglove.",
+    "bridge": "Serve the running service to Foxglove.",
     "driver": "Run the driver of a device: read it and publish its samples.",
     "emulate": "Emulate a device for its driver.",
+    "view": "Show a geometry file, a log, or the running service in the browser.",
     "status": "Show the health of the running daemon.",
     "spy": "Show all channels decoded: with lcm-spy, or in the terminal.",
     "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
@@ -60,6 +63,7 @@ _ALIASES = {
     "check": "validate lint",
     "replay": "play verify journal",
     "import-bag": "import",
+    "export": "mcap foxglove",
     "mode": "switch",
     "set-pose": "set initialpose localize",
     "status": "watch health top",
@@ -70,6 +74,7 @@ _ALIASES = {
     "install": "setup",
     "uninstall": "remove",
     "query": "explain motion",
+    "view": "viewer gui show3d rviz",
 }
 
 COMMAND_ALIASES = {alias: name for name, aliases in _ALIASES.items() for alias in aliases.split()}
@@ -97,6 +102,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}{suggest_path(error)}")
+    except ModuleNotFoundError as error:
+        # what lcm's package reports where its shared library lacks another one
+        if error.name != "lcm.Release":
+            raise
+        _fail("the LCM library needs libglib-2.0, which this machine lacks: sudo apt install libglib2.0-0")
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -117,9 +117,10 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         for pose in iter_poses(listener, start_utime, seconds, children, lambda: bool(valid)):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
+            is_first = pose.transformation.is_valid and not valid
             if pose.transformation.is_valid:
                 valid.append(pose)
-            if since >= next_row:
+            if since >= next_row or is_first:
                 truth = run.truth(pose.transformation.utime).utm
                 typer.echo(format_row(pose, since, truth, run.geodesy.origin.initial_utm))
                 next_row = math.floor(since) + 1.0

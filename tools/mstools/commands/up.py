@@ -23,6 +23,7 @@ from mstools.commands.driver import load_driver
 from mstools.commands.emulate import SCENARIOS
 from mstools.commands.run import LEVELS, check_log_options
 from mstools.commands.status import HealthListener
+from mstools.commands.view import check_installed
 from mstools.launch.connections import (
     SERVICE,
     STATE_FOLDER,
@@ -32,7 +33,7 @@ from mstools.launch.connections import (
     start_devices,
     start_programs,
 )
-from mstools.launch.processes import ChildProcesses
+from mstools.launch.processes import MODELSERVER, ChildProcesses
 from mstools.terminal.health_text import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
 from mstools.terminal.output import escape, print_problems
@@ -45,6 +46,9 @@ EMULATED_FOLDER: Final = "emulated"
 
 SELF: Final = "up"
 """Name of this command in the output."""
+
+VIEW: Final = "view"
+"""Name of the viewer in the output."""
 
 REPORT_TIMEOUT_S: Final = 20.0
 """Timeout for the first report of every driver before the emulated devices start, seconds."""
@@ -67,6 +71,7 @@ def command(
         list[str] | None,
         option("--fault NAME:KIND@SECONDS[:AMOUNT]", "Fault of an emulated device, e.g. gps:stall@20:30. Repeatable."),
     ] = None,
+    view: Annotated[bool, option("--view", "Open the viewer in the browser too.")] = False,
     seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
     url: UrlOption = "",
     log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
@@ -80,11 +85,13 @@ def command(
     \b
     Examples:
       modelserver up
-      modelserver up -c vehicle.yaml --emulate
+      modelserver up -c vehicle.yaml --emulate --view
       modelserver status, in another terminal
     """
     choose_name(scenario, SCENARIOS, "scenario", "--scenario")
     check_log_options(log_level, "auto")
+    if view:
+        check_installed()
     vehicle = load_checked(config)
     if emulate and not vehicle.drivers:
         raise ModelServerError(
@@ -92,11 +99,16 @@ def command(
         )
     of_devices = assign_faults(faults or (), vehicle, config, emulate=emulate)
     lines = emulate_lines(config) if emulate else EmulatedConnections(url, config, {})
-    printer = LinePrinter((SERVICE, SELF, *(name for each in vehicle.drivers for name in (each, f"{each} device"))))
+    printer = LinePrinter(
+        (SERVICE, SELF, VIEW, *(name for each in vehicle.drivers for name in (each, f"{each} device")))
+    )
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
         more = (*(("--url", url) if url else ()), "--log-level", log_level)
         began = time.monotonic()
         start_programs(children, lines.vehicle, vehicle.drivers, more)
+        if view:
+            bus = ("--url", url or vehicle.lcm.url, "--prefix", vehicle.lcm.channel_prefix)
+            children.start(VIEW, *MODELSERVER, "view", "--live", *bus)
         listener = HealthListener(open_lcm(resolve_url(url or vehicle.lcm.url)), vehicle.lcm.channel_prefix)
         supervision = Supervision(children, listener, printer, stop.is_set, began + seconds)
         if emulate:

@@ -41,7 +41,7 @@ def format_report(health: Health, drivers: Iterable[DriverHealth] = (), expected
     state = STATE_NAMES.get(health.state, str(health.state))
     who = f", process {health.pid} on {health.host}" if health.pid else ""
     head = f"{health.vehicle}: {state}, up {format_duration(health.uptime)}; modelserver {health.version}{who}"
-    parts = [escape(f"{head}, {format_clock(health.utime)}"), _format_body(health)]
+    parts = [escape(f"{head}, {format_clock(health.utime)}"), format_body(health)]
     if health.warnings:
         parts.append("warnings\n" + "\n".join(f"  {escape(name)}: {escape(text)}" for name, text in health.warnings))
     if health.channels:
@@ -54,7 +54,8 @@ def format_report(health: Health, drivers: Iterable[DriverHealth] = (), expected
     return "\n\n".join(parts)
 
 
-def _format_body(health: Health) -> str:
+def format_body(health: Health) -> str:
+    """Format pose, filter, geometry and process of a report."""
     localization = health.localization
     if localization.mode is None:
         rows = [("pose", "none: no localization sensor is configured")]

@@ -1,0 +1,306 @@
+"""The editor of the page, without a browser: what its fields and buttons change in the file."""
+
+from __future__ import annotations
+
+import math
+import queue
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+
+from modelserver.geometry import Joint, JointType, Mimic
+from modelserver.geometry.model import Model
+from modelserver.transforms.pose import Pose
+from mstools.edit.document import GeometryItem, ItemKind
+from mstools.edit.session import EditedFile, EditSession
+from mstools.view.editor import Editing, Editor
+from mstools.view.item_fields import Snap
+from mstools.view.page import open_page
+from mstools.view.scene import NameLabels, VehicleScene
+
+RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
+LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
+NOD = GeometryItem(ItemKind.CONSTRAINT, "FrontNoddingSICKAxis")
+
+
+class EditedPage:
+    """An editor on a page that nobody looks at. Its fields are set, and its buttons pressed, by their labels."""
+
+    def __init__(self, path: Path, server: Any):
+        self.session = EditSession(EditedFile.open(path))
+        self.actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.shown: list[Model] = []
+        assert self.session.model is not None
+        scene = VehicleScene(server, None, lambda frame, is_reference: None)
+        scene.set_model(self.session.model, "Raptor:CG", NameLabels.NONE)
+        self.scene = scene
+        self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
+        self.fields = self.editor._fields
+
+    def set(self, **values: Any) -> str:
+        """Set fields, press Set, and return the message."""
+        for key, value in values.items():
+            self.fields._fields[key].value = value
+        self.fields.set()
+        return self.message
+
+    @property
+    def message(self) -> str:
+        return str(self.editor._message.content).replace("\\", "")
+
+    @property
+    def model(self) -> Model:
+        assert self.session.model is not None
+        return self.session.model
+
+    def constraint(self, name: str) -> Any:
+        return next(each for each in self.model.constraints if each.name == name)
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[EditedPage]:
+    for each in ("geometry.yaml", "vehicle.yaml", "raptor.dbc"):
+        shutil.copy(RAPTOR / each, tmp_path)
+    opened = open_page(port=0)
+    yield EditedPage(tmp_path / "vehicle.yaml", opened.server)
+    opened.close()
+
+
+def test_given_all_items_then_their_fields_without_a_change_change_nothing(page: EditedPage) -> None:
+    before = page.session.document.text
+    for item in page.session.document.list_items():
+        page.editor.select(item)
+        assert page.set() == ""
+        assert page.session.document.text == before, item
+    assert page.session.undo_name == ""
+
+
+def test_given_numbers_then_the_frame_moves_and_undo_brings_it_back(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    page.set(xyz=(0.051234, 0.0, 0.06), rpy=(0.0, 12.0, 0.0), has_sigma=True, sigma_xyz=(0.002, 0.002, 0.002))
+    frame = page.model.frame(LENS.name)
+    assert frame.pose.is_close(Pose.from_rpy((0.051234, 0.0, 0.06), 0.0, math.radians(12.0), 0.0))
+    assert frame.sigma is not None
+    assert frame.sigma.position == (0.002, 0.002, 0.002)
+    assert page.shown == [page.model]
+    page.editor._step(page.session.undo)
+    assert not page.session.is_changed
+    assert page.fields._fields["xyz"].value == (0.05, 0.0, 0.06)
+
+
+def test_given_a_sigma_that_is_taken_away_then_none_is_stated(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.FRAME, "Digiclops:ImagePlane"))
+    page.set(has_sigma=False)
+    # the defaults of the file apply where none is stated
+    sigma = page.model.frame("Digiclops:ImagePlane").sigma
+    assert sigma is not None
+    assert sigma.position == (0.05, 0.05, 0.05)
+
+
+def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    page.set(sigma_xyz=(-0.1, 0.0, 0.0))
+    assert page.session.has_errors
+    assert "not negative" in page.editor._problem_texts.content
+    assert "cannot be saved" in page.editor._status.content
+    assert page.editor._save.disabled
+    assert page.editor._buttons[0].label == "1: FLEA:Lens"
+    page.editor.select(NOD)
+    page.editor.select(LENS)
+    page.set(sigma_xyz=(0.01, 0.0, 0.0))
+    assert not page.session.has_errors
+    assert page.editor._problem_texts.content.startswith(("none", "- and"))
+
+
+@pytest.mark.parametrize(
+    ("values", "joint"),
+    [
+        ({"limits": "-25, 15"}, {"lower": (math.radians(-25),), "upper": (math.radians(15),)}),
+        ({"limits": "-.inf, 15"}, {"lower": (), "upper": (math.radians(15),)}),
+        ({"limits": ""}, {"lower": (), "upper": ()}),
+        ({"rate_limit": "45", "sigma": ""}, {"rate_limit": (math.radians(45),), "sigma": ()}),
+        ({"default": "-5"}, {"default": (math.radians(-5),)}),
+        ({"axis": (0.0, 0.0, 2.0)}, {"axis": (0.0, 0.0, 1.0)}),
+        (
+            {"leader": "BackNoddingSICKAxis", "multiplier": "-1"},
+            {"mimic": Mimic("BackNoddingSICKAxis", -1.0, 0.0), "default": (0.0,)},
+        ),
+    ],
+)
+def test_given_fields_of_a_joint_then_the_joint_has_them(
+    page: EditedPage, values: dict[str, Any], joint: dict[str, Any]
+) -> None:
+    page.editor.select(NOD)
+    old = page.constraint(NOD.name).joint
+    assert page.set(**values) == ""
+    new = page.constraint(NOD.name).joint
+    for key in ("lower", "upper", "rate_limit", "default", "sigma", "axis", "mimic"):
+        assert getattr(new, key) == pytest.approx(joint.get(key, getattr(old, key))), key
+
+
+def test_given_one_number_of_a_joint_then_the_others_stay_as_they_are_written(page: EditedPage) -> None:
+    page.editor.select(NOD)
+    page.set(limits="-25, 20", rate_limit="35.3")
+    old = "limits_deg: [-30, 20], rate_limit_deg: 90, sigma_deg: 0.021}"
+    new = "limits_deg: [-25, 20], rate_limit_deg: 35.3, sigma_deg: 0.021}"
+    text = (RAPTOR / "geometry.yaml").read_text()
+    first = text.index(old, text.index(f"{NOD.name}:"))
+    assert page.session.document.text == text[:first] + new + text[first + len(old) :]
+
+
+def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "SpeedLanFixed"))
+    page.set(joint=JointType.PRISMATIC)
+    page.set(axis=(0.0, 0.0, 1.0), limits="0, 0.5")
+    assert page.constraint("SpeedLanFixed").joint == Joint(JointType.PRISMATIC, (0.0, 0.0, 1.0), (0.0,), (0.5,))
+    page.set(joint=JointType.REVOLUTE)
+    assert page.constraint("SpeedLanFixed").joint == Joint(JointType.REVOLUTE, (0.0, 0.0, 1.0))
+    page.set(joint=JointType.FLOATING)
+    assert page.constraint("SpeedLanFixed").joint == Joint(JointType.FLOATING)
+    page.set(joint=JointType.FIXED)
+    assert page.constraint("SpeedLanFixed").joint == Joint()
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"limits": "5"}, "two numbers, lower and upper"),
+        ({"limits": "20, -20"}, "reversed"),
+        ({"limits": "a, b"}, "'a' is not a number"),
+        ({"default": "70"}, "out of"),
+        ({"sigma": "-1"}, "not negative"),
+        ({"axis": (0.0, 0.0, 0.0)}, "axis"),
+        ({"name": "FLEALateral"}, "already"),
+        ({"name": "a b"}, "white space"),
+    ],
+)
+def test_given_a_wrong_field_then_the_message_has_why_and_nothing_changes(
+    page: EditedPage, values: dict[str, Any], words: str
+) -> None:
+    page.editor.select(NOD)
+    assert words in page.set(**values)
+    assert not page.session.is_changed
+
+
+def test_given_another_name_then_what_refers_to_it_follows_and_it_stays_selected(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.BODY, "FLEA"))
+    page.set(name="Camera", description="The color camera.")
+    assert page.constraint("FLEALateral").to == "Camera:BracketFixing"
+    assert page.model.body("Camera").description == "The color camera."
+    assert page.editor._item == GeometryItem(ItemKind.BODY, "Camera")
+
+
+def test_given_the_frame_of_a_template_then_one_or_all_bodies_change(page: EditedPage) -> None:
+    item = GeometryItem(ItemKind.FRAME, "FrontNoddingSICK:NoddingAxis")
+    page.editor.select(item)
+    page.set(xyz=(0.25, 0.0, 0.18), template=True)
+    assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
+    page.set(xyz=(0.26, 0.0, 0.18))
+    assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
+    assert page.model.frame(item.name).pose.xyz[0] == 0.26
+
+
+def test_given_a_drag_then_the_fields_follow_and_its_end_is_one_change(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FrontNoddingSICKFixed"))
+    body, parent, pose = page.fields.find_place() or pytest.fail("no place")
+    assert body == "Raptor"
+    assert parent == page.model.frame("Raptor:CabFrontRailCenter").pose
+    dragged = Pose((0.0123456, 0.0, 0.0)) @ pose
+    page.fields.set_dragged(dragged, Snap.NONE, is_end=False)
+    assert page.fields._fields["xyz"].value == (0.0123, 0.0, 0.0)
+    assert not page.session.is_changed
+    page.fields.set_dragged(dragged, Snap.FINE, is_end=True)
+    assert page.constraint("FrontNoddingSICKFixed").pose == Pose((0.012, 0.0, 0.0))
+    turned = Pose.from_rpy((0.012, 0.0, 0.0), 0.0, 0.0, math.radians(44.0))
+    page.fields.set_dragged(turned, Snap.MEDIUM, is_end=True)
+    assert np.degrees(page.constraint("FrontNoddingSICKFixed").pose.rpy) == pytest.approx([0.0, 0.0, 45.0])
+    page.editor._step(page.session.undo)
+    page.editor._step(page.session.undo)
+    assert not page.session.is_changed
+
+
+def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -> None:
+    editor = page.editor
+    editor._new.value = "Beacon"
+    editor._add(ItemKind.BODY)
+    assert editor._item == GeometryItem(ItemKind.BODY, "Beacon")
+    editor._new.value = "Lamp"
+    editor._add(ItemKind.FRAME)
+    assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp")
+    editor.select(GeometryItem(ItemKind.FRAME, "Raptor:CabRearRailCenter"))
+    editor._new.value = "BeaconFixed"
+    editor._add(ItemKind.CONSTRAINT)
+    page.set(to="Beacon:Origin")
+    assert page.model.get_transformation("Beacon:Lamp", "Raptor:CabRearRailCenter").pose == Pose.identity()
+    editor.select(GeometryItem(ItemKind.FRAME, "Beacon:Lamp"))
+    editor._new.value = ""
+    editor._duplicate()
+    assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp2")
+    editor.select(GeometryItem(ItemKind.BODY, "Beacon"))
+    editor._delete()
+    assert page.session.document.text == (RAPTOR / "geometry.yaml").read_text()
+    editor._new.value = "World"
+    editor._add(ItemKind.BODY)
+    assert "reserved" in page.message
+
+
+def test_given_text_then_it_is_written_and_a_wrong_one_is_not(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    assert page.editor._text.value.startswith("Lens:\n  xyz: [0.05, 0, 0.06]")
+    page.editor._text.value = "Lens: {xyz: [0.06, 0, 0]}"
+    page.editor._write_text()
+    assert page.model.frame(LENS.name).pose == Pose((0.06, 0.0, 0.0))
+    page.editor._text.value = "Lens: {xyz: [0.06, 0, 0]"
+    page.editor._write_text()
+    assert "not done" in page.message
+
+
+def test_given_frames_that_coincide_then_the_constraint_is_placed(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FLEALateral"))
+    place = page.editor._place
+    place._frame.value, place._target.value = "FLEA:Lens", "Digiclops:RightLens"
+    place._coincide()
+    assert page.message == ""
+    assert page.model.get_transformation("FLEA:Lens", "Digiclops:RightLens").pose.is_close(Pose.identity(), 2e-6, 1e-7)
+    place._target.value = "Raptor:CG"
+    place._frame.value = "Raptor:Origin"
+    place._coincide()
+    assert "one side" in page.message
+
+
+def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page: EditedPage) -> None:
+    item = GeometryItem(ItemKind.FRAME, "Raptor:CG")
+    page.editor.select(item)
+    true = np.array((1.2, 0.55, 0.1))
+    place = page.editor._place
+    others = ["Raptor:FrontLeftCorner", "Raptor:FrontRightCorner", "Raptor:RearLeftCorner", "Raptor:CabFrontRailCenter"]
+    for (frame, distance), name in zip(place._rows, others, strict=False):
+        frame.value = name
+        distance.value = float(np.linalg.norm(true - page.model.frame(name).pose.xyz))
+    place._measure()
+    assert page.message == ""
+    frame = page.model.frame(item.name)
+    assert frame.pose.xyz == pytest.approx(true, abs=1e-5)
+    assert frame.sigma is not None
+    assert 0.0 < max(frame.sigma.position) < 0.5
+    assert "+0.0 mm" in place._result.content.replace("-0.0", "+0.0")
+    for row, _ in place._rows[2:]:
+        row.value = "-"
+    place._measure()
+    assert "three frames" in page.message
+
+
+def test_given_a_service_that_does_not_answer_then_the_reason_is_shown(page: EditedPage) -> None:
+    page.editor._editing = Editing(page.session, "memq://", "", 0.05)
+    page.editor._ask_apply()
+    assert page.editor._reloading is not None
+    page.editor._reloading[1].exception(10.0)
+    page.editor.update()
+    assert page.message.startswith("not applied: ")
+    page.editor.close()

@@ -1,0 +1,157 @@
+"""The 3D scene of the viewer against the answers of queries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+
+from modelserver.transforms.pose import Pose
+from mstools.commands.demo import find_vehicle_file
+from mstools.view.drive import Picture
+from mstools.view.page import Page, open_page
+from mstools.view.panels import describe_answer, escape_markdown, format_code
+from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid, read_mesh
+from mstools.view.sources import Source, list_coordinates, open_geometry
+
+TETRAHEDRON = """\
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+f 1 3 2
+f 1 2 4
+f 1 4 3
+f 2 3 4
+"""
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    opened = open_page(port=0)
+    yield opened
+    opened.close()
+
+
+def make_scene(page: Page, source: Source) -> VehicleScene:
+    scene = VehicleScene(page.server, source.folder, lambda frame, is_reference: None)
+    assert source.drive.model is not None
+    scene.set_model(source.drive.model, source.drive.base_frame, NameLabels.FRAMES)
+    return scene
+
+
+def test_given_joints_anywhere_then_each_frame_is_drawn_where_a_query_places_it(page: Page) -> None:
+    source = open_geometry(find_vehicle_file(), {})
+    scene = make_scene(page, source)
+    model = source.drive.model
+    assert model is not None
+    assert source.set_joints is not None
+    generator = np.random.default_rng(3)
+    for _ in range(5):
+        source.set_joints({name: generator.uniform(-0.5, 0.5) for name, _, _ in list_coordinates(model)})
+        scene.show(source.drive.get_picture())
+        for body in model.bodies:
+            for frame in body:
+                drawn = scene.get_frame_pose(frame.full_name)
+                found = source.answers.get_pose(frame.full_name, source.drive.base_frame).transformation
+                assert drawn is not None
+                assert found.is_valid
+                assert drawn.is_close(found.pose, 1e-9, 1e-9), frame.full_name
+
+
+def test_given_bodies_that_nothing_joins_then_they_are_beside_the_vehicle(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text("modelserver: geometry/1\nbodies:\n  A: {frames: {F: {}}}\n  B: {frames: {F: {}}}\n")
+    scene = make_scene(page, open_geometry(path, {}))
+    near, far = (scene.get_frame_pose(name) for name in ("A:F", "B:F"))
+    assert near is not None
+    assert far is not None
+    assert near.xyz == (0.0, 0.0, 0.0)
+    assert far.xyz[1] < -0.5
+    assert scene.get_frame_pose("World:UTM") is None
+
+
+def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "mast.obj").write_text(TETRAHEDRON)
+    assert len(read_mesh("meshes/mast.obj", tmp_path).faces) == 4
+    assert len(read_mesh("package://robot/meshes/mast.obj", tmp_path).faces) == 4
+    (tmp_path / "meshes" / "empty.stl").write_bytes(b"no mesh")
+    (tmp_path / "meshes" / "bad.ply").write_bytes(b"no mesh")
+    for file, folder, reason in (
+        ("missing.stl", tmp_path, "not found"),
+        ("meshes/empty.stl", tmp_path, "no triangles"),
+        ("meshes/bad.ply", tmp_path, "cannot be read"),
+        ("meshes/mast.obj", None, "not from the bus"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            read_mesh(file, folder)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="a"><visual><geometry><mesh filename="meshes/mast.obj"/></geometry></visual></link>'
+        '<link name="b"><visual><geometry><mesh filename="missing.stl"/></geometry></visual></link>'
+        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+    )
+    scene = make_scene(page, open_geometry(urdf, {}))
+    assert scene.unread == ["missing.stl: not found"]
+
+
+def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:
+    generator = np.random.default_rng(1)
+    root = generator.normal(size=(3, 3))
+    covariance = root @ root.T
+    errors = generator.multivariate_normal(np.zeros(3), covariance, 20_000)
+    for percent, quantile in CHI_SQUARE_3.items():
+        radii, pose = compute_ellipsoid(covariance, quantile)
+        inside = np.sum((pose.inverse().transform(errors) / np.array(radii)) ** 2, axis=1) <= 1.0
+        assert abs(float(np.mean(inside)) - 0.01 * percent) < 0.012
+
+
+def test_given_a_picture_with_nan_and_without_covariance_then_nothing_is_drawn_of_them(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    for picture in (
+        Picture(1),
+        Picture(1, Pose.identity()),
+        Picture(1, Pose.identity(), covariance=np.zeros((3, 3)), horizontal_protection_level=math.inf),
+    ):
+        scene.show(picture)
+        scene.show_uncertainty(picture, 95, True)
+        scene.show_trail(np.zeros(0, np.int64), np.zeros((0, 3)))
+        scene.show_fixes(np.zeros((0, 3)), np.zeros(0, np.int64))
+
+
+def test_given_a_trail_that_grows_then_both_its_parts_together_are_the_whole_trail(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    whole = np.stack([np.arange(1000.0), np.zeros(1000), np.zeros(1000)], axis=1)
+    utimes = np.arange(1000, dtype=np.int64) * 33_000 + 10**15
+    redrawn = set()
+    for end in (*range(2, 700, 7), *range(400, 420)):
+        scene.show_trail(utimes[:end], whole[:end])
+        redrawn.add(len(scene._trail.points))
+        shown = [lines.points[:, :, 0].ravel() for lines in (scene._trail, scene._trail_end) if lines.visible]
+        assert sorted({*np.concatenate(shown).tolist()}) == list(range(end)), end
+    assert len(redrawn) < 10
+    scene.show_trail(utimes[:0], whole[:0])
+    assert not scene._trail.visible
+    assert not scene._trail_end.visible
+
+
+def test_given_an_answer_then_the_panel_shows_its_numbers_and_how_to_ask_for_them() -> None:
+    source = open_geometry(find_vehicle_file(), {})
+    explanation = source.answers.explain("FrontSICKLaser:Scan", "Raptor:CG")
+    text = describe_answer(explanation, None)
+    found = explanation.answer.transformation
+    assert f"| x | {found.pose.xyz[0]:.4f} m |" in text
+    assert "FrontNoddingSICKAxis" in text
+    code = format_code("FrontSICKLaser:Scan", "Raptor:CG", 5, explanation.answer)
+    assert 'platform.get_pose("FrontSICKLaser:Scan", "Raptor:CG", at=5)' in code
+    assert "modelserver query 'FrontSICKLaser:Scan' 'Raptor:CG' --at 5" in code
+
+
+def test_given_markup_in_a_name_then_it_is_shown_as_text() -> None:
+    assert escape_markdown("a|b<script>*_") == r"a\|b\<script\>\*\_"

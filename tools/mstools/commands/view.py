@@ -1,0 +1,148 @@
+"""`modelserver view`: a geometry file, a log, or the running service in the browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import sys
+import time
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from modelserver.errors import ModelServerError
+from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
+from modelserver.files.regular import read_start
+from mstools.terminal.options import (
+    KeyOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    Variables,
+    option,
+    parse_variables,
+)
+from mstools.terminal.output import check_writable
+from mstools.terminal.progress import catch_signals, show_progress
+
+if TYPE_CHECKING:
+    from mstools.view.editor import Editing
+    from mstools.view.sources import Source
+
+LOOPBACK = "127.0.0.1"
+DEFAULT_PORT = 8080
+RELOAD_TIMEOUT_S = 10.0
+
+
+def command(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A geometry file, vehicle file, or LCM log.")
+    ] = None,
+    live: Annotated[bool, option("--live", "Follow the running service.")] = False,
+    model: Annotated[Path | None, option("--model FILE", "Geometry for a log, in place of its own.")] = None,
+    settings: Variables = None,
+    bind: Annotated[
+        str, option("--bind ADDRESS", "Serve the page at this address. Beyond loopback its link has a token.")
+    ] = LOOPBACK,
+    port: Annotated[
+        int | None,
+        option("--port N", f"Port of the page. Default: {DEFAULT_PORT}, else a free one.", min=0, max=65535),
+    ] = None,
+    edit: Annotated[bool, option("--edit", "Edit the geometry file too. Its link has a token.")] = False,
+    no_browser: Annotated[bool, option("--no-browser", "Only print the link.")] = False,
+    seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
+    timeout: TimeoutOption = 1.0,
+    key: KeyOption = None,
+) -> None:
+    """Show a geometry file, a log, or with --live the running service in the browser.
+
+    The page shows bodies, frames, constraints and joints in 3D, the vehicle in the world with trail, fixes and
+    uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
+    --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
+    to the running service, signed with --key. It needs the extra view: pip install 'modelserver[view]'. Nothing is
+    loaded from the internet.
+
+    \b
+    Examples:
+      modelserver view config/raptor/geometry.yaml
+      modelserver view config/raptor/vehicle.yaml --edit --key reload.key
+      modelserver view drive.lcm
+      modelserver view --live
+    """
+    if live == (file is not None):
+        raise typer.BadParameter("give a file or --live", param_hint="FILE")
+    if edit and live:
+        raise typer.BadParameter("goes with a geometry or vehicle file: that of the service", param_hint="--edit")
+    check_installed()
+    from mstools.view.page import ViewError, open_page
+    from mstools.view.viewer import Viewer
+
+    source = open_source(file, model, settings, url, prefix, timeout)
+    try:
+        editing = None
+        if edit and file is not None:
+            if source.set_model is None:
+                raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
+            editing = open_editing(file, settings, url, prefix, key or "")
+        try:
+            page = open_page(bind, DEFAULT_PORT if port is None else port, with_token=edit)
+        except ViewError:
+            if port is not None:
+                raise
+            page = open_page(bind, 0, with_token=edit)
+        try:
+            viewer = Viewer(page, source, editing)
+            typer.echo(f"{source.title}: {page.link} (Ctrl-C ends it)")
+            sys.stdout.flush()
+            if not no_browser and bind == LOOPBACK:
+                webbrowser.open(page.link)
+            end = time.monotonic() + seconds
+            with catch_signals() as stop:
+                viewer.run(lambda: stop.is_set() or time.monotonic() >= end)
+        finally:
+            page.close()
+    finally:
+        source.close()
+
+
+def check_installed() -> None:
+    """Raise ModelServerError if the extra `view` is not installed."""
+    if importlib.util.find_spec("viser") is None:
+        raise ModelServerError("the viewer needs viser, which is not installed: pip install 'modelserver[view]'")
+
+
+def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
+    """Begin to edit a geometry file, or that of a vehicle file. Raises EditError, OSError.
+
+    Bus and prefix of the service are those given, else of the vehicle file.
+    """
+    from mstools.edit.session import EditedFile, EditSession
+    from mstools.view.editor import Editing
+
+    edited = EditedFile.open(file)
+    check_writable(str(edited.path))
+    if edited.config is not None:
+        url, prefix = url or edited.config.lcm.url, prefix or edited.config.lcm.channel_prefix
+    return Editing(EditSession(edited, parse_variables(settings)), url, prefix, RELOAD_TIMEOUT_S, str(key))
+
+
+def open_source(
+    file: Path | None, model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float
+) -> Source:
+    """Open what is to be shown. Raises GeometryError, ConfigError, RecordingError, OSError."""
+    from mstools.view.sources import open_geometry, open_live, open_log
+
+    if file is None:
+        return open_live(url, prefix, timeout)
+    kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
+    if kind is FileKind.LOG:
+        size = file.stat().st_size
+        with show_progress(f"reading {file.name}", size) as show:
+            return open_log(file, prefix, model, lambda part: show(round(part * size)))
+    if model is not None:
+        raise typer.BadParameter(f"goes with a log, but {file} is none: {kind.value}", param_hint="--model")
+    return open_geometry(file, parse_variables(settings))

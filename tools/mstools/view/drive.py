@@ -1,0 +1,513 @@
+"""A drive as the viewer shows it: geometry, poses, joints, fixes and events over time, from a log or a running service.
+
+`Drive.feed` processes one message and stores what a picture needs; `Drive.get_picture` returns the picture of an
+instant. Poses and joints are stored at most once per `PICTURE_PERIOD_US`, more than a screen shows, so an hour of them
+takes some 20 MB, and is read without decoding the rest. No clock, no socket.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.earth.geodesy import GeodesyError, geodesy_of
+from modelserver.earth.origin import Origin
+from modelserver.errors import WireError
+from modelserver.formats.snapshot import decode_snapshot
+from modelserver.geometry.joint import coordinate_names
+from modelserver.geometry.model import Model
+from modelserver.messages import (
+    VALID,
+    Decision,
+    DriverHealth,
+    FixType,
+    GpsSample,
+    Health,
+    Invalid,
+    JointsSample,
+    Mode,
+    PoseAnswer,
+    SnapshotPart,
+    Verdict,
+)
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Vector3
+from modelserver.wire.codec import decode, fingerprint_of
+from modelserver.wire.fields import read_text
+from modelserver.wire.snapshot import SnapshotAssembler
+
+PICTURE_PERIOD_US: Final = 30_000
+"""Least time between two stored poses, and two stored messages of joints of one source, microseconds."""
+
+MAX_ROWS: Final = 150_000
+"""Rows of a table: an hour and more of pictures. Older ones are dropped."""
+
+MAX_DELAY_US: Final = 1_000_000
+"""A row may come later than its successors by this time."""
+
+MAX_STAMP: Final = (1 << 32) * 1_000_000
+"""Stamps are below this, in the year 2106; more is no stamp."""
+
+MAX_EVENTS: Final = 2_000
+MAX_CHANNELS: Final = 500
+MAX_REPORT_PERIOD_US: Final = 900_000
+"""Reports of health and of the filter's state are stored about once a second, as bytes."""
+
+REPEATED_EVENT_US: Final = 1_000_000
+"""Events of one kind and text are one event while they follow each other within this time."""
+
+SOURCE_OFFSET: Final = 48
+"""Offset of the source in the bytes of a sample, behind fingerprint and the numbers of sensor_header_t."""
+
+POSITION: Final = "gps_position"
+"""The kind of decisions that are about the position of a fix."""
+
+
+class FixColor(StrEnum):
+    """What became of a fix."""
+
+    USED = "used"
+    REJECTED = "rejected"
+    MONITORED = "monitored"
+    NO_DECISION = "no decision"
+
+
+_COLOR_OF: Final = {
+    Verdict.USED: FixColor.USED,
+    Verdict.RESET: FixColor.USED,
+    Verdict.REJECTED: FixColor.REJECTED,
+    Verdict.MONITORED: FixColor.MONITORED,
+}
+FIX_COLORS: Final = tuple(FixColor)
+_NO_DECISION: Final = FIX_COLORS.index(FixColor.NO_DECISION)
+
+
+class EventKind(StrEnum):
+    """Kinds of events that the viewer jumps to."""
+
+    INVALID = "invalid"
+    VALID = "valid"
+    REJECTION = "rejection"
+    RESET = "reset"
+    MODE = "mode"
+    GEOMETRY = "geometry"
+
+
+@dataclass(slots=True)
+class DriveEvent:
+    """Something that happened at `utime`, `count` times until `last`."""
+
+    utime: int
+    kind: EventKind
+    text: str
+    last: int = 0
+    count: int = 1
+
+
+class Table:
+    """Rows of numbers in the order of their times. Appending is cheap; beyond `MAX_ROWS` the older half is dropped."""
+
+    def __init__(self, columns: int):
+        self._utimes = np.zeros(1024, np.int64)
+        self._rows = np.zeros((1024, columns))
+        self._earlier = 0
+        self.count = 0
+
+    @property
+    def utimes(self) -> npt.NDArray[np.int64]:
+        """The times (n,), microseconds."""
+        return self._utimes[: self.count]
+
+    @property
+    def rows(self) -> Array:
+        """The rows (n, columns)."""
+        return self._rows[: self.count]
+
+    @property
+    def last(self) -> int:
+        """The time of the last row, 0 without any."""
+        return int(self._utimes[self.count - 1]) if self.count else 0
+
+    def append(self, utime: int, *values: float) -> None:
+        """Append a row. One that is not later than the last row is ignored.
+
+        Where two rows in succession are earlier by more than `MAX_DELAY_US`, the clock was set back, or the last row's
+        time was wrong: the rows after them are dropped.
+        """
+        if utime <= self.last and self.count:
+            is_second = 0 < utime - self._earlier < MAX_DELAY_US
+            self._earlier = utime
+            if not is_second or utime > self.last - MAX_DELAY_US:
+                return
+            self.count = self.find(utime - 1) + 1
+        if self.count >= MAX_ROWS:
+            retained = MAX_ROWS // 2
+            self._utimes[:retained], self._rows[:retained] = self.utimes[-retained:], self.rows[-retained:]
+            self.count = retained
+        if self.count == len(self._utimes):
+            self._utimes = np.concatenate([self._utimes, np.zeros_like(self._utimes)])
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._utimes[self.count] = utime
+        self._rows[self.count] = values
+        self.count += 1
+
+    def find(self, utime: int) -> int:
+        """Return the number of the last row at or before a time, -1 where there is none."""
+        return int(np.searchsorted(self.utimes, utime, side="right")) - 1
+
+
+@dataclass(slots=True)
+class ChannelCount:
+    """Messages of a channel: their number, receive time of the last, and rate in Hz over the last seconds."""
+
+    count: int = 0
+    last: int = 0
+    rate: float = math.nan
+    _since: int = 0
+    _counted: int = 0
+
+    def add(self, now: int) -> None:
+        """Count a message received at `now`, microseconds."""
+        self.count += 1
+        self.last = now
+        if not self._since:
+            self._since, self._counted = now, self.count
+        elif now - self._since >= 1_000_000:
+            self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
+            self._since, self._counted = now, self.count
+
+
+class Picture(NamedTuple):
+    """The vehicle at `utime`: pose of the base frame in World:UTM, None where it is unknown, and what is known of it.
+
+    `covariance` is that of the position (3, 3), m2, and `heading_sigma` in radians, nan where unknown; `joints` gives
+    the position of each coordinate that was received.
+    """
+
+    utime: int
+    pose: Pose | None = None
+    invalid: Invalid = VALID
+    covariance: Array | None = None
+    heading_sigma: float = math.nan
+    horizontal_protection_level: float = math.nan
+    heading_protection_level: float = math.nan
+    joints: Mapping[str, float] = {}
+
+
+# columns of the table of poses
+_POSITION, _QUATERNION, _COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 13)
+_HEADING_SIGMA, _HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 18)
+_POSE_COLUMNS: Final = 18
+_UPPER: Final = np.triu_indices(3)
+MAX_INTERPOLATION_US: Final = 1_000_000
+"""Longest time between two poses that is interpolated."""
+
+
+@dataclass
+class Drive:
+    """What is known of a drive. Channels have the prefix `prefix`; `model` is the geometry, from a snapshot or given.
+
+    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel.
+    """
+
+    prefix: str = ""
+    model: Model | None = None
+    base_frame: str = ""
+    keep_geometry: bool = False
+    origin: Origin | None = None
+    poses: Table = field(default_factory=lambda: Table(_POSE_COLUMNS))
+    joints: dict[str, Table] = field(default_factory=dict)
+    events: list[DriveEvent] = field(default_factory=list)
+    channels: dict[str, ChannelCount] = field(default_factory=dict)
+    drivers: dict[str, DriverHealth] = field(default_factory=dict)
+    damaged: int = 0
+
+    def __post_init__(self) -> None:
+        self._coordinates = _list_coordinates(self.model)
+        self._fixes: dict[str, Table] = {}
+        # until the origin is known: source, time, latitude, longitude, height
+        self._unplaced: list[tuple[str, int, Vector3]] = []
+        self._assembler = SnapshotAssembler()
+        self.joints_channel = f"{self.prefix}JOINTS"
+        self._sources: dict[str, int] = {}
+        self._last_pose = 0
+        self._reports: dict[str, list[tuple[int, bytes]]] = {}
+        self._invalid: Invalid | None = None
+        self._mode: Mode | None = None
+        self._epoch = -1
+        self._gps = fingerprint_of("gps_t")
+        self._handlers = {
+            "POSE": self._process_pose,
+            "MODEL_SNAPSHOT": self._process_snapshot,
+            "JOINTS_HELD": self._process_joints,
+            "LOCALIZATION_DECISIONS": self._process_decisions,
+            "LOCALIZATION_STATE": self._store_report,
+            "MODELSERVER_HEALTH": self._store_report,
+            "DRIVER_HEALTH": self._process_driver,
+        }
+
+    # --- messages
+
+    def feed(self, channel: str, data: bytes, now: int) -> None:
+        """Process a message received at `now`, microseconds. Raises nothing; `damaged` counts what is malformed."""
+        counted = self.channels.get(channel)
+        if counted is None:
+            if len(self.channels) >= MAX_CHANNELS or not channel.startswith(self.prefix):
+                return
+            counted = self.channels[channel] = ChannelCount()
+        counted.add(now)
+        name = channel[len(self.prefix) :]
+        if not 0 < int.from_bytes(data[8:16], "big", signed=True) < MAX_STAMP:
+            # every message of this project begins with its stamp; what does not is of no use here
+            self.damaged += name in self._handlers
+            return
+        try:
+            handler = self._handlers.get(name)
+            if handler is not None:
+                handler(name, data, now)
+            elif data[:8] == self._gps:
+                self._process_gps(decode("gps_t", data))
+            elif channel == self.joints_channel:
+                self._process_joints(name, data, now)
+        except (WireError, GeodesyError, struct.error):
+            self.damaged += 1
+
+    def _process_snapshot(self, _: str, data: bytes, now: int) -> None:
+        part: SnapshotPart = decode("model_snapshot_t", data)
+        if self.model is not None and part.model_revision == self.model.revision:
+            return
+        whole = self._assembler.add(part)
+        if whole is None:
+            return
+        snapshot = decode_snapshot(whole)
+        self.joints_channel = snapshot.joints_channel
+        self.base_frame = snapshot.base_frame
+        if self.keep_geometry:
+            return
+        if self.model is not None:
+            self._add_event(part.utime, EventKind.GEOMETRY, f"geometry revision {snapshot.model.revision}")
+        self.set_model(snapshot.model)
+
+    def set_model(self, model: Model) -> None:
+        """Show another geometry."""
+        self.model = model
+        self._coordinates = _list_coordinates(model)
+
+    def _process_pose(self, _: str, data: bytes, now: int) -> None:
+        # the stamp alone decides whether the rest is read
+        stamp = int.from_bytes(data[8:16], "big", signed=True)
+        if 0 <= stamp - self._last_pose < PICTURE_PERIOD_US and self.poses.count:
+            return
+        answer: PoseAnswer = decode("pose_transform_t", data)
+        found = answer.transformation
+        self._last_pose = stamp
+        if answer.origin is not None and answer.origin != self.origin:
+            self.origin = answer.origin
+            # fixes of an earlier origin would be at wrong places
+            self._fixes.clear()
+            for each in self._unplaced:
+                self._place_fix(*each)
+            self._unplaced.clear()
+        covariance = found.covariance
+        upper = np.full(6, math.nan) if covariance is None else covariance[:3, :3][_UPPER]
+        self.poses.append(
+            stamp,
+            *found.pose.xyz,
+            *found.pose.wxyz,
+            *upper,
+            math.nan if covariance is None else math.sqrt(max(covariance[5, 5], 0.0)),
+            answer.horizontal_protection_level,
+            answer.heading_protection_level,
+            found.invalid_reasons,
+            found.pose_epoch,
+        )
+        self._note_validity(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
+
+    def _note_validity(self, utime: int, invalid: Invalid, epoch: int) -> None:
+        """Add events for a change of the validity and of the epoch."""
+        if self._invalid is not None and invalid != self._invalid:
+            kind = EventKind.INVALID if invalid else EventKind.VALID
+            self._add_event(utime, kind, invalid.explain() if invalid else "the pose is valid")
+        if self._epoch >= 0 and epoch != self._epoch:
+            self._add_event(utime, EventKind.RESET, f"the position was reset: epoch {epoch}")
+        self._invalid, self._epoch = invalid, epoch
+
+    def _process_joints(self, name: str, data: bytes, now: int) -> None:
+        # stamp and source alone decide whether the rest is read
+        stamp = int.from_bytes(data[8:16], "big", signed=True)
+        source = f"{name} {read_text(data, SOURCE_OFFSET)[0]}"
+        if 0 <= stamp - self._sources.get(source, 0) < PICTURE_PERIOD_US:
+            return
+        sample: JointsSample = decode("joints_t", data)
+        if source in self._sources or len(self._sources) < MAX_CHANNELS:
+            self._sources[source] = stamp
+        for joint in sample.joints:
+            if joint.name in self._coordinates and math.isfinite(joint.position):
+                self.set_joint(joint.name, sample.header.utime, joint.position)
+
+    def set_joint(self, name: str, utime: int, position: float) -> None:
+        """Set a coordinate, radians or meters."""
+        self.joints.setdefault(name, Table(1)).append(utime, position)
+
+    def _process_gps(self, sample: GpsSample) -> None:
+        place = (sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal)
+        if sample.fix_type is FixType.NONE or not all(map(math.isfinite, place[:2])):
+            return
+        height = place[2] if math.isfinite(place[2]) else sample.height_msl
+        known = (place[0], place[1], height if math.isfinite(height) else 0.0)
+        self._place_fix(sample.header.source, sample.header.utime, known)
+
+    def _place_fix(self, source: str, utime: int, place: Vector3) -> None:
+        """Store a fix at a geodetic place; without an origin it waits for one."""
+        if self.origin is None:
+            self._unplaced = [*self._unplaced[-MAX_EVENTS:], (source, utime, place)]
+            return
+        if source not in self._fixes and len(self._fixes) >= MAX_CHANNELS:
+            return
+        geodesy = geodesy_of(self.origin)
+        position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
+        self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
+
+    def _process_decisions(self, _: str, data: bytes, now: int) -> None:
+        for each in decode("decisions_t", data).decisions:
+            self._process_decision(each)
+
+    def _process_decision(self, decision: Decision) -> None:
+        if not 0 < decision.utime < MAX_STAMP:
+            raise WireError("malformed", f"{decision.utime} is no stamp")
+        table = self._fixes.get(decision.source)
+        if decision.kind == POSITION and table is not None:
+            row = table.find(decision.utime)
+            if row >= 0 and table.utimes[row] == decision.utime:
+                table.rows[row, 3] = FIX_COLORS.index(_COLOR_OF[decision.verdict])
+        if decision.verdict in (Verdict.REJECTED, Verdict.RESET):
+            is_reset = decision.verdict is Verdict.RESET
+            verb = "reset by" if is_reset else "rejected"
+            reason = f": {decision.reason}" if decision.reason else ""
+            kind = EventKind.RESET if is_reset else EventKind.REJECTION
+            self._add_event(decision.utime, kind, f"{verb} {decision.kind} of {decision.source}{reason}")
+
+    def _process_driver(self, _: str, data: bytes, now: int) -> None:
+        health: DriverHealth = decode("driver_health_t", data)
+        if health.source in self.drivers or len(self.drivers) < MAX_CHANNELS:
+            self.drivers[health.source] = health
+
+    def _store_report(self, name: str, data: bytes, now: int) -> None:
+        stamp = int.from_bytes(data[8:16], "big", signed=True)
+        stored = self._reports.setdefault(name, [])
+        if name == "LOCALIZATION_STATE":
+            self._note_mode(stamp, data)
+        if stored and 0 <= stamp - stored[-1][0] < MAX_REPORT_PERIOD_US:
+            return
+        stored.append((stamp, data))
+        if len(stored) > MAX_ROWS // 30:
+            del stored[: len(stored) // 2]
+
+    def _note_mode(self, utime: int, data: bytes) -> None:
+        """Add an event for a change of the mode, which is the first field after the stamp."""
+        try:
+            mode = Mode(int.from_bytes(data[16:17], "big", signed=True))
+        except ValueError:
+            return
+        if self._mode not in (None, mode):
+            self._add_event(utime, EventKind.MODE, f"mode {mode.name.lower()}")
+        self._mode = mode
+
+    def _add_event(self, utime: int, kind: EventKind, text: str) -> None:
+        for last in self.events[-5:]:
+            if (last.kind, last.text) == (kind, text) and utime - (last.last or last.utime) < REPEATED_EVENT_US:
+                last.last, last.count = utime, last.count + 1
+                return
+        self.events.append(DriveEvent(utime, kind, text, utime))
+        if len(self.events) > MAX_EVENTS:
+            del self.events[: MAX_EVENTS // 2]
+
+    # --- pictures
+
+    @property
+    def begin(self) -> int:
+        """The time of the first stored pose or joint reading, 0 without any."""
+        tables = [each for each in (self.poses, *self.joints.values()) if each.count]
+        return min((int(each.utimes[0]) for each in tables), default=0)
+
+    @property
+    def end(self) -> int:
+        """The time of the last stored pose or joint reading, 0 without any."""
+        return max((each.last for each in (self.poses, *self.joints.values())), default=0)
+
+    def get_fixes(self, utime: int) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return the positions in World:UTM (n, 3) of the fixes until a time, and indexes into `FIX_COLORS` (n,)."""
+        rows = [table.rows[: table.find(utime) + 1] for table in self._fixes.values()]
+        found = np.concatenate([np.zeros((0, 4)), *rows])
+        return found[:, :3], found[:, 3].astype(np.int64)
+
+    def get_track(self, utime: int, seconds: float = math.inf) -> tuple[npt.NDArray[np.int64], Array]:
+        """Return times (n,) and positions in World:UTM (n, 3) of the last seconds before a time, after a reset."""
+        end = self.poses.find(utime) + 1
+        first = 0
+        if math.isfinite(seconds):
+            first = int(np.searchsorted(self.poses.utimes, utime - round(seconds * 1e6)))
+        jumps = np.flatnonzero(np.diff(self.poses.rows[first:end, _EPOCH]) != 0)
+        if len(jumps):
+            first += int(jumps[-1]) + 1
+        return self.poses.utimes[first:end], self.poses.rows[first:end, _POSITION]
+
+    def get_picture(self, utime: int = 0) -> Picture:
+        """Return the picture at a time, or the latest one at 0; poses in between are interpolated."""
+        utime = utime or self.end
+        joints = self.get_joints(utime)
+        at = self.poses.find(utime)
+        if at < 0:
+            return Picture(utime, joints=joints)
+        row = self.poses.rows[at]
+        pose = _read_pose(row)
+        if at + 1 < self.poses.count and self.poses.rows[at + 1, _EPOCH] == row[_EPOCH]:
+            first, second = (int(each) for each in self.poses.utimes[at : at + 2])
+            if second - first <= MAX_INTERPOLATION_US:
+                pose = pose.interpolate(_read_pose(self.poses.rows[at + 1]), (utime - first) / (second - first))
+        covariance = None
+        if math.isfinite(row[_COVARIANCE.start]):
+            covariance = np.zeros((3, 3))
+            covariance[_UPPER] = row[_COVARIANCE]
+            covariance = covariance + np.triu(covariance, 1).T
+        levels = float(row[_HEADING_SIGMA]), float(row[_HORIZONTAL]), float(row[_HEADING])
+        return Picture(utime, pose, Invalid(int(row[_INVALID])), covariance, *levels, joints)
+
+    def get_joints(self, utime: int) -> dict[str, float]:
+        """Return the last position of each coordinate at or before a time."""
+        found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
+        return {name: float(table.rows[row, 0]) for name, (table, row) in found.items() if row >= 0}
+
+    def get_health(self, utime: int = 0) -> Health | None:
+        """Return the last health report at or before a time; the latest one at 0."""
+        health: Health | None = self._get_report("MODELSERVER_HEALTH", "health_t", utime)
+        return health
+
+    def get_navigation_state(self, utime: int = 0) -> Any:
+        """Return the filter's last published state at or before a time, None without one; the latest one at 0."""
+        return self._get_report("LOCALIZATION_STATE", "navigation_state_t", utime)
+
+    def _get_report(self, name: str, type_name: str, utime: int) -> Any:
+        stored = self._reports.get(name, [])
+        at = len(stored) if not utime else int(np.searchsorted([stamp for stamp, _ in stored], utime, side="right"))
+        try:
+            return decode(type_name, stored[at - 1][1]) if at else None
+        except WireError:
+            return None
+
+
+def _list_coordinates(model: Model | None) -> frozenset[str]:
+    """Return the names of the coordinates that JOINTS may drive."""
+    joints = model.joints if model is not None else {}
+    return frozenset(name for each in joints.values() for name in coordinate_names(each.name, each.joint))
+
+
+def _read_pose(row: Array) -> Pose:
+    return Pose(tuple(row[_POSITION].tolist()), tuple(row[_QUATERNION].tolist()))

@@ -1,0 +1,167 @@
+"""The viewer's page: viser's web server, opened only to those who may see it.
+
+viser serves its page and websocket to anyone who reaches the port, and to any web page that a browser has open: a
+websocket is not bound to the origin of its page. The guard here checks each request before viser sees it:
+
+- On loopback Host is a name of loopback: a foreign name that resolves to it (DNS rebinding) is rejected.
+- Origin, which browsers add to websockets, is that of this page.
+- Beyond loopback, and on a page that edits (each user of a machine reaches its loopback), a token is needed, by
+  whatever name the machine is reached: the link has it once, then a cookie that scripts cannot read. It is compared in
+  constant time.
+
+viser's tunnel to a public server is disabled, and a port that is in use is an error instead of the next free one.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from functools import partial
+from http.cookies import CookieError, SimpleCookie
+from io import StringIO
+from typing import Any, Final
+from unittest.mock import patch
+from urllib.parse import parse_qs, urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from modelserver.errors import ModelServerError
+
+LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
+COOKIE: Final = "modelserver_view"
+TOKEN_BYTES: Final = 24
+
+
+class ViewError(ModelServerError):
+    """The page cannot be served."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """Decides who may see the page: without a `token` who asks for `hosts` (name:port), else who has it."""
+
+    hosts: frozenset[str] = frozenset()
+    token: str = ""
+
+    def find_problem(self, request: Request) -> str:
+        """Return why a request is denied, empty where it is not."""
+        host = request.headers.get("Host", "")
+        if not self.token and host not in self.hosts:
+            return f"this page is served as {', '.join(sorted(self.hosts))}; open that address"
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return "requests of other pages are denied"
+        if self.token and not self._has_token(request):
+            return "the token is missing or wrong; open the link that modelserver view printed"
+        return ""
+
+    def _has_token(self, request: Request) -> bool:
+        try:
+            cookie = SimpleCookie(request.headers.get("Cookie", "")).get(COOKIE)
+        except CookieError:
+            cookie = None
+        given = cookie.value if cookie is not None else self._get_query_token(request)
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+    @staticmethod
+    def _get_query_token(request: Request) -> str:
+        return parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+
+    def process(
+        self, inner: Callable[..., Response | None] | None, connection: ServerConnection, request: Request
+    ) -> Response | None:
+        """Return viser's response to a request, or a denial."""
+        problem = self.find_problem(request)
+        if problem:
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{problem}\n")
+        response = None if inner is None else inner(connection, request)
+        if response is not None:
+            response.headers["X-Frame-Options"] = "DENY"
+            response.headers["Referrer-Policy"] = "no-referrer"
+            if self.token:
+                attributes = "HttpOnly; SameSite=Strict; Path=/"
+                response.headers["Set-Cookie"] = f"{COOKIE}={self.token}; {attributes}"
+        return response
+
+
+class PageServer(viser.ViserServer):
+    """viser's server without its tunnel to a public server."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Do nothing: what a vehicle does is not published."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A served page: `server` adds content to it, `link` opens it."""
+
+    server: PageServer
+    link: str
+
+    def close(self) -> None:
+        """Stop serving."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
+
+
+def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool = False) -> Page:
+    """Serve a page at an address and port; port 0 is any free one. Raises ViewError.
+
+    An address other than loopback, or `with_token`, needs the token in the link.
+    """
+    try:
+        is_loopback = ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        raise ViewError(f"{address!r} is no IP address; give one of this machine, e.g. 0.0.0.0 for all") from None
+    bound = _bind(address, port)
+    port = bound.getsockname()[1]
+    token = "" if is_loopback and not with_token else secrets.token_urlsafe(TOKEN_BYTES)
+    host = f"[{address}]" if ":" in address else address
+    reached = _find_own_address() if ipaddress.ip_address(address).is_unspecified else host
+    guard = Guard(frozenset(f"{name}:{port}" for name in (*LOOPBACK_NAMES, host)), token)
+    # its own messages on stdout are replaced by the link
+    with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", partial(_serve, guard, bound)):
+        server = PageServer(host=address, port=port, label="ModelServer", verbose=False)
+    return Page(server, f"http://{reached}:{port}/" + (f"?token={token}" if token else ""))
+
+
+def _bind(address: str, port: int) -> socket.socket:
+    """Return a socket bound to an address. Raises ViewError where it is in use."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_STREAM)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((address, port))
+    except (OSError, OverflowError) as error:
+        bound.close()
+        reason = getattr(error, "strerror", "") or str(error)
+        raise ViewError(f"cannot serve at {address} port {port}: {reason}; choose another with --port N") from None
+    return bound
+
+
+def _find_own_address() -> str:
+    """Return an address by which other machines reach this one; sends nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return "127.0.0.1"
+        return str(probe.getsockname()[0])
+
+
+_SERVE: Final = websockets.asyncio.server.serve
+
+
+def _serve(guard: Guard, bound: socket.socket, handler: Any, host: str, port: int, **options: Any) -> Any:
+    """Serve as viser asks for, with the guard before its own handler, on a socket that is bound already."""
+    inner = options.pop("process_request")
+    return _SERVE(handler, sock=bound, process_request=partial(guard.process, inner), **options)

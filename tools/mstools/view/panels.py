@@ -1,0 +1,464 @@
+"""The panels of the page: query of two frames, time, state, display, and the joints of a geometry file."""
+
+from __future__ import annotations
+
+import math
+import queue
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import viser
+
+from modelserver.errors import ModelServerError, QueryError
+from modelserver.geometry import names
+from modelserver.geometry.joint import Joint
+from modelserver.geometry.model import Model
+from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
+from mstools.terminal.health_text import format_body, format_duration
+from mstools.view.drive import Drive, DriveEvent, EventKind, Picture
+from mstools.view.scene import CHI_SQUARE_3, NameLabels
+from mstools.view.sources import Source, list_coordinates
+
+WORLDS: Final = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
+SPEEDS: Final = ("0.25x", "0.5x", "1x", "2x", "5x", "10x", "30x")
+ALL: Final = "all"
+SHOWN_EVENTS: Final = 8
+QUERY_PERIOD_S: Final = 0.5
+STATE_PERIOD_S: Final = 0.5
+SHOWN_STATES: Final = 40
+
+_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|$~])")
+
+
+def escape_markdown(text: str) -> str:
+    """Return a text in which nothing is markup."""
+    return _SPECIAL.sub(r"\\\1", text.replace("\n", " "))
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown; the cells are texts."""
+    lines = [header, ["---"] * len(header), *[[escape_markdown(cell) for cell in row] for row in rows]]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+class QueryPanel:
+    """Two frames, and where one is in the other: transformation, uncertainty, motion, and the path with its shares.
+
+    Queries run in a thread of their own: those of a log read it, which may take a second.
+    """
+
+    def __init__(self, gui: viser.GuiApi, source: Source):
+        self._source = source
+        self._executor = ThreadPoolExecutor(1, "query")
+        self._running: Future[tuple[str, str, tuple[str, ...]]] | None = None
+        self._asked: tuple[object, ...] = ()
+        self._asked_at = -math.inf
+        self.path: tuple[str, ...] = ()
+        """Frames on the path of the shown answer."""
+        gui.add_markdown("Click an axis or a body in the scene: **frame**. With Shift: **in**.")
+        self._interest: Any = gui.add_dropdown("Frame", ("",))
+        self._reference: Any = gui.add_dropdown("in", ("",))
+        exchange = gui.add_button("Exchange")
+        exchange.on_click(lambda _: self.set_frames(self._reference.value, self._interest.value))
+        self._answer = gui.add_markdown("")
+        with gui.add_folder("Copy", expand_by_default=False):
+            self._code = gui.add_markdown("")
+
+    def set_model(self, model: Model, base_frame: str) -> None:
+        """Offer the frames of a model."""
+        frames = [frame.full_name for body in model.bodies for frame in body]
+        chosen = (self._interest.value, self._reference.value)
+        for dropdown in (self._interest, self._reference):
+            dropdown.options = (*frames, *WORLDS)
+        offered = (frames[-1] if frames else WORLDS[0], base_frame or WORLDS[0])
+        self.set_frames(*[old if old in (*frames, *WORLDS) else new for old, new in zip(chosen, offered, strict=True)])
+
+    def set_frames(self, interest: str, reference: str) -> None:
+        """Choose the two frames."""
+        self._interest.value, self._reference.value = interest, reference
+
+    def pick(self, frame: str, is_reference: bool) -> None:
+        """Choose one of the frames, as a click does."""
+        (self._reference if is_reference else self._interest).value = frame
+
+    def update(self, utime: int, now: float, state: object) -> bool:
+        """Ask again where the question or its time changed; return whether the shown answer changed.
+
+        `utime` is 0 for the latest; `state` differs where the answer to the same question may.
+        """
+        if self._running is not None:
+            if not self._running.done():
+                return False
+            text, code, self.path = self._running.result()
+            self._running = None
+            self._answer.content, self._code.content = text, code
+            return True
+        question = (self._interest.value, self._reference.value, utime, state)
+        if question == self._asked or now - self._asked_at < QUERY_PERIOD_S or not self._interest.value:
+            return False
+        self._asked, self._asked_at = question, now
+        self._running = self._executor.submit(self._ask, self._interest.value, self._reference.value, utime)
+        return False
+
+    def _ask(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
+        """Return the answer, the code that asks for it, and the frames of the path."""
+        answers = self._source.answers
+        code = format_code(interest, reference, utime, None)
+        try:
+            explanation = answers.explain(interest, reference, at=utime, policy=Policy.INTERPOLATED)
+        except (ModelServerError, OSError) as error:
+            near = f" Nearest: {', '.join(error.nearest)}" if isinstance(error, QueryError) and error.nearest else ""
+            return f"**No answer:** {escape_markdown(str(error))}.{escape_markdown(near)}", code, ()
+        motion = None
+        try:
+            if self._source.set_joints is None:
+                motion = answers.get_motion(interest, reference, at=utime)
+        except (ModelServerError, OSError):
+            # not every pair at every time has one; the pose has its own reasons
+            pass
+        frames = [reference]
+        for edge in explanation.edges:
+            frames += edge.ends if edge.forward else edge.ends[::-1]
+        text = describe_answer(explanation, motion)
+        return text, format_code(interest, reference, utime, explanation.answer), (*frames, interest)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+def describe_answer(explanation: Explanation, motion: MotionAnswer | None) -> str:
+    """Format an answer as Markdown tables."""
+    answer = explanation.answer
+    found = answer.transformation
+    sigmas: list[float | None] = [None] * 6
+    if found.covariance is not None:
+        sigmas = [math.sqrt(max(found.covariance[n, n], 0.0)) for n in range(6)]
+    angles = [math.degrees(each) + 0.0 for each in found.rpy]
+    rows = [
+        (name, f"{value + 0.0:.4f} m", _format_sigma(sigma, 1.0, "m"))
+        for name, value, sigma in zip("xyz", found.pose.xyz, sigmas[:3], strict=True)
+    ]
+    rows += [
+        (name, f"{value:.3f} deg", _format_sigma(sigma, math.degrees(1.0), "deg"))
+        for name, value, sigma in zip(("roll", "pitch", "yaw"), angles, sigmas[3:], strict=True)
+    ]
+    parts = [format_table(("", "value", "sigma"), rows)]
+    if answer.geodetic is not None:
+        place = answer.geodetic
+        heading = "" if math.isnan(place.heading_deg) else f", heading {place.heading_deg:.2f} deg"
+        parts.append(f"{place.latitude_deg:.8f}, {place.longitude_deg:.8f} deg, height {place.height:.2f} m{heading}")
+    if math.isfinite(answer.horizontal_protection_level):
+        degrees = math.degrees(answer.heading_protection_level)
+        parts.append(f"Protection level {answer.horizontal_protection_level:.2f} m, heading {degrees:.2f} deg")
+    if not found.is_valid:
+        parts.append(f"**Not valid:** {escape_markdown(Invalid(found.invalid_reasons).explain())}")
+    flags = [flag.name or "" for flag in Quality if flag in answer.quality]
+    if flags:
+        parts.append(f"Flags: {escape_markdown(', '.join(flags))}")
+    if motion is not None:
+        vectors = (("velocity", motion.velocity, 1.0, "m/s"), ("turn rate", motion.angular_velocity, 57.29578, "deg/s"))
+        moving = [
+            (name, *(f"{scale * value + 0.0:.3f}" for value in values), unit) for name, values, scale, unit in vectors
+        ]
+        parts.append(format_table(("motion", "x", "y", "z", ""), moving))
+    edges = [
+        (each.name, each.kind, _format_share(each.position_share), _format_share(each.rotation_share))
+        for each in explanation.edges
+    ]
+    if edges:
+        parts.append(format_table(("path", "kind", "position", "rotation"), edges))
+        parts.append("Shares are of the variance.")
+    return "\n\n".join(parts)
+
+
+def _format_sigma(sigma: float | None, scale: float, unit: str) -> str:
+    return "unknown" if sigma is None else f"{scale * sigma:.4f} {unit}"
+
+
+def _format_share(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100.0 * share:.1f} %"
+
+
+def format_code(interest: str, reference: str, utime: int, answer: PoseAnswer | None) -> str:
+    """Return the question in Python and for the command line, and the answer in YAML, as code blocks."""
+    at = f", at={utime}" if utime else ""
+    blocks = [
+        ("python", f'platform.get_pose("{interest}", "{reference}"{at})'),
+        ("shell", f"modelserver query '{interest}' '{reference}'" + (f" --at {utime}" if utime else "")),
+    ]
+    if answer is not None:
+        found = answer.transformation
+        xyz, rpy = (
+            ", ".join(f"{value + 0.0:.6g}" for value in each) for each in (found.pose.xyz, map(math.degrees, found.rpy))
+        )
+        blocks.append(("yaml", f"xyz: [{xyz}]\nrpy_deg: [{rpy}]"))
+    return "\n\n".join(f"```{language}\n{text}\n```" for language, text in blocks)
+
+
+class TimePanel:
+    """The time that is shown: a slider over the drive, playback, and jumps to events.
+
+    `utime` is 0 while the newest picture of a live drive is followed.
+    """
+
+    def __init__(self, gui: viser.GuiApi, is_live: bool, actions: queue.SimpleQueue[Callable[[], None]]):
+        self._begin = 0
+        self._end = 0
+        self._at = 0.0
+        self._shown_at = math.nan
+        self.is_playing = False
+        self.is_following = is_live
+        self._drive: Drive | None = None
+        self._clock = gui.add_markdown("")
+        self._slider: Any = gui.add_slider("Time (s)", 0.0, 1.0, 0.05, 0.0)
+        # a value that this program sets has no client
+        self._slider.on_update(
+            lambda event: actions.put(lambda: self.jump(event.target.value)) if event.client_id is not None else None
+        )
+        self._play = gui.add_button("Play")
+        self._play.on_click(lambda _: actions.put(self.toggle))
+        self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
+        self._follow: Any = gui.add_checkbox("Live", is_live, visible=is_live)
+        self._follow.on_update(
+            lambda event: (
+                actions.put(lambda: self._set_following(event.target.value)) if event.client_id is not None else None
+            )
+        )
+        with gui.add_folder("Events"):
+            self._kind = gui.add_dropdown("Kind", (ALL, *EventKind))
+            previous, following = gui.add_button("Previous"), gui.add_button("Next")
+            previous.on_click(lambda _: actions.put(lambda: self._jump_to_event(-1)))
+            following.on_click(lambda _: actions.put(lambda: self._jump_to_event(1)))
+            self._events = gui.add_markdown("")
+
+    @property
+    def utime(self) -> int:
+        """The shown time, 0 for the newest."""
+        return 0 if self.is_following else self._begin + round(self._at * 1e6)
+
+    def jump(self, seconds: float) -> None:
+        """Show the time so many seconds after the begin of the drive."""
+        self._at = min(max(seconds, 0.0), (self._end - self._begin) * 1e-6)
+        self._set_following(False)
+
+    def toggle(self) -> None:
+        """Play or pause; playing from the end begins again."""
+        self.is_playing = not self.is_playing
+        if self.is_playing and self._at >= (self._end - self._begin) * 1e-6 - 0.05:
+            self.jump(0.0)
+        self._play.label = "Pause" if self.is_playing else "Play"
+
+    def _set_following(self, is_following: bool) -> None:
+        self.is_following = is_following
+        if self._follow.value != is_following:
+            self._follow.value = is_following
+
+    def _list_events(self) -> list[DriveEvent]:
+        wanted = self._kind.value
+        events = sorted(self._drive.events if self._drive else [], key=lambda each: each.utime)
+        return [each for each in events if wanted in (ALL, each.kind)]
+
+    def _jump_to_event(self, direction: int) -> None:
+        here = self._begin + round(self._at * 1e6)
+        times = [each.utime for each in self._list_events()]
+        later = [each for each in times if (each - here) * direction > 1_000]
+        if later:
+            self.is_playing = False
+            self._play.label = "Play"
+            self.jump((min(later, key=lambda each: abs(each - here)) - self._begin) * 1e-6)
+
+    def advance(self, drive: Drive, seconds: float) -> None:
+        """Continue playback after `seconds` of wall time, over a drive that may have become longer."""
+        self._drive = drive
+        begin, end = drive.begin, drive.end
+        if self._begin and begin != self._begin:
+            self._at += (self._begin - begin) * 1e-6
+        self._begin, self._end = begin, end
+        length = max((end - begin) * 1e-6, 0.1)
+        if self.is_following:
+            self._at = length
+        elif self.is_playing:
+            self._at = min(self._at + seconds * float(self._speed.value.rstrip("x")), length)
+            if self._at >= length:
+                self.toggle()
+
+    def show(self) -> None:
+        """Update slider, clock and events."""
+        length = max((self._end - self._begin) * 1e-6, 0.1)
+        if abs(self._slider.max - length) > 0.5:
+            self._slider.max = math.ceil(length * 20.0) / 20.0
+        if self._at != self._shown_at:
+            self._shown_at = self._at
+            self._slider.value = round(min(self._at, self._slider.max) * 20.0) / 20.0
+        here = self._begin + round(self._at * 1e6)
+        when = datetime.fromtimestamp(here * 1e-6, UTC).isoformat(sep=" ", timespec="milliseconds") if here else ""
+        clock = f"**{self._at:.2f} s** of {length:.1f} s  \n{when}" if here else "no pose and no joints yet"
+        self._set(self._clock, clock)
+        events = self._list_events()
+        before = [each for each in events if each.utime <= here][-SHOWN_EVENTS:]
+        after = [each for each in events if each.utime > here][:2]
+        rows = [self._describe(each) for each in (*before, *after)]
+        self._set(self._events, format_table(("s", "event", ""), rows) if rows else "none")
+
+    def _describe(self, event: DriveEvent) -> tuple[str, str, str]:
+        repeated = f" ({event.count}x)" if event.count > 1 else ""
+        return (f"{(event.utime - self._begin) * 1e-6:.2f}", event.kind, event.text + repeated)
+
+    @staticmethod
+    def _set(handle: viser.GuiMarkdownHandle, text: str) -> None:
+        if handle.content != text:
+            handle.content = text
+
+
+class StatePanel:
+    """Validity in words, sensors with ages and rates, drivers, findings, and the states of the filter."""
+
+    def __init__(self, gui: viser.GuiApi):
+        self._validity = gui.add_markdown("no report yet")
+        with gui.add_folder("Sensors and channels"):
+            self._channels = gui.add_markdown("")
+        with gui.add_folder("Findings"):
+            self._findings = gui.add_markdown("")
+        with gui.add_folder("Filter", expand_by_default=False):
+            self._states = gui.add_markdown("")
+
+    def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
+        """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
+        health = drive.get_health(utime)
+        state = "**invalid:** " + escape_markdown(picture.invalid.explain()) if picture.invalid else "**valid**"
+        text = "no pose" if picture.pose is None else f"The pose is {state}"
+        if health is not None:
+            rows = [(line[:9].strip(), line[9:].strip()) for line in format_body(health).splitlines()]
+            text += f"\n\n{format_table(('', ''), rows)}"
+        self._validity.content = text
+        self._channels.content = _format_channels(drive, health, now)
+        findings = [(subject, text) for subject, text in health.warnings] if health is not None else []
+        rejected = [(what, f"{reason}: {count}") for what, reason, count in health.rejected] if health else []
+        parts = [format_table(("", "finding"), findings) if findings else "no finding"]
+        if rejected:
+            parts.append(format_table(("rejected", "reason"), rejected))
+        self._findings.content = "\n\n".join(parts)
+        navigation = drive.get_navigation_state(utime)
+        self._states.content = "no state published" if navigation is None else _format_states(navigation)
+
+
+def _format_channels(drive: Drive, health: Health | None, now: int) -> str:
+    rows = [
+        (
+            name,
+            "-" if math.isnan(each.rate) else f"{each.rate:.1f}",
+            format_duration(max(now - each.last, 0) * 1e-6) if now else "-",
+            str(each.count),
+        )
+        for name, each in sorted(drive.channels.items())
+        if not name.startswith("REPLY_")
+    ]
+    sensors = [
+        (each.channel.removeprefix("sensor:"), f"{each.rate_hz:.1f} Hz", f"{each.used} of {each.measured} used")
+        for each in (health.channels if health is not None else ())
+        if each.channel.startswith("sensor:")
+    ]
+    parts = [format_table(("sensor", "rate", "measurements"), sensors)] if sensors else []
+    parts.append(format_table(("channel", "Hz", "age", "count"), rows) if rows else "no message")
+    drivers = [(each.source, each.phase.name.lower(), f"{each.rate_hz:.1f} Hz") for each in drive.drivers.values()]
+    if drivers:
+        parts.append(format_table(("driver", "phase", "rate"), sorted(drivers)))
+    return "\n\n".join(parts)
+
+
+def _format_states(navigation: Any) -> str:
+    """Format the states of the filter with their standard deviations."""
+    count = len(navigation.names)
+    has_covariance = len(navigation.covariance) == count * count
+    rows = []
+    for n, (name, value) in enumerate(zip(navigation.names, navigation.values, strict=True)):
+        sigma = f"{math.sqrt(max(navigation.covariance[n * (count + 1)], 0.0)):.3g}" if has_covariance else "-"
+        rows.append((name, f"{value:.4g}", sigma))
+    return format_table(("state", "value", "sigma"), rows[:SHOWN_STATES]) if rows else "no state"
+
+
+class DisplayPanel:
+    """What the scene shows."""
+
+    def __init__(self, gui: viser.GuiApi):
+        self._labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
+        self._follow = gui.add_checkbox("Follow the vehicle", True)
+        self._uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid of the position; protection levels")
+        confidences = tuple(f"{each} %" for each in CHI_SQUARE_3)
+        self._confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
+        self._trail = gui.add_dropdown("Trail", ("10 s", "60 s", "10 min", "all"), initial_value="10 min")
+
+    @property
+    def labels(self) -> NameLabels:
+        """The names that are shown."""
+        return NameLabels(self._labels.value)
+
+    @property
+    def follow(self) -> bool:
+        """Whether the camera follows the vehicle."""
+        return self._follow.value
+
+    @property
+    def uncertainty(self) -> bool:
+        """Whether ellipsoid and protection levels are shown."""
+        return self._uncertainty.value
+
+    @property
+    def confidence(self) -> int:
+        """The confidence of the ellipsoid in percent."""
+        return int(self._confidence.value.split()[0])
+
+    @property
+    def trail_s(self) -> float:
+        """The length of the trail in seconds."""
+        return {"10 s": 10.0, "60 s": 60.0, "10 min": 600.0}.get(self._trail.value, math.inf)
+
+
+class JointsPanel:
+    """A slider for each coordinate of a geometry file, degrees and meters, within its limits."""
+
+    def __init__(self, gui: viser.GuiApi, source: Source, actions: queue.SimpleQueue[Callable[[], None]]):
+        self._gui = gui
+        self._source = source
+        self._actions = actions
+        self._sliders: dict[str, tuple[Any, float]] = {}
+        self._defaults: dict[str, float] = {}
+        self._folder = gui.add_folder("Positions")
+
+    def set_model(self, model: Model) -> None:
+        """Offer the coordinates of a model; those that were moved stay where they are."""
+        moved = {
+            name: slider.value
+            for name, (slider, _) in self._sliders.items()
+            if not math.isclose(slider.value, self._defaults[name], abs_tol=1e-6)
+        }
+        for slider, _ in self._sliders.values():
+            slider.remove()
+        self._sliders, self._defaults = {}, {}
+        with self._folder:
+            for name, joint, number in list_coordinates(model):
+                self._add_slider(name, joint, number, moved.get(name))
+        if moved.keys() & self._sliders.keys():
+            self._apply()
+
+    def _add_slider(self, name: str, joint: Joint, number: int, moved: float | None) -> None:
+        is_angle = joint.angle_flags[number]
+        scale = math.degrees(1.0) if is_angle else 1.0
+        free = math.pi if is_angle else 1.0
+        low = max(joint.lower[number], -free) if joint.lower else -free
+        high = min(joint.upper[number], free) if joint.upper else free
+        lower, upper = low * scale, max(high, low + 1e-6) * scale
+        self._defaults[name] = default = min(max(joint.default_position[number] * scale, lower), upper)
+        value = default if moved is None else min(max(moved, lower), upper)
+        unit, step = ("deg", 0.1) if is_angle else ("m", 0.001)
+        slider = self._gui.add_slider(f"{name} ({unit})", lower, upper, step, value)
+        slider.on_update(lambda event: self._actions.put(self._apply) if event.client_id is not None else None)
+        self._sliders[name] = (slider, scale)
+
+    def _apply(self) -> None:
+        assert self._source.set_joints is not None
+        self._source.set_joints({name: slider.value / scale for name, (slider, scale) in self._sliders.items()})

@@ -1,0 +1,513 @@
+"""The 3D scene: the vehicle's geometry under a node that moves in World:UTM, with trail, fixes and uncertainty.
+
+Scene nodes, of which `/world` alone moves with the follow camera (the vehicle then stays at the scene's origin):
+
+    /world                      World:UTM
+    /world/vehicle              the base frame
+    /world/vehicle/body/NUMBER  a body: its shapes, the axes and the names of its frames
+    /world/vehicle/edges        constraints, a segment each
+
+Bodies that no constraints join to the base frame are drawn beside the vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+import viser
+
+from modelserver.earth.geodesy import GeodesyError, geodesy_of
+from modelserver.earth.origin import Origin
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Body
+from modelserver.geometry.shape import Shape, ShapeKind
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Vector3
+from mstools.view.drive import FIX_COLORS, FixColor, Picture
+from mstools.view.frames import FramePoses
+
+MAX_MESH_BYTES: Final = 50_000_000
+MAX_TRAIL_POINTS: Final = 4_000
+TRAIL_PERIOD_US: Final = 5_000_000
+MAX_FIXES: Final = 10_000
+MIN_EXTENT: Final = 0.04
+"""Least edge of the box of a body without shapes, meters."""
+
+MIN_WEDGE: Final = 2.0
+"""Least length of the lines of the heading's protection level, meters."""
+
+Rgb = tuple[int, int, int]
+BODY_COLOR: Final[Rgb] = (108, 140, 175)
+FIXED_COLOR: Final[Rgb] = (150, 150, 150)
+MOVABLE_COLOR: Final[Rgb] = (240, 150, 40)
+PATH_COLOR: Final[Rgb] = (230, 60, 160)
+TRAIL_COLOR: Final[Rgb] = (70, 150, 250)
+VALID_COLOR: Final[Rgb] = (60, 180, 90)
+INVALID_COLOR: Final[Rgb] = (225, 70, 60)
+COLOR_OF_FIX: Final[Mapping[FixColor, Rgb]] = {
+    FixColor.USED: (60, 180, 90),
+    FixColor.REJECTED: (225, 70, 60),
+    FixColor.MONITORED: (240, 190, 60),
+    FixColor.NO_DECISION: (150, 150, 150),
+}
+_PALETTE: Final = np.array([COLOR_OF_FIX[each] for each in FIX_COLORS], np.uint8)
+
+CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
+"""Quantiles of chi-square with three degrees of freedom by confidence in percent (NIST e-Handbook, 1.3.6.7.4)."""
+
+GRID_LABELS: Final = 1
+"""Labeled grid crossings on each side of the vehicle, at `LABEL_SPACING`."""
+
+GIZMO_SCALE: Final = 0.2
+"""Length of the gizmo's arrows, as a part of the size of the model."""
+
+LABEL_SPACING: Final = 20.0
+"""Meters."""
+
+
+class NameLabels(StrEnum):
+    """Which names stand in the scene."""
+
+    NONE = "none"
+    BODIES = "bodies"
+    FRAMES = "frames"
+
+
+class ConstraintLine(NamedTuple):
+    """A constraint as a line between two points, each in the coordinates of its body."""
+
+    bodies: tuple[str, str]
+    points: tuple[Vector3, Vector3]
+    is_movable: bool
+
+
+class VehicleScene:
+    """Draw one model and its pictures.
+
+    Parameters
+    ----------
+    folder : of the geometry file, in which mesh files are looked up; None reads none
+    pick : called with the full name of a frame that was clicked, and whether Shift was held
+    """
+
+    def __init__(self, server: viser.ViserServer, folder: Path | None, pick: Callable[[str, bool], None]):
+        self._scene = server.scene
+        self._folder = folder
+        self._pick = pick
+        self._bodies: dict[str, viser.SceneNodeHandle] = {}
+        self._frames: FramePoses | None = None
+        self._poses: dict[str, Pose] = {}
+        self._segments: list[ConstraintLine] = []
+        self._labels: list[tuple[NameLabels, viser.LabelHandle]] = []
+        self._model: Model | None = None
+        self._positions: Mapping[str, float] = {}
+        self._path: tuple[str, ...] = ()
+        self._drawn: dict[str, object] = {}
+        self._size = 1.0
+        self.unread: list[str] = []
+        """Mesh files that could not be read, with the reason."""
+        self.follow = True
+        self.is_edited = False
+        """Whether it has a gizmo: bodies are not clicked then, frames are."""
+        self._world = self._scene.add_frame("/world", show_axes=False)
+        self._vehicle = self._scene.add_frame("/world/vehicle", show_axes=False)
+        self._scene.add_grid(
+            "/world/grid",
+            infinite_grid=True,
+            cell_size=1.0,
+            section_size=10.0,
+            cell_color=(205, 205, 205),
+            section_color=(160, 160, 160),
+            fade_distance=150.0,
+            shadow_opacity=0.0,
+        )
+        self._trail = self._add_lines("/world/trail", TRAIL_COLOR, 3.0)
+        self._trail_end = self._add_lines("/world/trail_end", TRAIL_COLOR, 3.0)
+        self._trail_span = (0, 0)
+        # placed by their positions: a browser moves nodes at once, but draws other lines some pictures later
+        self._level = self._scene.add_frame("/world/protection_level", show_axes=False, visible=False)
+        self._circle = self._add_lines("/world/protection_level/position", VALID_COLOR, 2.0)
+        self._circle.points = _make_circle()
+        self._wedge = [self._add_lines(f"/world/protection_level/heading/{n}", VALID_COLOR, 2.0) for n in range(2)]
+        for side in self._wedge:
+            side.points = np.array([[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]], np.float32)
+        self._edges = (
+            self._add_lines("/world/vehicle/edges/fixed", FIXED_COLOR, 2.5),
+            self._add_lines("/world/vehicle/edges/movable", MOVABLE_COLOR, 3.5),
+        )
+        self._path_lines = self._add_lines("/world/vehicle/path", PATH_COLOR, 5.0)
+        self._fixes = self._scene.add_point_cloud(
+            "/world/fixes",
+            np.zeros((1, 3), np.float32),
+            np.zeros((1, 3), np.uint8),
+            visible=False,
+            point_size=0.08,
+            point_shape="circle",
+            precision="float32",
+        )
+        self._gizmo: Any = None
+        self._ellipsoid = self._scene.add_icosphere("/world/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False)
+
+    def _add_lines(self, name: str, color: Rgb, width: float) -> Any:
+        """Add a node of line segments, none at first, `width` pixels wide."""
+        return self._scene.add_line_segments(
+            name, np.zeros((0, 2, 3), np.float32), color, thickness=width, thickness_units="screen"
+        )
+
+    # --- geometry
+
+    @property
+    def model(self) -> Model | None:
+        """The model that is drawn."""
+        return self._model
+
+    def set_model(self, model: Model, base_frame: str, labels: NameLabels) -> float:
+        """Draw another model, and return its size in meters; `base_frame` is the frame whose pose is published."""
+        for each in self._bodies.values():
+            each.remove()
+        # went with its body
+        self._gizmo = None
+        self._bodies, self._poses, self._labels, self._segments, self.unread = {}, {}, [], [], []
+        self._model, self._positions = model, {}
+        self._frames = FramePoses(model, base_frame)
+        size = self._size = _measure_model(model)
+        orphans = 0
+        for number, body in enumerate(model.bodies):
+            root = f"/world/vehicle/body/{number}"
+            node = self._scene.add_frame(root, show_axes=False)
+            self._bodies[body.name] = node
+            if body.name not in self._frames.paths:
+                # not joined to the base: beside the vehicle
+                orphans += 1
+                self._poses[body.name] = Pose((0.0, -size - orphans * 0.5, 0.0))
+                node.position = self._poses[body.name].xyz
+            self._draw_body(root, body, size, labels)
+        for constraint in model.constraints:
+            ends = [names.split(each) for each in (constraint.from_, constraint.to)]
+            points = [model.frame(each).pose.xyz for each in (constraint.from_, constraint.to)]
+            bodies = (ends[0][0], ends[1][0])
+            self._segments.append(ConstraintLine(bodies, (points[0], points[1]), constraint.joint.is_movable))
+        self._place_bodies(self._frames.compute_bodies({}))
+        return size
+
+    def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
+        shapes = body.visuals or body.collisions
+        for number, shape in enumerate(shapes or (_make_box(body),)):
+            color, opacity = BODY_COLOR, 0.2 if not shapes else 1.0
+            if shape.material is not None and shape.material.color is not None:
+                red, green, blue, opacity = shape.material.color
+                color = (round(255 * red), round(255 * green), round(255 * blue))
+            node = self._draw_shape(f"{root}/shape/{number}", shape, color, opacity)
+            # what can be clicked hides from the pointer what is behind it: frames in a stand-in box, and the gizmo
+            if node is not None and shapes and body.frames and not self.is_edited:
+                self._add_pick(node, lambda _: body.frames[0].full_name)
+        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0), labels)
+        if not body.frames:
+            return
+        axes = self._scene.add_batched_axes(
+            f"{root}/axes",
+            np.array([each.pose.wxyz for each in body.frames], np.float32),
+            np.array([each.pose.xyz for each in body.frames], np.float32),
+            axes_length=0.05 * size,
+            axes_radius=0.0015 * size,
+        )
+        self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
+        for number, frame in enumerate(body.frames):
+            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz, labels)
+
+    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3, shown: NameLabels) -> None:
+        label = self._scene.add_label(
+            node, text, position=place, visible=kind == shown, font_screen_scale=0.8, anchor="bottom-center"
+        )
+        self._labels.append((kind, label))
+
+    def _add_pick(self, node: Any, find_frame: Callable[[Any], str]) -> None:
+        """Make a node clickable."""
+        node.on_click(lambda event: self._pick(find_frame(event), False))
+        node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
+
+    def _draw_shape(self, name: str, shape: Shape, color: Rgb, opacity: float) -> Any:
+        scene, place = self._scene, shape.pose
+        transparency = opacity if opacity < 1.0 else None
+        look: dict[str, Any] = {
+            "color": color,
+            "opacity": transparency,
+            "wxyz": place.wxyz,
+            "position": place.xyz,
+        }
+        if shape.kind is ShapeKind.BOX:
+            return scene.add_box(name, dimensions=np.array(shape.size), **look)
+        if shape.kind is ShapeKind.CYLINDER:
+            return scene.add_cylinder(name, shape.size[0], shape.size[1], **look)
+        if shape.kind is ShapeKind.SPHERE:
+            return scene.add_icosphere(name, shape.size[0], **look)
+        try:
+            mesh = read_mesh(shape.file, self._folder)
+        except (OSError, ValueError) as error:
+            self.unread.append(f"{shape.file}: {error}")
+            return None
+        vertices = np.asarray(mesh.vertices, np.float32) * np.array(shape.size, np.float32)
+        return scene.add_mesh_simple(name, vertices, np.asarray(mesh.faces, np.uint32), side="double", **look)
+
+    def show_labels(self, shown: NameLabels) -> None:
+        """Show the names of bodies or frames."""
+        for kind, label in self._labels:
+            label.visible = kind == shown
+
+    # --- pictures
+
+    def show(self, picture: Picture) -> None:
+        """Move the vehicle and its joints to those of a picture."""
+        self._move_joints(picture.joints)
+        pose = picture.pose or Pose.identity()
+        if self._is_changed("pose", (pose, self.follow)):
+            self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
+            x, y, z = pose.xyz if self.follow else (0.0, 0.0, 0.0)
+            self._world.position = (-x, -y, -z)
+
+    def _is_changed(self, what: str, value: object) -> bool:
+        """Return whether a value differs from the last one of that name, and store it."""
+        if what in self._drawn and self._drawn[what] == value:
+            return False
+        self._drawn[what] = value
+        return True
+
+    def _move_joints(self, positions: Mapping[str, float]) -> None:
+        if self._frames is None or positions == self._positions:
+            return
+        moved = {name for name, value in positions.items() if self._positions.get(name) != value}
+        moved |= self._positions.keys() - positions.keys()
+        self._positions = dict(positions)
+        poses = self._frames.compute_bodies(positions, moved)
+        if poses:
+            self._place_bodies(poses)
+
+    def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
+        """Move bodies to their poses in the base frame, and redraw what depends on them."""
+        for name, pose in poses.items():
+            node = self._bodies[name]
+            node.position, node.wxyz = pose.xyz, pose.wxyz
+        self._poses.update(poses)
+        for is_movable, lines in enumerate(self._edges):
+            points = [
+                [self._poses[body].transform(point) for body, point in zip(each.bodies, each.points, strict=True)]
+                for each in self._segments
+                if each.is_movable == bool(is_movable)
+            ]
+            lines.points = np.array(points, np.float32).reshape(-1, 2, 3)
+        self._draw_path()
+
+    def get_frame_pose(self, frame: str) -> Pose | None:
+        """Return the pose of a frame in the base frame as drawn; None for an unknown or world frame."""
+        body, _, name = frame.partition(":")
+        if body not in self._poses or self._model is None or not self._model.body(body).has_frame(name):
+            return None
+        return self._poses[body] @ self._model.frame(frame).pose
+
+    def highlight_path(self, frames: Sequence[str]) -> None:
+        """Highlight the path through some frames, none to remove it."""
+        self._path = tuple(frames)
+        self._draw_path()
+
+    def _draw_path(self) -> None:
+        points = [pose.xyz for frame in self._path if (pose := self.get_frame_pose(frame)) is not None]
+        lines = [pair for pair in pairwise(points) if pair[0] != pair[1]]
+        if self._is_changed("path", lines):
+            self._path_lines.points = np.array(lines, np.float32).reshape(-1, 2, 3)
+
+    def show_gizmo(self, body: str, parent: Pose, pose: Pose, move: Callable[[Pose, bool], None]) -> None:
+        """Show a gizmo at a pose in the frame `parent` of a body.
+
+        `move` is called with the pose to which it is dragged, and whether that is the end of the drag.
+        """
+        self.hide_gizmo()
+        node = self._bodies.get(body)
+        if node is None:
+            return
+        self._gizmo = self._scene.add_frame(
+            f"{node.name}/edited", show_axes=False, position=parent.xyz, wxyz=parent.wxyz
+        )
+        controls = self._scene.add_transform_controls(
+            f"{node.name}/edited/gizmo",
+            scale=GIZMO_SCALE * self._size,
+            depth_test=False,
+            position=pose.xyz,
+            wxyz=pose.wxyz,
+        )
+
+        async def follow(event: viser.TransformControlsEvent) -> None:
+            # async: the order of the phases is kept
+            place = Pose(event.target.position.tolist(), event.target.wxyz.tolist())
+            if event.phase != "start":
+                move(place, event.phase == "end")
+
+        controls.on_update(follow)
+
+    def hide_gizmo(self) -> None:
+        """Remove the gizmo."""
+        if self._gizmo is not None:
+            self._gizmo.remove()
+            self._gizmo = None
+
+    def show_trail(self, utimes: npt.NDArray[np.int64], points: Array) -> None:
+        """Draw the trail through points (n, 3) in World:UTM at times (n,), microseconds.
+
+        Only its last seconds are sent again with each picture, the rest when it is `TRAIL_PERIOD_US` old.
+        """
+        if not len(points):
+            self._trail_span = (0, 0)
+            for lines in (self._trail, self._trail_end):
+                lines.visible = False
+            return
+        span = (int(utimes[0]), int(utimes[-1]))
+        begin, end = self._trail_span
+        if not (0 <= span[1] - end < TRAIL_PERIOD_US and abs(span[0] - begin) < 2 * TRAIL_PERIOD_US):
+            self._trail_span = begin, end = span
+            step = max(1, -(-len(points) // MAX_TRAIL_POINTS))
+            self._draw_line(self._trail, points[::-1][::step][::-1])
+        self._draw_line(self._trail_end, points[utimes >= end])
+
+    @staticmethod
+    def _draw_line(lines: Any, points: Array) -> None:
+        lines.visible = len(points) > 1
+        if lines.visible:
+            lines.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+
+    def show_fixes(self, points: Array, colors: npt.NDArray[np.int64]) -> None:
+        """Draw fixes at points (n, 3) in World:UTM, by their index into `FIX_COLORS` (n,)."""
+        key = (len(points), tuple(points[-1]), tuple(colors[-20:])) if len(points) else ()
+        if self._is_changed("fixes", key) and len(points):
+            self._fixes.visible = True
+            self._fixes.points = points[-MAX_FIXES:].astype(np.float32)
+            self._fixes.colors = _PALETTE[colors[-MAX_FIXES:]].reshape(-1, 3)
+
+    def show_uncertainty(self, picture: Picture, confidence: int, is_shown: bool) -> None:
+        """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
+        key = (picture, confidence, is_shown)
+        if self._drawn.get("uncertainty") == key[1:] and self._drawn.get("uncertain picture") is picture:
+            return
+        self._drawn["uncertainty"], self._drawn["uncertain picture"] = key[1:], picture
+        color = INVALID_COLOR if picture.invalid else VALID_COLOR
+        has_ellipsoid = is_shown and picture.covariance is not None and picture.pose is not None
+        self._ellipsoid.visible = has_ellipsoid
+        if has_ellipsoid:
+            assert picture.pose is not None
+            assert picture.covariance is not None
+            radii, pose = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
+            self._ellipsoid.position, self._ellipsoid.wxyz = picture.pose.xyz, pose.wxyz
+            self._ellipsoid.scale = radii
+            self._ellipsoid.color = color
+        self._show_levels(picture, color, is_shown)
+
+    def _show_levels(self, picture: Picture, color: Rgb, is_shown: bool) -> None:
+        """Draw the horizontal protection level, a circle, and that of the heading, a wedge."""
+        radius, heading = picture.horizontal_protection_level, picture.heading_protection_level
+        self._level.visible = is_shown and picture.pose is not None and math.isfinite(radius)
+        if not self._level.visible or picture.pose is None:
+            return
+        self._level.position = picture.pose.xyz
+        is_known = math.isfinite(heading)
+        if self._is_changed("levels", (round(radius, 2), is_known, color)):
+            self._circle.scale = radius
+            for lines in (self._circle, *self._wedge):
+                lines.colors = np.array(color, np.uint8)
+            for side in self._wedge:
+                side.visible = is_known
+                side.scale = max(radius, MIN_WEDGE)
+        for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
+            if is_known:
+                yaw = float(picture.pose.rpy[2]) + sign * min(heading, math.pi)
+                side.wxyz = Pose.from_rpy((0.0, 0.0, 0.0), yaw=yaw).wxyz
+
+    def label_grid(self, picture: Picture, origin: Origin | None) -> None:
+        """Label the grid around the vehicle with UTM coordinates, latitude and longitude."""
+        if picture.pose is None or origin is None:
+            return
+        east, north = (round(each / LABEL_SPACING) for each in picture.pose.xyz[:2])
+        if not self._is_changed("labels", (east, north, origin)):
+            return
+        geodesy = geodesy_of(origin)
+        for i in range(-GRID_LABELS, GRID_LABELS + 1):
+            for k in range(-GRID_LABELS, GRID_LABELS + 1):
+                x, y = (east + i) * LABEL_SPACING, (north + k) * LABEL_SPACING
+                easting, northing = origin.initial_utm[0] + x, origin.initial_utm[1] + y
+                try:
+                    latitude, longitude, _ = geodesy.geodetic_from_utm(easting, northing, 0.0)
+                except GeodesyError:
+                    continue
+                text = f"{easting:.0f} E {northing:.0f} N\n{latitude:.6f}, {longitude:.6f}"
+                self._scene.add_label(f"/world/grid/{i} {k}", text, position=(x, y, 0.0), font_screen_scale=0.6)
+
+
+def _measure_model(model: Model) -> float:
+    """Return the size of a model in meters: the largest extent of a body's frames, at least 0.5."""
+    extents = [float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies]
+    return max([0.5, *extents])
+
+
+def _list_corners(body: Body) -> Array:
+    return np.array([(0.0, 0.0, 0.0), *(frame.pose.xyz for frame in body.frames)])
+
+
+def _make_box(body: Body) -> Shape:
+    """Return a box around the frames of a body that has no shapes."""
+    corners = _list_corners(body)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()
+    return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
+
+
+def read_mesh(file: str, folder: Path | None) -> trimesh.Trimesh:
+    """Read a mesh file. Raises OSError, ValueError with the reason.
+
+    `file` is a path or a package URL, looked up from `folder`, and for a package also from the folders above it.
+    """
+    if folder is None:
+        raise ValueError("meshes are read with a geometry file, not from the bus")
+    relative = file.removeprefix("file://").removeprefix("package://")
+    places = [folder / relative]
+    if file.startswith("package://"):
+        inside = relative.partition("/")[2]
+        places += [parent / name for parent in (folder, *folder.parents[:3]) for name in (relative, inside)]
+    path = next((each for each in places if each.is_file()), None)
+    if path is None:
+        raise ValueError("not found")
+    if path.stat().st_size > MAX_MESH_BYTES:
+        raise ValueError(f"larger than {MAX_MESH_BYTES // 1_000_000} MB")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:
+        raise ValueError(f"cannot be read: {error or type(error).__name__}") from None
+    if not len(mesh.faces):
+        raise ValueError("has no triangles")
+    return mesh
+
+
+def compute_ellipsoid(covariance: Array, quantile: float) -> tuple[Vector3, Pose]:
+    """Return the semi-axes in meters and the orientation of the ellipsoid (p - m)' inv(P) (p - m) = quantile.
+
+    `covariance` is P (3, 3), m2. By the eigenvalues of P.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    if np.linalg.det(vectors) < 0.0:
+        vectors[:, 0] = -vectors[:, 0]
+    x, y, z = (math.sqrt(max(value, 0.0) * quantile) for value in values.tolist())
+    matrix = np.eye(4)
+    matrix[:3, :3] = vectors
+    return (x, y, z), Pose.from_matrix(matrix)
+
+
+def _make_circle() -> Array:
+    """Return the segments (64, 2, 3) of the unit circle."""
+    angles = np.linspace(0.0, 2.0 * math.pi, 65)
+    points = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1)
+    return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)

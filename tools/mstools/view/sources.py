@@ -1,0 +1,188 @@
+"""What the viewer shows: a geometry file, a log, or a running service; a `Drive` with a client that answers queries."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
+from modelserver.client.remote import Platform
+from modelserver.formats.snapshot import ModelSnapshot
+from modelserver.geometry import names
+from modelserver.geometry.joint import Joint, coordinate_names
+from modelserver.geometry.model import Model
+from modelserver.messages import JointSample, JointsSample, SensorHeader
+from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import LogEvent, LogFile
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.listener import iter_batches
+from mstools.commands.pose_source import load_given_model
+from mstools.edit.session import EditedFile
+from mstools.recordings.log_platform import LogPlatform, scan_log
+from mstools.view.drive import Drive
+
+FILE_UTIME: Final = 10**15
+"""Stamp of the first joint positions of a geometry file; each later one is a second later."""
+
+PROGRESS_EVENTS: Final = 20_000
+
+
+@dataclass
+class Source:
+    """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
+
+    `folder` is that of the geometry file, in which its meshes are. `set_joints` moves the joints of a geometry file,
+    `set_model` shows it as edited.
+    """
+
+    title: str
+    drive: Drive
+    answers: LocalPlatform | Platform
+    folder: Path | None = None
+    is_live: bool = False
+    set_joints: Callable[[Mapping[str, float]], None] | None = None
+    set_model: Callable[[Model], None] | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    _resources: ExitStack = field(default_factory=ExitStack)
+
+    @property
+    def has_time(self) -> bool:
+        """Whether it changes with time: a log or a running service."""
+        return not isinstance(self.answers, FilePlatform)
+
+    def close(self) -> None:
+        """End the threads and leave the bus."""
+        self._resources.close()
+
+
+# --- geometry file
+
+
+class FilePlatform(LocalPlatform):
+    """Queries of a geometry, with the joints where they are set."""
+
+    def __init__(self, model: Model, base_frame: str, where: str):
+        self.where = where
+        self._utime = FILE_UTIME
+        self.set_model(model, base_frame)
+
+    def set_model(self, model: Model, base_frame: str) -> None:
+        """Answer with another geometry, with all joints at their defaults."""
+        snapshot = ModelSnapshot("", model, base_frame, base_frame, HISTORY_S, "JOINTS")
+        self._receiver = MirrorReceiver("", snapshot, True)
+
+    def read_state(self) -> tuple[MirrorState, int]:
+        """Return the state and its time."""
+        return self._receiver.state, self._utime
+
+    def set_joints(self, positions: Mapping[str, float]) -> None:
+        """Set the positions of coordinates, radians and meters."""
+        self._utime += 1_000_000
+        samples = tuple([JointSample(name, position) for name, position in positions.items()])
+        sample = JointsSample(SensorHeader(self._utime, "view", 0, self._utime), samples)
+        self._receiver.feed("JOINTS", encode(sample), self._utime)
+
+
+def list_coordinates(model: Model) -> list[tuple[str, Joint, int]]:
+    """Return name, joint and number of each coordinate that can be set: those of joints that follow no other."""
+    return [
+        (name, each.joint, number)
+        for each in model.joints.values()
+        if each.joint.mimic is None
+        for number, name in enumerate(coordinate_names(each.name, each.joint))
+    ]
+
+
+def open_geometry(path: Path, variables: Mapping[str, str]) -> Source:
+    """Open a geometry file, or that of a vehicle file. Raises GeometryError, ConfigError, OSError."""
+    file = EditedFile.open(path)
+    geometry, base_frame = file.path, file.config.base_frame if file.config is not None else ""
+    model = load_given_model(geometry, variables)
+    drive = Drive(keep_geometry=True)
+    answers = FilePlatform(model, base_frame, f"in {path}")
+    source = Source(f"{model.name or path.name}", drive, answers, geometry.resolve().parent)
+
+    def set_joints(positions: Mapping[str, float]) -> None:
+        answers.set_joints(positions)
+        with source.lock:
+            for name, position in positions.items():
+                drive.set_joint(name, answers.read_state()[1], position)
+
+    def set_model(shown: Model) -> None:
+        frames = [frame.full_name for body in shown.bodies for frame in body]
+        base = base_frame if base_frame in frames else next(iter(frames), "")
+        answers.set_model(shown, base)
+        with source.lock:
+            drive.set_model(shown)
+            drive.base_frame = base
+            drive.joints.clear()
+        set_joints({name: joint.default_position[number] for name, joint, number in list_coordinates(shown)})
+
+    set_model(model)
+    source.set_joints, source.set_model = set_joints, set_model
+    return source
+
+
+# --- log
+
+
+def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callable[[float], None]) -> Source:
+    """Open a log of the service; `model` is a geometry file in place of the log's.
+
+    `show_progress` is called with the part that is read, 0 to 1. Raises RecordingError, GeometryError, OSError.
+    """
+    given = None
+    drive = Drive(prefix)
+    if model is not None:
+        loaded = load_given_model(model, {})
+        base = names.join(loaded.root.name, loaded.root.frames[0].name)
+        given = ModelSnapshot("", loaded, base, base, HISTORY_S, f"{prefix}JOINTS")
+        drive = Drive(prefix, loaded, base, keep_geometry=True)
+    with LogFile(path) as log:
+        contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
+    answers = LogPlatform(path, prefix, given, contents)
+    if not drive.base_frame:
+        drive.base_frame = answers.base_frame
+    return Source(path.name, drive, answers, model.resolve().parent if model is not None else None)
+
+
+def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], None]) -> Iterator[LogEvent]:
+    """Yield the events of a log after feeding them to a drive."""
+    for number, event in enumerate(log):
+        drive.feed(event.channel, event.data, event.utime)
+        if number % PROGRESS_EVENTS == 0:
+            show_progress(event.end / log.size)
+        yield event
+    show_progress(1.0)
+
+
+# --- running service
+
+
+def open_live(url: str, prefix: str, timeout: float) -> Source:
+    """Follow the running service."""
+    drive = Drive(prefix)
+    answers = Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="view")
+    source = Source("live", drive, answers, is_live=True)
+    stop = threading.Event()
+    listener = threading.Thread(target=_listen, args=(source, resolve_url(url), stop), name="view", daemon=True)
+    listener.start()
+    source._resources.callback(answers.close)
+    source._resources.callback(listener.join, 2.0)
+    source._resources.callback(stop.set)
+    return source
+
+
+def _listen(source: Source, url: str, stop: threading.Event) -> None:
+    """Feed the messages of the bus to a drive until the event is set."""
+    for batch in iter_batches(open_lcm(url), source.drive.prefix, stop.is_set):
+        now = time.time_ns() // 1000
+        with source.lock:
+            for channel, data in batch:
+                source.drive.feed(channel, data, now)
