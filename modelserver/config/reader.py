@@ -153,6 +153,9 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
         mark = getattr(error, "problem_mark", None)
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
         line = mark.line + 1 if mark else 0
+        if "nesting depth" in what:
+            # later versions of libyaml have a limit of their own, which its scanner reaches before the event
+            raise _make_depth_error(name, line) from None
         raise make_error(name, line, f"not YAML: {what}", "check indentation and quotes") from None
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
@@ -356,11 +359,15 @@ def _check_shape(raw: bytes, name: str) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > MAX_DEPTH:
-                raise make_error(name, line, "nested too deeply", "look for brackets that are not closed")
+                raise _make_depth_error(name, line)
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         elif isinstance(event, yaml.AliasEvent):
             raise make_error(name, line, f"aliases (*{event.anchor}) are not supported", "write the value again")
+
+
+def _make_depth_error(name: str, line: int) -> ConfigError:
+    return make_error(name, line, "nested too deeply", "look for brackets that are not closed")
 
 
 def make_error(name: str, line: int, message: str, fix: str) -> ConfigError:

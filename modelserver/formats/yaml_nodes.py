@@ -22,6 +22,9 @@ from modelserver.geometry.builder import ModelBuilder
 MAX_DEPTH = 20
 """No geometry file is nested deeper than 8."""
 
+_DEPTH_MESSAGE = f"the file nests deeper than {MAX_DEPTH} levels"
+_DEPTH_FIX = "no geometry needs that; look for brackets that are not closed"
+
 MAX_NODES = 4_000_000
 """Nodes, aliases expanded; 10,000 frames have about 130,000."""
 
@@ -98,6 +101,9 @@ def _explain_syntax(error: yaml.MarkedYAMLError, text: str) -> tuple[str, str, i
     lines = text.split("\n")
     if 0 < number <= len(lines) and re.match(r"[ ]*\t", lines[number - 1]):
         return "the line is indented with a tab, which YAML forbids", "write spaces instead of tabs", number
+    if "nesting depth" in (error.problem or ""):
+        # later versions of libyaml have a limit of their own, which its scanner reaches before the event
+        return _DEPTH_MESSAGE, _DEPTH_FIX, number
     context = f" {error.context}" if error.context else ""
     fix = "look at this line and the one before: a missing colon, bracket or quote, or a wrong indentation"
     return f"the YAML is not well-formed: {error.problem or 'unreadable'}{context}", fix, number
@@ -123,9 +129,7 @@ class _NodeBuilder:
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
                 self.check(event.tag, 1, line)
                 if len(open_nodes) >= MAX_DEPTH:
-                    message = f"the file nests deeper than {MAX_DEPTH} levels"
-                    fix = "no geometry needs that; look for brackets that are not closed"
-                    raise SyntaxProblemError(message, line, fix)
+                    raise SyntaxProblemError(_DEPTH_MESSAGE, line, _DEPTH_FIX)
                 container = YamlNode(NodeKind.MAPPING if kind is yaml.MappingStartEvent else NodeKind.LIST, line)
                 open_nodes.append((container, event.anchor, None))
                 continue

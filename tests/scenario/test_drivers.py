@@ -329,15 +329,19 @@ def test_given_devices_unplugged_for_5_s_then_they_stream_within_2_s_of_their_re
 
 
 def assert_rate(name: str, samples: list[Any]) -> None:
-    """Check that samples come at the device's rate, and by its own time, where it has one, none is left out."""
+    """Check that samples come at the device's rate: by its own time, where it has one, and none is left out.
+
+    Else by the host's: those of the first and second half that a busy machine delayed least are that far apart.
+    """
     period_us = 1_000_000 / RATES_HZ[name]
-    first, last = samples[0].header, samples[-1].header
-    spent = last.host_utime - first.host_utime
-    assert (len(samples) - 1) * period_us == pytest.approx(spent, rel=0.1)
-    if first.device_utime:
+    if samples[0].header.device_utime:
         times = [sample.header.device_utime for sample in samples]
         steps = [after - before for before, after in itertools.pairwise(times)]
         assert steps == pytest.approx([period_us] * len(steps), abs=2)
+        return
+    delays = [sample.header.host_utime - period_us * number for number, sample in enumerate(samples)]
+    half = len(samples) // 2
+    assert abs(min(delays[half:]) - min(delays[:half])) < 0.1 * period_us * len(samples)
 
 
 def test_given_a_stall_and_damage_then_the_driver_reports_and_recovers(bench: Bench) -> None:

@@ -51,7 +51,7 @@ def read_value(page: Page, name: str) -> float:
 
 
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
-    for _ in range(300):
+    for _ in range(600):
         if condition():
             return
         page.wait_for_timeout(100)
@@ -127,7 +127,7 @@ def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow
 
 
 def test_given_the_demo_then_the_laser_nods_in_the_page_while_it_drives() -> None:
-    with run_process([*MODELSERVER, "demo", "--seconds", "90"], "", stdout=subprocess.PIPE) as process:
+    with run_process([*MODELSERVER, "demo", "--seconds", "300"], "", stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         with process.stdout:
             found = next(match for line in process.stdout if (match := re.search(r"--url '?(udpm:[^\s']+)", line)))
