@@ -120,6 +120,19 @@ def test_two_minutes_with_a_small_fault_hold(fault: str, tmp_path: Path, capsys:
     assert "OUT OF BOUNDS" not in output
 
 
+@pytest.mark.slow
+def test_on_a_steady_circle_with_an_unknown_latency_the_bound_covers_the_heading() -> None:
+    fault = integrity.BY_NAME["steady_circle"]
+    # the gyro's scale turns the heading there, which fixes cannot tell from a latency that grows
+    scenario = Scenario(VEHICLES["rover"], 450.0, np.random.default_rng((51, 23, 0, 2)), has_velocity=False)
+    fault.inject(scenario)
+    looks = integrity.observe(scenario)
+    assert looks.valid.mean() > 0.7
+    error, bound = looks.errors["heading"][looks.valid], looks.bounds["heading"][looks.valid]
+    assert np.all(error < bound)
+    assert error.max() < 0.4
+
+
 def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
     scenario = create_scenario("rover", 60.0)
     scenario.events = [(20.0, 30.0)]

@@ -27,6 +27,7 @@ from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.fusion import correct_path, report_event
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
+from modelserver.estimation.filter.latency_estimator import compute_heading_variance
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
@@ -168,7 +169,8 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
 
 def _hold(setup: Setup, state: Aligned) -> ConsistencyMonitor:
     """Return the monitor with the bound of the heading before a correction."""
-    level = protection_levels.compute_heading(float(state.nav.covariance[8, 8]), setup.settings)
+    variance = float(state.nav.covariance[8, 8]) + compute_heading_variance(state.nav, setup.layout)
+    level = protection_levels.compute_heading(variance, setup.settings)
     return state.consistency.hold_heading(level, state.nav.utime)
 
 

@@ -206,7 +206,8 @@ def _fuse_aligned(
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
         state = correct_path(setup, state, uncorrected)
-        level = protection_levels.compute_heading(float(nav.covariance[8, 8]), settings)
+        variance = float(nav.covariance[8, 8]) + latency_estimator.compute_heading_variance(nav, layout)
+        level = protection_levels.compute_heading(variance, settings)
         state = state._replace(consistency=state.consistency.hold_heading(level, nav.utime))
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)

@@ -5,6 +5,11 @@ If its uncertainty is too small, the heading absorbs what is latency; if it is t
 error of the fixes. So the latency is also fitted by itself when the heading is aligned (`fit_latency`), and inflated
 while rejected or drifting fixes suggest that it has changed (`inflate_latency`). It shows in acceleration and in turns;
 at constant speed straight ahead it is a displacement, and on a steady circle a rotation.
+
+On a steady circle fixes determine only the sum of the heading and of turn rate times latency. An inflated latency would
+follow whatever turns the heading there, such as an error of the gyro's scale, and take the heading along without limit.
+So it is not inflated while the two are correlated, and the heading's variance is that of a latency which may have
+changed (`compute_heading_variance`).
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.heading_alignment import PathFix, compute_velocities
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.transforms.so3 import Array
 
 MIN_FIXES: Final = 6
 """Fixes to fit the latency from: twice the numbers that are fitted."""
@@ -32,6 +38,12 @@ MIN_SPEED: Final = 0.5
 
 CHANGE_SIGMA: Final = 0.1
 """Standard deviation of a latency that has changed, seconds: receivers compute for 20 to 150 ms (Groves 2013, 10.3)."""
+
+SEPARATE_CORRELATION: Final = 0.1
+"""Correlation of heading and latency up to which fixes separate the two; on a steady circle it becomes 0.5."""
+
+TURN_SIGMA: Final = 0.15
+"""Standard deviation of a latency that may have changed while fixes cannot show it, seconds: the same, at most."""
 
 DRIFT_INFLATION: Final = 4.0
 """Inflation of the GNSS noise, in variance, from which the latency is inflated too."""
@@ -103,11 +115,26 @@ def inflate_latency(
     seconds = (residual[0] * vx + residual[1] * vy) / square
     variance = float(nav.covariance[at, at])
     inflated = min(variance + CHANGE_SIGMA**2 * weight, CHANGE_SIGMA**2, seconds * seconds)
-    if not inflated > variance:
+    if not inflated > variance or not _is_separate(nav.covariance, at):
         return nav
     P = nav.covariance.copy()
     P[at, at] = inflated
     return nav._replace(covariance=P)
+
+
+def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:
+    """Return the variance of the heading by a change of the latency that fixes cannot separate from it, rad2."""
+    if LATENCY not in layout:
+        return 0.0
+    at = layout.index(LATENCY)
+    if _is_separate(nav.covariance, at):
+        return 0.0
+    turn_rate = nav.rate[2] - nav.gyro_bias[2]
+    return max(TURN_SIGMA**2 - float(nav.covariance[at, at]), 0.0) * turn_rate * turn_rate
+
+
+def _is_separate(P: Array, at: int) -> bool:
+    return bool(P[8, at] ** 2 <= SEPARATE_CORRELATION**2 * P[8, 8] * P[at, at])
 
 
 def get_drift_weight(inflation: float, seconds: float, settings: FilterSettings) -> float:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
-from modelserver.estimation.filter import eskf, propagation, protection_levels
+from modelserver.estimation.filter import eskf, latency_estimator, propagation, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.fusion import uses_gnss
@@ -71,6 +71,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     silent = 0.0 if state.is_stationary else (utime - gnss.used_utime) * 1e-6
     offset, variance = gnss.offset.decay(silent, settings)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
+    P[5, 5] += latency_estimator.compute_heading_variance(nav, setup.layout)
     monitor = state.consistency
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)

@@ -663,3 +663,27 @@ def test_given_a_steady_turn_then_odom_follows_its_circle_and_its_uncertainty_gr
     assert stopped.pose(odom.utime + 400_000) == odom.pose(odom.utime)
     rested = odom.advance(nav._replace(utime=odom.utime + 20_000), ZERO, is_stationary=True)
     assert (rested.drift, rested.velocity) == (odom.drift, ZERO)
+
+
+def correlate_heading_with_latency(correlation: float):
+    nav = some_nav(SETUP, 5)
+    at = SETUP.layout.index(LATENCY)
+    P = nav.covariance.copy()
+    P[at, :] = P[:, at] = 0.0
+    P[at, at] = 0.05**2
+    P[8, at] = P[at, 8] = correlation * 0.05 * math.sqrt(P[8, 8])
+    rate = (0.0, 0.0, 0.4 + nav.gyro_bias[2])
+    return nav._replace(covariance=P, rate=rate, velocity=(3.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("correlation", "is_inflated"), [(0.0, True), (0.05, True), (0.5, False), (-0.5, False)])
+def test_given_a_heading_that_goes_with_the_latency_then_it_is_not_inflated_but_may_have_changed(
+    correlation, is_inflated
+):
+    nav = correlate_heading_with_latency(correlation)
+    at = SETUP.layout.index(LATENCY)
+    after = latency_estimator.inflate_latency(nav, (2.0, 0.0), 0.5, SETUP.layout, is_speed_measured=True)
+    variance = 0.05**2 + 0.5 * latency_estimator.CHANGE_SIGMA**2 if is_inflated else 0.05**2
+    assert after.covariance[at, at] == pytest.approx(variance)
+    of_heading = latency_estimator.compute_heading_variance(nav, SETUP.layout)
+    assert of_heading == pytest.approx(0.0 if is_inflated else 0.4**2 * (latency_estimator.TURN_SIGMA**2 - 0.05**2))
