@@ -174,6 +174,8 @@ class GeometryDocument:
     def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> GeometryDocument:
         """Set the description of an item, or remove it where it is empty."""
         text, path = self._open(item, in_template)
+        if description == text.get_text((*path, "description")):
+            return GeometryDocument(text)
         if description:
             return GeometryDocument(_set(text, path, "description", _format_word(description)))
         return GeometryDocument(text.remove((*path, "description")) if text.has((*path, "description")) else text)

@@ -224,9 +224,12 @@ class ItemFields:
         return document.rename(item, name, in_template) if name else document
 
     def _is_changed(self, *keys: str) -> bool:
-        """Return whether a field was changed; after a wrong change all count as such."""
+        """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
+        assert self._item is not None
         present = [key for key in keys if key in self._fields]
-        return any(self._session.has_errors or self._differs(key) for key in present)
+        # the fields show the last model without an error, not what the text has
+        is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
+        return any(is_wrong or self._differs(key) for key in present)
 
     def _differs(self, key: str) -> bool:
         given, value = self._given[key], self._fields[key].value

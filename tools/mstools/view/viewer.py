@@ -105,7 +105,7 @@ class Viewer:
         while not self._actions.empty():
             self._execute(self._actions.get())
         if self._editor is not None:
-            self._editor.update()
+            self._editor.update(now)
         source, display = self._source, self._display
         with source.lock:
             drive = source.drive
