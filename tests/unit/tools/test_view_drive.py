@@ -22,6 +22,9 @@ from modelserver.messages import (
     Invalid,
     JointSample,
     JointsSample,
+    Mode,
+    NavigationState,
+    Phase,
     PoseAnswer,
     PublishDecisions,
     SensorHeader,
@@ -324,6 +327,22 @@ def test_given_messages_of_a_channel_then_its_mean_rate_is_that_of_all() -> None
     for n in range(11):
         drive.feed("OTHER", b"", START + n * (100_000 if n < 10 else 200_000))
     assert drive.channels["OTHER"].mean_rate == pytest.approx(5.0)
+
+
+def test_given_states_of_the_filter_then_the_course_of_one_is_that_before_the_time() -> None:
+    drive = Drive()
+    for n in range(100):
+        utime = START + n * 1_000_000
+        state = NavigationState(
+            *(utime, Mode.FULL, Phase.ALIGNED, False, VALID, 0, *ORIGIN.initial_utm, Pose.identity()),
+            *((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (), ("east", "wheel_scale"), (1.0, 0.5 * n), (4.0, 0.0, 0.0, 9.0)),
+        )
+        drive.feed("LOCALIZATION_STATE", encode(state), utime)
+    times, values, sigmas = drive.get_state_course("wheel_scale", START + 70_000_000, 30.0)
+    assert times == pytest.approx(np.arange(-29.0, 1.0))
+    assert values == pytest.approx(0.5 * np.arange(41.0, 71.0))
+    assert sigmas == pytest.approx(np.full(30, 3.0))
+    assert all(not len(each) for each in drive.get_state_course("unknown", START + 70_000_000))
 
 
 def test_given_a_truncated_log_then_it_opens_and_its_damage_is_known(tmp_path: Path, model: Model) -> None:

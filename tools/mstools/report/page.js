@@ -140,7 +140,7 @@ async function draw(chart) {
 
 async function drawAll() {
   if (!("DecompressionStream" in window)) {
-    for (const chart of charts) chart.innerHTML = "<p class=late>This chart needs a browser of 2023 or later.</p>";
+    for (const chart of charts) chart.innerHTML = "<p class=unsupported>This chart needs a browser of 2023 or later.</p>";
     return;
   }
   await loadLibrary();

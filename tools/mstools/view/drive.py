@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import struct
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -351,9 +353,9 @@ class Drive:
             found.invalid_reasons,
             found.pose_epoch,
         )
-        self._note_validity(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
+        self._add_validity_events(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
 
-    def _note_validity(self, utime: int, invalid: Invalid, epoch: int) -> None:
+    def _add_validity_events(self, utime: int, invalid: Invalid, epoch: int) -> None:
         """Add events for a change of the validity and of the epoch."""
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
@@ -426,14 +428,14 @@ class Drive:
         stamp = int.from_bytes(data[8:16], "big", signed=True)
         stored = self._reports.setdefault(name, [])
         if name == "LOCALIZATION_STATE":
-            self._note_mode(stamp, data)
+            self._add_mode_event(stamp, data)
         if stored and 0 <= stamp - stored[-1][0] < MAX_REPORT_PERIOD_US:
             return
         stored.append((stamp, data))
         if len(stored) > MAX_ROWS // 30:
             del stored[1::2]
 
-    def _note_mode(self, utime: int, data: bytes) -> None:
+    def _add_mode_event(self, utime: int, data: bytes) -> None:
         """Add an event for a change of the mode, which is the first field after the stamp."""
         try:
             mode = Mode(int.from_bytes(data[16:17], "big", signed=True))
@@ -537,9 +539,30 @@ class Drive:
         """Return the filter's last published state at or before a time, None without one; the latest one at 0."""
         return self._get_report("LOCALIZATION_STATE", "navigation_state_t", utime)
 
+    def get_state_course(self, state: str, utime: int = 0, seconds: float = 60.0) -> tuple[Array, Array, Array]:
+        """Return times (n,), values (n,) and standard deviations (n,) of a state of the filter before a time.
+
+        Times are in seconds relative to that time; the latest at 0.
+        """
+        end = utime or self.end
+        stored = self._reports.get("LOCALIZATION_STATE", [])
+        rows = []
+        for stamp, data in stored[bisect_right(stored, end - round(seconds * 1e6), key=itemgetter(0)) :]:
+            if stamp > end:
+                break
+            try:
+                navigation = decode("navigation_state_t", data)
+                at, count = navigation.names.index(state), len(navigation.names)
+            except (WireError, ValueError):
+                continue
+            variance = navigation.covariance[at * (count + 1)]
+            rows.append(((stamp - end) * 1e-6, navigation.values[at], math.sqrt(max(variance, 0.0))))
+        times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
+        return times, values, sigmas
+
     def _get_report(self, name: str, type_name: str, utime: int) -> Any:
         stored = self._reports.get(name, [])
-        at = len(stored) if not utime else int(np.searchsorted([stamp for stamp, _ in stored], utime, side="right"))
+        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
         try:
             return decode(type_name, stored[at - 1][1]) if at else None
         except WireError:

@@ -32,6 +32,9 @@ SHOWN_EVENTS: Final = 8
 QUERY_PERIOD_S: Final = 0.5
 STATE_PERIOD_S: Final = 0.5
 SHOWN_STATES: Final = 40
+NO_STATE: Final = "-"
+VALUE_COLOR: Final = "#228be6"
+SIGMA_COLOR: Final = "#9ab8d4"
 RATE_PERIOD_US: Final = 3_000_000
 """Rates of sensors are means over this time: a report alone may be of a tenth of a second."""
 
@@ -59,8 +62,8 @@ class QueryPanel:
         self._source = source
         self._executor = ThreadPoolExecutor(1, "query")
         self._running: Future[tuple[str, str, tuple[str, ...]]] | None = None
-        self._asked: tuple[object, ...] = ()
-        self._asked_at = -math.inf
+        self._last_query: tuple[object, ...] = ()
+        self._queried_at = -math.inf
         self.path: tuple[str, ...] = ()
         """Frames on the path of the shown answer."""
         gui.add_markdown("Click an axis or a body in the scene: **frame**. With Shift: **in**.")
@@ -95,9 +98,9 @@ class QueryPanel:
         (self._reference if is_reference else self._interest).value = frame
 
     def update(self, utime: int, now: float, state: object) -> bool:
-        """Ask again where the question or its time changed; return whether the shown answer changed.
+        """Query again where the frames or the time changed; return whether the shown answer changed.
 
-        `utime` is 0 for the latest; `state` differs where the answer to the same question may.
+        `utime` is 0 for the latest; `state` differs where the answer to the same query may.
         """
         if self._running is not None:
             if not self._running.done():
@@ -106,15 +109,15 @@ class QueryPanel:
             self._running = None
             self._answer.content, self._code.content = text, code
             return True
-        question = (self._interest.value, self._reference.value, utime, state)
-        if question == self._asked or now - self._asked_at < QUERY_PERIOD_S or not self._interest.value:
+        query = (self._interest.value, self._reference.value, utime, state)
+        if query == self._last_query or now - self._queried_at < QUERY_PERIOD_S or not self._interest.value:
             return False
-        self._asked, self._asked_at = question, now
-        self._running = self._executor.submit(self._ask, self._interest.value, self._reference.value, utime)
+        self._last_query, self._queried_at = query, now
+        self._running = self._executor.submit(self._run_query, self._interest.value, self._reference.value, utime)
         return False
 
-    def _ask(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
-        """Return the answer, the code that asks for it, and the frames of the path."""
+    def _run_query(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
+        """Return the answer, the code of the query, and the frames of the path."""
         answers = self._source.answers
         code = format_code(interest, reference, utime, None)
         try:
@@ -199,7 +202,7 @@ def _format_share(share: float) -> str:
 
 
 def format_code(interest: str, reference: str, utime: int, answer: PoseAnswer | None) -> str:
-    """Return the question in Python and for the command line, and the answer in YAML, as code blocks."""
+    """Return the query in Python and for the command line, and the answer in YAML, as code blocks."""
     at = f", at={utime}" if utime else ""
     blocks = [
         ("python", f"platform.get_pose({_quote(interest)}, {_quote(reference)}{at})"),
@@ -363,7 +366,35 @@ class StatePanel:
         with gui.add_folder("Findings"):
             self._findings = gui.add_markdown("")
         with gui.add_folder("Filter", expand_by_default=False):
+            self._state: Any = gui.add_dropdown(
+                "State", (NO_STATE,), hint="Its last minute, with one sigma to each side"
+            )
+            self._course = gui.add_uplot(
+                (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
+                (
+                    {"label": "s"},
+                    {"label": "value", "stroke": VALUE_COLOR, "width": 2},
+                    {"label": "+ sigma", "stroke": SIGMA_COLOR},
+                    {"label": "- sigma", "stroke": SIGMA_COLOR},
+                ),
+                scales={"x": {"time": False}},
+                legend={"show": False},
+                height=180,
+                visible=False,
+            )
             self._states = gui.add_markdown("")
+
+    def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
+        """Show the last minute of the chosen state."""
+        options = (NO_STATE, *states)
+        if tuple(self._state.options) != options:
+            chosen = self._state.value
+            self._state.options = options
+            self._state.value = chosen if chosen in options else NO_STATE
+        self._course.visible = self._state.value != NO_STATE
+        if self._course.visible:
+            times, values, sigmas = drive.get_state_course(self._state.value, utime)
+            self._course.data = (times, values, values + sigmas, values - sigmas)
 
     def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
         """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
@@ -388,6 +419,7 @@ class StatePanel:
         self._findings.content = "\n\n".join(parts)
         navigation = drive.get_navigation_state(utime)
         self._states.content = "no state published" if navigation is None else _format_states(navigation)
+        self._show_course(drive, utime, navigation.names if navigation is not None else ())
 
 
 def _format_sensors(health: Health, earlier: Health | None) -> str:
@@ -439,11 +471,10 @@ def _format_rate(rate: float) -> str:
 def _format_states(navigation: Any) -> str:
     """Format the states of the filter with their standard deviations."""
     count = len(navigation.names)
-    has_covariance = len(navigation.covariance) == count * count
     rows = []
     for n, (name, value) in enumerate(zip(navigation.names, navigation.values, strict=True)):
-        sigma = f"{math.sqrt(max(navigation.covariance[n * (count + 1)], 0.0)):.3g}" if has_covariance else "-"
-        rows.append((name, f"{value:.4g}", sigma))
+        sigma = math.sqrt(max(navigation.covariance[n * (count + 1)], 0.0))
+        rows.append((name, f"{value:.4g}", f"{sigma:.3g}"))
     return format_table(("state", "value", "sigma"), rows[:SHOWN_STATES]) if rows else "no state"
 
 
