@@ -25,7 +25,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import check_writable
+from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import catch_signals, show_progress
 
 if TYPE_CHECKING:
@@ -98,10 +98,10 @@ def command(
             page = open_page(bind, 0, with_token=edit)
         try:
             viewer = Viewer(page, source, editing)
-            typer.echo(f"{source.title}: {page.link} (Ctrl-C ends it)")
+            typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
             sys.stdout.flush()
             for each in source.damage[:SHOWN_DAMAGE]:
-                typer.echo(f"modelserver: {source.title}: {each}", err=True)
+                typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
             if not no_browser and bind == LOOPBACK and has_screen():
                 webbrowser.open(page.link)
             end = time.monotonic() + seconds

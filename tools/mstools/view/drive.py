@@ -158,7 +158,7 @@ class Table:
             if not is_second or utime > self.last - MAX_DELAY_US:
                 return
             self.count = self.find(utime - 1) + 1
-        if self.count > 1 and utime - self._utimes[self.count - 2] < self._period:
+        if self._period and utime - self._utimes[self.count - 2] < self._period:
             # in place of the last row
             self.count -= 1
         if self.count >= MAX_ROWS:
