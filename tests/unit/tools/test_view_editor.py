@@ -172,7 +172,7 @@ def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> No
     ("values", "words"),
     [
         ({"limits": "5"}, "two numbers, lower and upper"),
-        ({"limits": "20, -20"}, "reversed"),
+        ({"limits": "20, -20"}, "lower one first, got '20, -20'"),
         ({"limits": "a, b"}, "'a' is not a number"),
         ({"default": "70"}, "out of"),
         ({"sigma": "-1"}, "not negative"),

@@ -260,6 +260,8 @@ class ItemFields:
                 return replace(old, axis=axis)
             is_angle = kind is JointType.REVOLUTE
             limits = self._read_values("limits", 2, is_angle)
+            if limits and limits[0] > limits[1]:
+                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
             mimic = None
             if self._fields["leader"].value != NO_LEADER:
                 (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)
