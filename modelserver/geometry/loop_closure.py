@@ -121,8 +121,8 @@ def chi_square_to_sigmas(square: float, degrees: int) -> float:
     """
     if degrees < 1:
         return 0.0
-    if square > 2.0 * MAX_SIGMAS**2:
-        # the probability would underflow
+    if square > 1.5 * MAX_SIGMAS**2:
+        # more than MAX_SIGMAS for up to six degrees of freedom; the probability underflows from 1480 on
         return MAX_SIGMAS
     probability = _chi_square_survival(square, degrees)
     return min(MAX_SIGMAS, max(0.0, -NormalDist().inv_cdf(probability / 2.0)))

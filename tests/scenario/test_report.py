@@ -63,6 +63,16 @@ def test_given_a_report_then_all_its_charts_are_drawn_and_a_time_is_shown_on_all
         assert 0.0 < time < 25.0
         assert page.locator(CURSORS).evaluate_all("(all) => all.every((each) => each.style.display === 'block')")
         assert track.locator(".spot").evaluate("(each) => each.style.display") == "block"
+        # a timeline has one between its bars too
+        page.locator("html").evaluate("(each) => delete each.dataset.time")
+        over_time.nth(0).scroll_into_view_if_needed()
+        box = over_time.nth(0).locator(".nsewdrag").first.bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 1)
+        page.locator("html[data-time]").wait_for(state="attached")
+        over_time.nth(1).scroll_into_view_if_needed()
+        over_time.nth(1).locator(".nsewdrag").first.hover()
+        page.wait_for_timeout(300)
         # and from the map to the others
         track.scroll_into_view_if_needed()
         spot = track.locator(".spot").bounding_box()

@@ -156,7 +156,10 @@ def test_given_any_chi_squared_then_its_sigmas_are_those_of_equal_probability(sq
 
 
 def test_given_probabilities_near_nothing_then_the_number_is_bounded():
-    assert [chi_square_to_sigmas(square, 6) for square in (1e4, 1e300, math.inf)] == [MAX_SIGMAS] * 3
+    for degrees in range(1, 7):
+        # also where the probability underflows
+        squares = [*np.arange(1300.0, 1900.0, 10.0), 1e4, 1e300, math.inf]
+        assert [chi_square_to_sigmas(square, degrees) for square in squares] == [MAX_SIGMAS] * len(squares)
     assert chi_square_to_sigmas(0.0, 3) == 0.0
     assert chi_square_to_sigmas(1.0, 0) == 0.0
 

@@ -15,6 +15,7 @@ from support_moving import BASE, ODOM, SCAN, T0, UTM, S, estimate, joints_at, ro
 from support_recordings import write_log
 
 from modelserver.formats import save_model
+from modelserver.geometry.parts import Sigma
 from modelserver.joints.history import JointHistory
 from modelserver.transforms import Pose
 from modelserver.wire.codec import encode
@@ -99,6 +100,23 @@ def test_given_a_correction_after_the_time_then_it_counts(run: Command, tmp_path
     code, out, _ = run("query", BASE, UTM, "--log", path, "--at", T0 + 2 * S, "--json")
     assert code == 0
     assert output(out).is_close(vehicle(2.0), 1e-9, 1e-9)
+
+
+def test_given_another_geometry_later_then_each_time_has_its_own(run: Command, tmp_path: Path) -> None:
+    other = rover(Sigma((0.5, 0.5, 0.5)))
+    events = list(drive(2.0))
+    for n in range(250, 500):
+        at = T0 + n * S // 100
+        events += [(at, *each) for each in parts(snapshot(other), at)] if n % 100 == 50 else []
+        events += [(at + DELAY, *each) for each in (*pose(estimate(n / 100), other), joints(n / 100))]
+    path = write_log(tmp_path / "two.lcm", sorted(events))
+    revisions = {}
+    for seconds in (0.5, 1.9, 1.99, 2.51, 4.0):
+        code, out, _ = run("query", SCAN, BASE, "--log", path, "--at", f"+{seconds}", "--json")
+        assert code == 0
+        revisions[seconds] = json.loads(out)["model_revision"]
+    first, second = rover().revision, other.revision
+    assert revisions == {0.5: first, 1.9: first, 1.99: first, 2.51: second, 4.0: second}
 
 
 @pytest.mark.parametrize(

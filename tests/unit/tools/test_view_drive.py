@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,9 @@ from modelserver.messages import (
     Invalid,
     JointSample,
     JointsSample,
+    Mode,
+    NavigationState,
+    Phase,
     PoseAnswer,
     PublishDecisions,
     SensorHeader,
@@ -30,8 +34,10 @@ from modelserver.messages import (
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import encode_event
 from mstools.view import drive as drive_module
 from mstools.view.drive import FIX_COLORS, Drive, EventKind, FixColor, Table
+from mstools.view.sources import open_log
 
 START = 1_700_000_000_000_000
 ORIGIN = origin_at(50.27, -111.18, 770.0)
@@ -272,12 +278,80 @@ def test_given_mutated_messages_then_nothing_is_raised_and_every_time_has_a_pict
         drive.get_fixes(utime)
 
 
-def test_given_more_rows_than_the_limit_then_the_newest_remain(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_given_more_rows_than_the_limit_then_all_the_time_remains_with_the_last_row(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(drive_module, "MAX_ROWS", 3000)
     table = Table(1)
-    for n in range(10_000):
-        table.append(n + 1, n)
+    for n in range(100_000):
+        table.append(10 * n + 10, n)
+        assert table.last == 10 * n + 10
+        assert table.rows[-1, 0] == n
     assert 1500 <= table.count <= 3000
-    assert table.last == 10_000
-    assert table.rows[table.find(9_000), 0] == 8_999.0
-    assert np.all(np.diff(table.utimes) == 1)
+    assert table.utimes[0] == 10
+    assert np.all(table.utimes == 10 * table.rows[:, 0] + 10)
+    # as dense at its begin as at its end
+    steps = np.diff(table.utimes)[:-1]
+    assert steps.max() <= 2 * steps.min()
+
+
+def test_given_a_log_with_two_geometries_then_each_time_has_its_own(model: Model) -> None:
+    builder = ModelBuilder()
+    builder.add_body("Other").add_frame("Frame")
+    other = builder.build()
+    drive = Drive()
+    for seconds, each, base in ((1, model, "Cart:Base"), (3, other, "Other:Frame"), (6, other, "Other:Frame")):
+        whole = encode_snapshot(ModelSnapshot("cart", each, base, base, 60.0, "JOINTS"))
+        drive.feed("MODEL_SNAPSHOT", encode(SnapshotPart(START + seconds * 10**6, each.revision, 0, 1, whole)), START)
+    shown = [drive.get_geometry(START + seconds * 10**6) for seconds in (0, 2, 3, 9)]
+    assert [each.revision for each, _ in shown if each is not None] == [model.revision] * 2 + [other.revision] * 2
+    assert [base for _, base in shown] == ["Cart:Base"] * 2 + ["Other:Frame"] * 2
+    assert drive.get_geometry() == (drive.model, "Other:Frame")
+    assert [event.kind for event in drive.events] == [EventKind.GEOMETRY]
+
+
+def test_given_a_service_that_stops_then_that_is_said_after_some_seconds() -> None:
+    drive = Drive("v_")
+    assert "no message of a service yet" in drive.find_silence(START)
+    drive.feed("v_POSE", make_pose(0.0, 1.0), START)
+    # requests are no sign of a service
+    drive.feed("v_PLATFORM_GET_TRANSFORM", make_pose(0.0, 1.0), START + 60_000_000)
+    assert drive.find_silence(START + 1_000_000) == ""
+    assert "no message of the service for 60 s" in drive.find_silence(START + 60_000_000)
+    drive.feed("v_MODELSERVER_HEALTH", make_pose(0.0, 1.0), START + 60_000_000)
+    assert drive.find_silence(START + 60_000_000) == ""
+
+
+def test_given_messages_of_a_channel_then_its_mean_rate_is_that_of_all() -> None:
+    drive = Drive()
+    for n in range(11):
+        drive.feed("OTHER", b"", START + n * (100_000 if n < 10 else 200_000))
+    assert drive.channels["OTHER"].mean_rate == pytest.approx(5.0)
+
+
+def test_given_states_of_the_filter_then_the_course_of_one_is_that_before_the_time() -> None:
+    drive = Drive()
+    for n in range(100):
+        utime = START + n * 1_000_000
+        state = NavigationState(
+            *(utime, Mode.FULL, Phase.ALIGNED, False, VALID, 0, *ORIGIN.initial_utm, Pose.identity()),
+            *((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (), ("east", "wheel_scale"), (1.0, 0.5 * n), (4.0, 0.0, 0.0, 9.0)),
+        )
+        drive.feed("LOCALIZATION_STATE", encode(state), utime)
+    times, values, sigmas = drive.get_state_course("wheel_scale", START + 70_000_000, 30.0)
+    assert times == pytest.approx(np.arange(-29.0, 1.0))
+    assert values == pytest.approx(0.5 * np.arange(41.0, 71.0))
+    assert sigmas == pytest.approx(np.full(30, 3.0))
+    assert all(not len(each) for each in drive.get_state_course("unknown", START + 70_000_000))
+
+
+def test_given_a_truncated_log_then_it_opens_and_its_damage_is_known(tmp_path: Path, model: Model) -> None:
+    whole = encode_snapshot(ModelSnapshot("cart", model, "Cart:Base", "Cart:Base", 60.0, "JOINTS"))
+    messages = [(b"MODEL_SNAPSHOT", encode(SnapshotPart(START, model.revision, 0, 1, whole)))]
+    messages += [(b"POSE", make_pose(0.1 * n, 0.1 * n)) for n in range(20)]
+    events = [encode_event(n, START + n, *each) for n, each in enumerate(messages)]
+    path = tmp_path / "drive.lcm"
+    path.write_bytes(b"".join(events)[:-10])
+    source = open_log(path, "", None, lambda part: None)
+    assert source.drive.end == START + 1_800_000
+    assert [each.partition(" after")[0] for each in source.damage] == ["the log is truncated"]

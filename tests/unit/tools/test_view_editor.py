@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
+from modelserver.errors import Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
@@ -171,7 +172,7 @@ def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> No
     ("values", "words"),
     [
         ({"limits": "5"}, "two numbers, lower and upper"),
-        ({"limits": "20, -20"}, "reversed"),
+        ({"limits": "20, -20"}, "lower one first, got '20, -20'"),
         ({"limits": "a, b"}, "'a' is not a number"),
         ({"default": "70"}, "out of"),
         ({"sigma": "-1"}, "not negative"),
@@ -296,11 +297,76 @@ def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page:
     assert "three frames" in page.message
 
 
+def test_given_an_error_elsewhere_then_an_item_keeps_its_notation(page: EditedPage) -> None:
+    page.editor.select(GeometryItem(ItemKind.FRAME, "Digiclops:ImagePlane"))
+    page.set(sigma_xyz=(-0.1, 0.0, 0.0))
+    assert page.session.has_errors
+    before = page.session.document.text
+    # its description has several lines, its sigma is that of the file's defaults
+    page.editor.select(LENS)
+    page.set()
+    assert page.session.document.text == before
+    page.set(xyz=(0.051, 0.0, 0.06))
+    changed = set(page.session.document.text.splitlines()) - set(before.splitlines())
+    assert [line.strip() for line in changed] == ["xyz: [0.051, 0, 0.06]"]
+
+
+def test_given_a_wrong_number_then_its_old_value_typed_again_is_set(page: EditedPage) -> None:
+    before = page.session.document.text
+    page.editor.select(LENS)
+    page.set(xyz=(2e9, 0.0, 0.06))
+    assert page.session.has_errors
+    page.set(xyz=(0.05, 0.0, 0.06))
+    assert not page.session.has_errors
+    assert page.model.frame(LENS.name).pose.xyz == (0.05, 0.0, 0.06)
+    assert "description: >-" in page.session.document.text
+    assert page.session.document.text.count("\n") == before.count("\n") + 1
+
+
+def test_given_a_file_that_changes_on_disk_then_that_is_shown_until_it_is_read(page: EditedPage) -> None:
+    path = page.session.file.path
+    page.editor.update(1.0)
+    assert "meanwhile" not in page.editor._status.content
+    path.write_text(path.read_text().replace("name: raptor", "name: other"))
+    page.editor.update(1.1)
+    assert "meanwhile" not in page.editor._status.content
+    page.editor.update(10.0)
+    assert "changed meanwhile on disk" in page.editor._status.content
+    page.editor._ask_read()
+    page.editor.update(10.1)
+    assert "meanwhile" not in page.editor._status.content
+    path.unlink()
+    page.editor.update(20.0)
+    assert "changed meanwhile on disk" in page.editor._status.content
+
+
+def test_given_an_edit_after_the_difference_was_shown_then_it_is_not_saved(page: EditedPage) -> None:
+    path = page.session.file.path
+    before = path.read_text()
+    page.editor.select(LENS)
+    page.set(xyz=(0.051, 0.0, 0.06))
+    shown = page.session.document
+    page.set(xyz=(0.052, 0.0, 0.06))
+    page.editor._write_file(shown)
+    assert "edited since its difference was shown" in page.message
+    assert path.read_text() == before
+    page.editor._write_file(page.session.document)
+    assert path.read_text() == page.session.document.text
+
+
+def test_given_notes_alone_then_they_are_counted(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    note = Problem(Severity.NOTE, "x")
+    page.session.problems = (note, note)
+    page.editor._show_problems()
+    assert page.editor._problem_texts.content == "none\n\n2 notes: modelserver check --notes"
+
+
 def test_given_a_service_that_does_not_answer_then_the_reason_is_shown(page: EditedPage) -> None:
     page.editor._editing = Editing(page.session, "memq://", "", 0.05)
     page.editor._ask_apply()
     assert page.editor._reloading is not None
     page.editor._reloading[1].exception(10.0)
-    page.editor.update()
+    page.editor.update(0.0)
     assert page.message.startswith("not applied: ")
     page.editor.close()

@@ -74,6 +74,8 @@ def test_given_a_host_or_origin_then_only_its_own_is_allowed(headers: dict[str, 
         ("/", f"{COOKIE}=wrong", False),
         ("/", f"other=1; {COOKIE}=secret", True),
         ("/?token=%ff%00", "", False),
+        # a cookie of a viewer that was served here before does not shut out who has the new link
+        ("/?token=secret", f"{COOKIE}=old", True),
     ],
 )
 def test_given_a_token_then_only_those_who_have_it_are_allowed(path: str, cookie: str, is_allowed: bool) -> None:
@@ -120,6 +122,8 @@ def test_given_a_page_beyond_loopback_then_its_link_has_the_token_that_it_needs(
         assert response.status == 200
         cookie = response.getheader("Set-Cookie") or ""
         assert "HttpOnly" in cookie
+        # browsers send a cookie to all ports of a machine
+        assert cookie.startswith(f"{COOKIE}_{urlsplit(page.link).port}=")
         assert fetch(page, Host=host, Cookie=cookie.partition(";")[0]).status == 200
     finally:
         page.close()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
@@ -94,11 +98,17 @@ def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(
         '<robot name="r"><link name="a"><visual><geometry><mesh filename="meshes/mast.obj"/></geometry></visual></link>'
-        '<link name="b"><visual><geometry><mesh filename="missing.stl"/></geometry></visual></link>'
-        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint></robot>'
+        '<link name="b"><visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+        '<collision><geometry><sphere radius="1"/></geometry></collision></link>'
+        '<link name="c"><visual><geometry><mesh filename="missing.stl"/></geometry></visual></link>'
+        '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
+        '<joint name="k" type="fixed"><parent link="a"/><child link="c"/></joint></robot>'
     )
     scene = make_scene(page, open_geometry(urdf, {}))
     assert scene.unread == ["missing.stl: not found"]
+    drawn = {node.name.partition("/body/")[2] for node in page.server.scene._handle_from_node_name.values()}
+    assert {"0/visual/0", "1/collision/0", "2/box/0"} < drawn
+    assert not {"0/collision/0", "0/box/0", "1/box/0"} & drawn
 
 
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:
@@ -151,6 +161,30 @@ def test_given_an_answer_then_the_panel_shows_its_numbers_and_how_to_ask_for_the
     code = format_code("FrontSICKLaser:Scan", "Raptor:CG", 5, explanation.answer)
     assert 'platform.get_pose("FrontSICKLaser:Scan", "Raptor:CG", at=5)' in code
     assert "modelserver query 'FrontSICKLaser:Scan' 'Raptor:CG' --at 5" in code
+
+
+def test_given_quotes_in_names_then_what_is_copied_is_python_shell_and_yaml() -> None:
+    interest, reference = """B:'"$(id)`""", r"C:\n"
+    python, shell = re.findall(r"```\w+\n(.*)\n```", format_code(interest, reference, 0, None))
+    assert [each.value for each in ast.parse(python).body[0].value.args] == [interest, reference]  # type: ignore[attr-defined]
+    assert shlex.split(shell) == ["modelserver", "query", interest, reference]
+    source = open_geometry(find_vehicle_file(), {})
+    answer = source.answers.explain("FrontSICKLaser:Scan", "Raptor:CG").answer
+    code = re.findall(r"```yaml\n(.*)\n```", format_code(interest, reference, 0, answer), re.DOTALL)[0]
+    found = answer.transformation
+    assert found.covariance is not None
+    stated = yaml.safe_load(code)
+    assert stated["xyz"] == pytest.approx(found.pose.xyz, rel=1e-5)
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert stated["sigma"]["xyz"] == pytest.approx(sigmas[:3], rel=1e-3)
+    assert stated["sigma"]["rpy_deg"] == pytest.approx(np.degrees(sigmas[3:]), rel=1e-3)
+
+
+def test_given_two_frames_that_are_queried_then_their_names_are_in_the_scene(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    scene.show_labels(NameLabels.BODIES, ("Raptor:CG", "FLEA:Lens"))
+    shown = {text for kind, text, label in scene._labels if label.visible and kind is NameLabels.FRAMES}
+    assert shown == {"Raptor:CG", "FLEA:Lens"}
 
 
 def test_given_markup_in_a_name_then_it_is_shown_as_text() -> None:

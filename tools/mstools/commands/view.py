@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 import sys
 import time
 import webbrowser
@@ -24,7 +25,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import check_writable
+from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import catch_signals, show_progress
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8080
 RELOAD_TIMEOUT_S = 10.0
+SHOWN_DAMAGE = 5
 
 
 def command(
@@ -96,9 +98,11 @@ def command(
             page = open_page(bind, 0, with_token=edit)
         try:
             viewer = Viewer(page, source, editing)
-            typer.echo(f"{source.title}: {page.link} (Ctrl-C ends it)")
+            typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
             sys.stdout.flush()
-            if not no_browser and bind == LOOPBACK:
+            for each in source.damage[:SHOWN_DAMAGE]:
+                typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
+            if not no_browser and bind == LOOPBACK and has_screen():
                 webbrowser.open(page.link)
             end = time.monotonic() + seconds
             with catch_signals() as stop:
@@ -107,6 +111,11 @@ def command(
             page.close()
     finally:
         source.close()
+
+
+def has_screen() -> bool:
+    """Return whether a browser can have a window; one of the terminal would take it, and cannot draw the page."""
+    return sys.platform != "linux" or any(os.environ.get(each) for each in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
 def check_installed() -> None:

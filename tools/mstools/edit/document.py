@@ -142,6 +142,7 @@ class GeometryDocument:
         self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3, in_template: bool = False
     ) -> GeometryDocument:
         """Set the pose of a frame on its body, or of a constraint. Only what differs is written."""
+        _check_finite((*xyz, *rpy_deg))
         text, path = self._open(item, in_template)
         old, new = _read_pose(text, path), Pose.from_rpy(xyz, *map(math.radians, rpy_deg))
         is_turned = old.distance(new)[1] > SAME_RADIANS
@@ -159,6 +160,7 @@ class GeometryDocument:
         self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None, in_template: bool = False
     ) -> GeometryDocument:
         """Set the standard deviations of a frame or constraint; a part that is None is not stated."""
+        _check_finite([*(xyz or ()), *(rpy_deg or ())])
         text, path = self._open(item, in_template)
         stated = [
             f"{key}: {format_scalar_or_list(tuple([round(each, DECIMALS) for each in values]))}"
@@ -172,6 +174,8 @@ class GeometryDocument:
     def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> GeometryDocument:
         """Set the description of an item, or remove it where it is empty."""
         text, path = self._open(item, in_template)
+        if description == text.get_text((*path, "description")):
+            return GeometryDocument(text)
         if description:
             return GeometryDocument(_set(text, path, "description", _format_word(description)))
         return GeometryDocument(text.remove((*path, "description")) if text.has((*path, "description")) else text)
@@ -364,6 +368,13 @@ def _set_numbers(text: YamlText, path: Path, key: str, values: Sequence[float]) 
     same = [a == b for a, b in zip(old, new, strict=True)]
     shown = [written[n] if same[n] else format_number(value) for n, value in enumerate(new)]
     return _set(text, path, key, f"[{', '.join(shown)}]")
+
+
+def _check_finite(values: Sequence[float]) -> None:
+    """Raise EditError for a number that is not finite."""
+    for value in values:
+        if not math.isfinite(value):
+            raise EditError(f"{value} is no number of a pose or sigma; enter a finite one")
 
 
 def _parse(text: str) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import Problem, Severity
+from modelserver.errors import ModelServerError, Problem, Severity
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import read_start
 from modelserver.formats import parse_content, read_content
@@ -92,11 +92,13 @@ class EditSession:
         self._undone: list[Step] = []
         self.model: Model | None = None
         """The last model without an error."""
+        self._loaded: GeometryDocument | None = None
         self._check()
 
     def _check(self) -> None:
         model, self.problems = self.file.check(self.document.text, self._variables)
-        self.model = model or self.model
+        if model is not None:
+            self.model, self._loaded = model, self.document
 
     @property
     def document(self) -> GeometryDocument:
@@ -145,6 +147,20 @@ class EditSession:
         if self._undone:
             self._steps.append(self._undone.pop())
             self._check()
+
+    def is_as_loaded(self, item: GeometryItem) -> bool:
+        """Return whether the entry of an item is written as in the document of `model`."""
+        try:
+            return self._loaded is not None and self._loaded.get_yaml(item) == self.document.get_yaml(item)
+        except EditError:
+            return False
+
+    def has_changed_on_disk(self) -> bool:
+        """Return whether the file is no longer what was read or saved."""
+        try:
+            return self.file.read() != self._saved
+        except (ModelServerError, OSError):
+            return True
 
     def find_culprit(self, problem: Problem) -> GeometryItem | None:
         """Return the item in which a problem of the geometry file is."""

@@ -55,9 +55,13 @@ class YamlText:
 
     def __init__(self, text: str):
         self.text = text
+        try:
+            content = text.encode()
+        except UnicodeEncodeError as error:
+            raise EditError(f"{text[error.start : error.end]!r} is no character of a text file; remove it") from None
         builder = ModelBuilder()
         # bounds depth and size: the parser below is recursive
-        if parse_yaml(text.encode(), builder, "") is None:
+        if parse_yaml(content, builder, "") is None:
             problem = builder.problems[0]
             raise EditError(f"line {problem.line}: {problem.message}; {problem.fix}")
         self._root = yaml.compose(text, Loader=_LOADER)

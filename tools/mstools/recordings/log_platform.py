@@ -139,12 +139,29 @@ class LogPlatform(LocalPlatform):
                     continue
                 if at and policy is Policy.LATEST and stamp > at:
                     continue
+                if at and stamp > at and self._is_of_other_geometry(event, knowledge.state):
+                    break
                 if at and stamp > at and self._is_complete(knowledge.state, at, ends, history_us):
                     break
                 now = event.utime
                 knowledge.feed(event.channel, event.data, now)
                 channels.update(knowledge.channels)
         self._read = (knowledge.state, now)
+
+    def _is_of_other_geometry(self, event: LogEvent, known: MirrorState) -> bool:
+        """Return whether a pose or snapshot is of another geometry: after a reload, or of a service started later."""
+        if known.view is None or self._given_model is not None:
+            return False
+        try:
+            if event.channel == f"{self._prefix}MODEL_SNAPSHOT":
+                part: SnapshotPart = decode("model_snapshot_t", event.data)
+                return part.model_revision != known.view.model.revision
+            if event.channel == f"{self._prefix}POSE":
+                answer: PoseAnswer = decode("pose_transform_t", event.data)
+                return answer.transformation.model_revision not in ("", known.view.model.revision)
+        except WireError:
+            pass
+        return False
 
     def _find_start(self, oldest: int) -> int:
         """Return the offset in the file from which poses from `oldest` on are read."""

@@ -83,10 +83,25 @@ function showTime(time) {
   }
 }
 
-function readTime(chart, event) {
-  const point = event.points[0];
-  if (!isOverTime(chart)) return point.customdata ?? null;
-  return event.xvals ? event.xvals[0] : point.x;
+// the pointer's time: plotly's own hover events are of drawn points, and there is none between two bars
+function followPointer(chart) {
+  let last = null;
+  chart.addEventListener("mousemove", (event) => {
+    if (last === null) requestAnimationFrame(() => {
+      const at = last.clientX - chart.getBoundingClientRect().left - chart._fullLayout._size.l;
+      const axis = chart._fullLayout.xaxis;
+      last = null;
+      if (at >= 0 && at <= axis._length) showTime(axis.p2l(at));
+    });
+    last = event;
+  });
+}
+
+function followPoints(chart) {
+  chart.on("plotly_hover", (event) => {
+    const time = event.points[0].customdata ?? null;
+    if (time !== null) showTime(time);
+  });
 }
 
 // --- one zoom of all time axes
@@ -117,16 +132,15 @@ async function draw(chart) {
   await Plotly.newPlot(chart, figure.data, figure.layout, CONFIG);
   await Plotly.relayout(chart, makeColors(chart.layout));
   addMark(chart, isOverTime(chart) ? "cursor" : "spot");
-  chart.on("plotly_hover", (event) => {
-    const time = readTime(chart, event);
-    if (time !== null) showTime(time);
-  });
-  if (isOverTime(chart)) chart.on("plotly_relayout", (change) => linkZoom(chart, change));
+  if (isOverTime(chart)) {
+    followPointer(chart);
+    chart.on("plotly_relayout", (change) => linkZoom(chart, change));
+  } else followPoints(chart);
 }
 
 async function drawAll() {
   if (!("DecompressionStream" in window)) {
-    for (const chart of charts) chart.innerHTML = "<p class=late>This chart needs a browser of 2023 or later.</p>";
+    for (const chart of charts) chart.innerHTML = "<p class=unsupported>This chart needs a browser of 2023 or later.</p>";
     return;
   }
   await loadLibrary();

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import struct
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -47,7 +49,7 @@ PICTURE_PERIOD_US: Final = 30_000
 """Least time between two stored poses, and two stored messages of joints of one source, microseconds."""
 
 MAX_ROWS: Final = 150_000
-"""Rows of a table: an hour and more of pictures. Older ones are dropped."""
+"""Rows of a table: an hour and more of pictures. More are thinned."""
 
 MAX_DELAY_US: Final = 1_000_000
 """A row may come later than its successors by this time."""
@@ -57,6 +59,10 @@ MAX_STAMP: Final = (1 << 32) * 1_000_000
 
 MAX_EVENTS: Final = 2_000
 MAX_CHANNELS: Final = 500
+MAX_GEOMETRIES: Final = 100
+SILENCE_US: Final = 3_000_000
+"""Time without a message after which the service counts as silent, microseconds; health is published each second."""
+
 MAX_REPORT_PERIOD_US: Final = 900_000
 """Reports of health and of the filter's state are stored about once a second, as bytes."""
 
@@ -112,12 +118,17 @@ class DriveEvent:
 
 
 class Table:
-    """Rows of numbers in the order of their times. Appending is cheap; beyond `MAX_ROWS` the older half is dropped."""
+    """Rows of numbers in the order of their times. Appending is cheap.
+
+    At `MAX_ROWS` every second row is dropped, and rows that follow are no denser than those: a table has all of a drive
+    however long it is, and always the last row.
+    """
 
     def __init__(self, columns: int):
         self._utimes = np.zeros(1024, np.int64)
         self._rows = np.zeros((1024, columns))
         self._earlier = 0
+        self._period = 0
         self.count = 0
 
     @property
@@ -147,10 +158,14 @@ class Table:
             if not is_second or utime > self.last - MAX_DELAY_US:
                 return
             self.count = self.find(utime - 1) + 1
+        if self._period and utime - self._utimes[self.count - 2] < self._period:
+            # in place of the last row
+            self.count -= 1
         if self.count >= MAX_ROWS:
-            retained = MAX_ROWS // 2
-            self._utimes[:retained], self._rows[:retained] = self.utimes[-retained:], self.rows[-retained:]
+            retained = len(self.utimes[::2])
+            self._utimes[:retained], self._rows[:retained] = self.utimes[::2].copy(), self.rows[::2].copy()
             self.count = retained
+            self._period = int(np.median(np.diff(self.utimes)))
         if self.count == len(self._utimes):
             self._utimes = np.concatenate([self._utimes, np.zeros_like(self._utimes)])
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
@@ -170,6 +185,7 @@ class ChannelCount:
     count: int = 0
     last: int = 0
     rate: float = math.nan
+    _first: int = 0
     _since: int = 0
     _counted: int = 0
 
@@ -177,11 +193,18 @@ class ChannelCount:
         """Count a message received at `now`, microseconds."""
         self.count += 1
         self.last = now
+        self._first = self._first or now
         if not self._since:
             self._since, self._counted = now, self.count
         elif now - self._since >= 1_000_000:
             self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
             self._since, self._counted = now, self.count
+
+    @property
+    def mean_rate(self) -> float:
+        """Rate over all messages, Hz; nan for fewer than two."""
+        seconds = (self.last - self._first) * 1e-6
+        return (self.count - 1) / seconds if seconds > 0.0 else math.nan
 
 
 class Picture(NamedTuple):
@@ -235,6 +258,7 @@ class Drive:
         # until the origin is known: source, time, latitude, longitude, height
         self._unplaced: list[tuple[str, int, Vector3]] = []
         self._assembler = SnapshotAssembler()
+        self._geometries: list[tuple[int, Model, str]] = []
         self.joints_channel = f"{self.prefix}JOINTS"
         self._sources: dict[str, int] = {}
         self._last_pose = 0
@@ -293,6 +317,7 @@ class Drive:
             return
         if self.model is not None:
             self._add_event(part.utime, EventKind.GEOMETRY, f"geometry revision {snapshot.model.revision}")
+        self._geometries = [*self._geometries[-MAX_GEOMETRIES:], (part.utime, snapshot.model, snapshot.base_frame)]
         self.set_model(snapshot.model)
 
     def set_model(self, model: Model) -> None:
@@ -328,9 +353,9 @@ class Drive:
             found.invalid_reasons,
             found.pose_epoch,
         )
-        self._note_validity(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
+        self._add_validity_events(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
 
-    def _note_validity(self, utime: int, invalid: Invalid, epoch: int) -> None:
+    def _add_validity_events(self, utime: int, invalid: Invalid, epoch: int) -> None:
         """Add events for a change of the validity and of the epoch."""
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
@@ -403,14 +428,14 @@ class Drive:
         stamp = int.from_bytes(data[8:16], "big", signed=True)
         stored = self._reports.setdefault(name, [])
         if name == "LOCALIZATION_STATE":
-            self._note_mode(stamp, data)
+            self._add_mode_event(stamp, data)
         if stored and 0 <= stamp - stored[-1][0] < MAX_REPORT_PERIOD_US:
             return
         stored.append((stamp, data))
         if len(stored) > MAX_ROWS // 30:
-            del stored[: len(stored) // 2]
+            del stored[1::2]
 
-    def _note_mode(self, utime: int, data: bytes) -> None:
+    def _add_mode_event(self, utime: int, data: bytes) -> None:
         """Add an event for a change of the mode, which is the first field after the stamp."""
         try:
             mode = Mode(int.from_bytes(data[16:17], "big", signed=True))
@@ -441,6 +466,26 @@ class Drive:
     def end(self) -> int:
         """The time of the last stored pose or joint reading, 0 without any."""
         return max((each.last for each in (self.poses, *self.joints.values())), default=0)
+
+    def get_geometry(self, utime: int = 0) -> tuple[Model | None, str]:
+        """Return the model at a time, and the frame whose pose is published; the latest at 0.
+
+        Before the first snapshot it is that of the first.
+        """
+        if not utime or not self._geometries:
+            return self.model, self.base_frame
+        begun = [each for each in self._geometries if each[0] <= utime]
+        _, model, base_frame = begun[-1] if begun else self._geometries[0]
+        return model, base_frame
+
+    def find_silence(self, now: int) -> str:
+        """Return in words that the service publishes nothing, empty if it does. `now` is the time, microseconds."""
+        published = [self.channels.get(f"{self.prefix}{name}") for name in ("POSE", "MODELSERVER_HEALTH")]
+        last = max((each.last for each in published if each is not None), default=0)
+        if now - last < SILENCE_US:
+            return ""
+        since = f"no message of the service for {(now - last) * 1e-6:.0f} s" if last else "no message of a service yet"
+        return f"{since}; is it running (modelserver run -c vehicle.yaml), on this bus and with this channel prefix?"
 
     def get_fixes(self, utime: int) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the positions in World:UTM (n, 3) of the fixes until a time, and indexes into `FIX_COLORS` (n,)."""
@@ -494,9 +539,30 @@ class Drive:
         """Return the filter's last published state at or before a time, None without one; the latest one at 0."""
         return self._get_report("LOCALIZATION_STATE", "navigation_state_t", utime)
 
+    def get_state_course(self, state: str, utime: int = 0, seconds: float = 60.0) -> tuple[Array, Array, Array]:
+        """Return times (n,), values (n,) and standard deviations (n,) of a state of the filter before a time.
+
+        Times are in seconds relative to that time; the latest at 0.
+        """
+        end = utime or self.end
+        stored = self._reports.get("LOCALIZATION_STATE", [])
+        rows = []
+        for stamp, data in stored[bisect_right(stored, end - round(seconds * 1e6), key=itemgetter(0)) :]:
+            if stamp > end:
+                break
+            try:
+                navigation = decode("navigation_state_t", data)
+                at, count = navigation.names.index(state), len(navigation.names)
+            except (WireError, ValueError):
+                continue
+            variance = navigation.covariance[at * (count + 1)]
+            rows.append(((stamp - end) * 1e-6, navigation.values[at], math.sqrt(max(variance, 0.0))))
+        times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
+        return times, values, sigmas
+
     def _get_report(self, name: str, type_name: str, utime: int) -> Any:
         stored = self._reports.get(name, [])
-        at = len(stored) if not utime else int(np.searchsorted([stamp for stamp, _ in stored], utime, side="right"))
+        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
         try:
             return decode(type_name, stored[at - 1][1]) if at else None
         except WireError:

@@ -30,6 +30,8 @@ from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
 MAX_LABEL: Final = 60
+LOOK_PERIOD_S: Final = 2.0
+"""Period at which the file is compared with what was read, seconds."""
 
 Change = Callable[[GeometryDocument], GeometryDocument]
 
@@ -79,6 +81,8 @@ class Editor:
         self._item: GeometryItem | None = None
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
+        self._next_look = 0.0
+        self._is_outdated = False
         self._buttons: list[Any] = []
         self._status = gui.add_markdown("")
         self._message = gui.add_markdown("")
@@ -162,13 +166,8 @@ class Editor:
     def _refresh(self) -> None:
         """Show the session as it is after a change."""
         session = self._session
-        errors = sum(each.severity is Severity.ERROR for each in session.problems)
-        state = "not saved" if session.is_changed else "saved"
-        if errors:
-            state += (
-                f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows the last model"
-            )
-        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
+        self._next_look = 0.0
+        self._show_status()
         for button, name, change in (
             (self._undo, "Undo", session.undo_name),
             (self._redo, "Redo", session.redo_name),
@@ -188,15 +187,32 @@ class Editor:
             self._shown = session.model
             self._show(session.model)
 
+    def _show_status(self) -> None:
+        """Show whether there is something to save, and what is against it."""
+        session = self._session
+        errors = sum(each.severity is Severity.ERROR for each in session.problems)
+        state = "not saved" if session.is_changed else "saved"
+        if errors:
+            state += (
+                f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows the last model"
+            )
+        if self._is_outdated:
+            state += ". **The file changed meanwhile on disk:** read it again before you go on"
+        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
+
     def _show_problems(self) -> None:
         for button in self._buttons:
             button.remove()
         self._buttons = []
         found = sorted(self._session.problems, key=lambda each: list(Severity).index(each.severity))
         shown = [each for each in found if each.severity is not Severity.NOTE][:SHOWN_PROBLEMS]
-        more = len(found) - len(shown)
-        lines = [f"- {_describe(each)}" for each in shown]
-        self._problem_texts.content = "\n".join([*lines, *([f"- and {more} more, or notes"] if more else [])]) or "none"
+        notes = sum(each.severity is Severity.NOTE for each in found)
+        more = len(found) - len(shown) - notes
+        lines = [f"- {_describe(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
+        text = "\n".join(lines) or "none"
+        if notes:
+            text += f"\n\n{notes} note{'' if notes == 1 else 's'}: modelserver check --notes"
+        self._problem_texts.content = text
         with self._problems:
             for number, problem in enumerate(shown, 1):
                 culprit = self._session.find_culprit(problem)
@@ -299,13 +315,13 @@ class Editor:
 
     def _ask_save(self) -> None:
         """Show what would be saved."""
-        diff = self._session.make_diff()
+        diff, shown = self._session.make_diff(), self._session.document
         modal = self._gui.add_modal(f"Save {self._session.file.path.name}")
         with modal:
             # longer than what the file may have
             fence = "`" * (3 + diff.count("`"))
             self._gui.add_markdown(f"{fence}diff\n{diff}\n{fence}")
-            self._add_button("Save", lambda: self._confirm(modal, self._write_file))
+            self._add_button("Save", lambda: self._confirm(modal, lambda: self._write_file(shown)))
             self._add_button("Cancel", modal.close)
 
     def _ask_read(self) -> None:
@@ -319,8 +335,12 @@ class Editor:
             self._add_button("Drop them", lambda: self._confirm(modal, lambda: self._step(self._session.read)))
             self._add_button("Cancel", modal.close)
 
-    def _write_file(self) -> None:
-        if self._do(self._session.save):
+    def _write_file(self, shown: GeometryDocument) -> None:
+        """Save the document whose difference was shown."""
+        if self._session.document is not shown:
+            # in another tab
+            self._report("not saved: the geometry was edited since its difference was shown; look at it again")
+        elif self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
         self._refresh_quietly()
 
@@ -343,8 +363,13 @@ class Editor:
             self._report("asking the service ...")
             self._reloading = dry_run, self._executor.submit(self._editing.reload, dry_run)
 
-    def update(self) -> None:
-        """Show the reply of the service, once it is there."""
+    def update(self, now: float) -> None:
+        """Show the reply of the service, once it is there, and that the file has changed on disk."""
+        if now >= self._next_look:
+            self._next_look = now + LOOK_PERIOD_S
+            if self._session.has_changed_on_disk() != self._is_outdated:
+                self._is_outdated = not self._is_outdated
+                self._show_status()
         if self._reloading is None or not self._reloading[1].done():
             return
         (dry_run, future), self._reloading = self._reloading, None

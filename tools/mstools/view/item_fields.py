@@ -224,9 +224,12 @@ class ItemFields:
         return document.rename(item, name, in_template) if name else document
 
     def _is_changed(self, *keys: str) -> bool:
-        """Return whether a field was changed; after a wrong change all count as such."""
+        """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
+        assert self._item is not None
         present = [key for key in keys if key in self._fields]
-        return any(self._session.has_errors or self._differs(key) for key in present)
+        # the fields show the last model without an error, not what the text has
+        is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
+        return any(is_wrong or self._differs(key) for key in present)
 
     def _differs(self, key: str) -> bool:
         given, value = self._given[key], self._fields[key].value
@@ -257,6 +260,8 @@ class ItemFields:
                 return replace(old, axis=axis)
             is_angle = kind is JointType.REVOLUTE
             limits = self._read_values("limits", 2, is_angle)
+            if limits and limits[0] > limits[1]:
+                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
             mimic = None
             if self._fields["leader"].value != NO_LEADER:
                 (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)

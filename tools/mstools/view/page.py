@@ -47,10 +47,14 @@ class ViewError(ModelServerError):
 
 @dataclass(frozen=True, slots=True)
 class Guard:
-    """Decides who may see the page: without a `token` who asks for `hosts` (name:port), else who has it."""
+    """Decides who may see the page: without a `token` who asks for `hosts` (name:port), else who has it.
+
+    `cookie` is the name of the cookie; browsers send those of one port to all ports of a machine.
+    """
 
     hosts: frozenset[str] = frozenset()
     token: str = ""
+    cookie: str = COOKIE
 
     def find_problem(self, request: Request) -> str:
         """Return why a request is denied, empty where it is not."""
@@ -65,12 +69,16 @@ class Guard:
         return ""
 
     def _has_token(self, request: Request) -> bool:
+        # the link's counts too where a cookie is there: it may be of a viewer that was served here before
+        given = (self._get_cookie_token(request), self._get_query_token(request))
+        return any(hmac.compare_digest(each.encode(), self.token.encode()) for each in given)
+
+    def _get_cookie_token(self, request: Request) -> str:
         try:
-            cookie = SimpleCookie(request.headers.get("Cookie", "")).get(COOKIE)
+            cookie = SimpleCookie(request.headers.get("Cookie", "")).get(self.cookie)
         except CookieError:
-            cookie = None
-        given = cookie.value if cookie is not None else self._get_query_token(request)
-        return hmac.compare_digest(given.encode(), self.token.encode())
+            return ""
+        return "" if cookie is None else cookie.value
 
     @staticmethod
     def _get_query_token(request: Request) -> str:
@@ -89,7 +97,7 @@ class Guard:
             response.headers["Referrer-Policy"] = "no-referrer"
             if self.token:
                 attributes = "HttpOnly; SameSite=Strict; Path=/"
-                response.headers["Set-Cookie"] = f"{COOKIE}={self.token}; {attributes}"
+                response.headers["Set-Cookie"] = f"{self.cookie}={self.token}; {attributes}"
         return response
 
 
@@ -127,7 +135,7 @@ def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool 
     token = "" if is_loopback and not with_token else secrets.token_urlsafe(TOKEN_BYTES)
     host = f"[{address}]" if ":" in address else address
     reached = _find_own_address() if ipaddress.ip_address(address).is_unspecified else host
-    guard = Guard(frozenset(f"{name}:{port}" for name in (*LOOPBACK_NAMES, host)), token)
+    guard = Guard(frozenset(f"{name}:{port}" for name in (*LOOPBACK_NAMES, host)), token, f"{COOKIE}_{port}")
     # its own messages on stdout are replaced by the link
     with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", partial(_serve, guard, bound)):
         server = PageServer(host=address, port=port, label="ModelServer", verbose=False)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
 import queue
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from modelserver.errors import ModelServerError, QueryError
@@ -29,6 +32,11 @@ SHOWN_EVENTS: Final = 8
 QUERY_PERIOD_S: Final = 0.5
 STATE_PERIOD_S: Final = 0.5
 SHOWN_STATES: Final = 40
+NO_STATE: Final = "-"
+VALUE_COLOR: Final = "#228be6"
+SIGMA_COLOR: Final = "#9ab8d4"
+RATE_PERIOD_US: Final = 3_000_000
+"""Rates of sensors are means over this time: a report alone may be of a tenth of a second."""
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|$~])")
 
@@ -54,8 +62,8 @@ class QueryPanel:
         self._source = source
         self._executor = ThreadPoolExecutor(1, "query")
         self._running: Future[tuple[str, str, tuple[str, ...]]] | None = None
-        self._asked: tuple[object, ...] = ()
-        self._asked_at = -math.inf
+        self._last_query: tuple[object, ...] = ()
+        self._queried_at = -math.inf
         self.path: tuple[str, ...] = ()
         """Frames on the path of the shown answer."""
         gui.add_markdown("Click an axis or a body in the scene: **frame**. With Shift: **in**.")
@@ -76,6 +84,11 @@ class QueryPanel:
         offered = (frames[-1] if frames else WORLDS[0], base_frame or WORLDS[0])
         self.set_frames(*[old if old in (*frames, *WORLDS) else new for old, new in zip(chosen, offered, strict=True)])
 
+    @property
+    def frames(self) -> tuple[str, str]:
+        """The two frames."""
+        return self._interest.value, self._reference.value
+
     def set_frames(self, interest: str, reference: str) -> None:
         """Choose the two frames."""
         self._interest.value, self._reference.value = interest, reference
@@ -85,9 +98,9 @@ class QueryPanel:
         (self._reference if is_reference else self._interest).value = frame
 
     def update(self, utime: int, now: float, state: object) -> bool:
-        """Ask again where the question or its time changed; return whether the shown answer changed.
+        """Query again where the frames or the time changed; return whether the shown answer changed.
 
-        `utime` is 0 for the latest; `state` differs where the answer to the same question may.
+        `utime` is 0 for the latest; `state` differs where the answer to the same query may.
         """
         if self._running is not None:
             if not self._running.done():
@@ -96,15 +109,15 @@ class QueryPanel:
             self._running = None
             self._answer.content, self._code.content = text, code
             return True
-        question = (self._interest.value, self._reference.value, utime, state)
-        if question == self._asked or now - self._asked_at < QUERY_PERIOD_S or not self._interest.value:
+        query = (self._interest.value, self._reference.value, utime, state)
+        if query == self._last_query or now - self._queried_at < QUERY_PERIOD_S or not self._interest.value:
             return False
-        self._asked, self._asked_at = question, now
-        self._running = self._executor.submit(self._ask, self._interest.value, self._reference.value, utime)
+        self._last_query, self._queried_at = query, now
+        self._running = self._executor.submit(self._run_query, self._interest.value, self._reference.value, utime)
         return False
 
-    def _ask(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
-        """Return the answer, the code that asks for it, and the frames of the path."""
+    def _run_query(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
+        """Return the answer, the code of the query, and the frames of the path."""
         answers = self._source.answers
         code = format_code(interest, reference, utime, None)
         try:
@@ -165,12 +178,17 @@ def describe_answer(explanation: Explanation, motion: MotionAnswer | None) -> st
             (name, *(f"{scale * value + 0.0:.3f}" for value in values), unit) for name, values, scale, unit in vectors
         ]
         parts.append(format_table(("motion", "x", "y", "z", ""), moving))
+    # a joint has the name of its constraint
     edges = [
-        (each.name, each.kind, _format_share(each.position_share), _format_share(each.rotation_share))
+        (
+            f"joint {each.name}" if each.kind == "joint" else each.name,
+            _format_share(each.position_share),
+            _format_share(each.rotation_share),
+        )
         for each in explanation.edges
     ]
     if edges:
-        parts.append(format_table(("path", "kind", "position", "rotation"), edges))
+        parts.append(format_table(("path", "position", "rotation"), edges))
         parts.append("Shares are of the variance.")
     return "\n\n".join(parts)
 
@@ -184,19 +202,37 @@ def _format_share(share: float) -> str:
 
 
 def format_code(interest: str, reference: str, utime: int, answer: PoseAnswer | None) -> str:
-    """Return the question in Python and for the command line, and the answer in YAML, as code blocks."""
+    """Return the query in Python and for the command line, and the answer in YAML, as code blocks."""
     at = f", at={utime}" if utime else ""
     blocks = [
-        ("python", f'platform.get_pose("{interest}", "{reference}"{at})'),
-        ("shell", f"modelserver query '{interest}' '{reference}'" + (f" --at {utime}" if utime else "")),
+        ("python", f"platform.get_pose({_quote(interest)}, {_quote(reference)}{at})"),
+        (
+            "shell",
+            f"modelserver query {_quote_shell(interest)} {_quote_shell(reference)}{f' --at {utime}' if utime else ''}",
+        ),
     ]
     if answer is not None:
         found = answer.transformation
         xyz, rpy = (
             ", ".join(f"{value + 0.0:.6g}" for value in each) for each in (found.pose.xyz, map(math.degrees, found.rpy))
         )
-        blocks.append(("yaml", f"xyz: [{xyz}]\nrpy_deg: [{rpy}]"))
+        lines = [f"xyz: [{xyz}]", f"rpy_deg: [{rpy}]"]
+        if found.covariance is not None:
+            sigmas = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)) * np.repeat((1.0, math.degrees(1.0)), 3)
+            meters, degrees = (", ".join(f"{each:.4g}" for each in part) for part in (sigmas[:3], sigmas[3:]))
+            lines.append(f"sigma: {{xyz: [{meters}], rpy_deg: [{degrees}]}}")
+        blocks.append(("yaml", "\n".join(lines)))
     return "\n\n".join(f"```{language}\n{text}\n```" for language, text in blocks)
+
+
+def _quote(name: str) -> str:
+    """Return a name as a string of Python."""
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _quote_shell(name: str) -> str:
+    """Return a name as a word of a shell, always in quotes."""
+    return f"'{name}'" if "'" not in name else shlex.quote(name)
 
 
 class TimePanel:
@@ -210,6 +246,7 @@ class TimePanel:
         self._end = 0
         self._at = 0.0
         self._shown_at = math.nan
+        self._is_settled = False
         self.is_playing = False
         self.is_following = is_live
         self._drive: Drive | None = None
@@ -291,10 +328,15 @@ class TimePanel:
         length = max((self._end - self._begin) * 1e-6, 0.1)
         if abs(self._slider.max - length) > 0.5:
             self._slider.max = math.ceil(length * 20.0) / 20.0
-        if self._at != self._shown_at:
+        if self._at != self._shown_at or not self._is_settled:
+            # sent again once it stays: a browser may have moved the slider while another value was underway to it
+            self._is_settled = self._at == self._shown_at
             self._shown_at = self._at
-            self._slider.value = round(min(self._at, self._slider.max) * 20.0) / 20.0
-        here = self._begin + round(self._at * 1e6)
+            value = round(min(self._at, self._slider.max) * 20.0) / 20.0
+            if self._is_settled:
+                self._slider.value = value + 0.05
+            self._slider.value = value
+        here = self._begin + round(self._at * 1e6) if self._begin else 0
         when = datetime.fromtimestamp(here * 1e-6, UTC).isoformat(sep=" ", timespec="milliseconds") if here else ""
         clock = f"**{self._at:.2f} s** of {length:.1f} s  \n{when}" if here else "no pose and no joints yet"
         self._set(self._clock, clock)
@@ -324,18 +366,51 @@ class StatePanel:
         with gui.add_folder("Findings"):
             self._findings = gui.add_markdown("")
         with gui.add_folder("Filter", expand_by_default=False):
+            self._state: Any = gui.add_dropdown(
+                "State", (NO_STATE,), hint="Its last minute, with one sigma to each side"
+            )
+            self._course = gui.add_uplot(
+                (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
+                (
+                    {"label": "s"},
+                    {"label": "value", "stroke": VALUE_COLOR, "width": 2},
+                    {"label": "+ sigma", "stroke": SIGMA_COLOR},
+                    {"label": "- sigma", "stroke": SIGMA_COLOR},
+                ),
+                scales={"x": {"time": False}},
+                legend={"show": False},
+                height=180,
+                visible=False,
+            )
             self._states = gui.add_markdown("")
+
+    def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
+        """Show the last minute of the chosen state."""
+        options = (NO_STATE, *states)
+        if tuple(self._state.options) != options:
+            chosen = self._state.value
+            self._state.options = options
+            self._state.value = chosen if chosen in options else NO_STATE
+        self._course.visible = self._state.value != NO_STATE
+        if self._course.visible:
+            times, values, sigmas = drive.get_state_course(self._state.value, utime)
+            self._course.data = (times, values, values + sigmas, values - sigmas)
 
     def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
         """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
         health = drive.get_health(utime)
         state = "**invalid:** " + escape_markdown(picture.invalid.explain()) if picture.invalid else "**valid**"
         text = "no pose" if picture.pose is None else f"The pose is {state}"
+        silent = drive.find_silence(now) if now and not utime else ""
+        if silent:
+            text = f"**{escape_markdown(silent)}**\n\nBefore: {text[:1].lower() + text[1:]}"
         if health is not None:
             rows = [(line[:9].strip(), line[9:].strip()) for line in format_body(health).splitlines()]
             text += f"\n\n{format_table(('', ''), rows)}"
         self._validity.content = text
-        self._channels.content = _format_channels(drive, health, now)
+        earlier = drive.get_health(health.utime - RATE_PERIOD_US) if health is not None else None
+        parts = [] if health is None else [_format_sensors(health, earlier)]
+        self._channels.content = "\n\n".join([*parts, _format_channels(drive, now)])
         findings = [(subject, text) for subject, text in health.warnings] if health is not None else []
         rejected = [(what, f"{reason}: {count}") for what, reason, count in health.rejected] if health else []
         parts = [format_table(("", "finding"), findings) if findings else "no finding"]
@@ -344,40 +419,62 @@ class StatePanel:
         self._findings.content = "\n\n".join(parts)
         navigation = drive.get_navigation_state(utime)
         self._states.content = "no state published" if navigation is None else _format_states(navigation)
+        self._show_course(drive, utime, navigation.names if navigation is not None else ())
 
 
-def _format_channels(drive: Drive, health: Health | None, now: int) -> str:
-    rows = [
-        (
-            name,
-            "-" if math.isnan(each.rate) else f"{each.rate:.1f}",
-            format_duration(max(now - each.last, 0) * 1e-6) if now else "-",
-            str(each.count),
+def _format_sensors(health: Health, earlier: Health | None) -> str:
+    """Format the sensors of a report, with rates since an earlier one, as of the report alone where there is none."""
+    before = {each.channel: each.count for each in earlier.channels} if earlier is not None else {}
+    seconds = (health.utime - earlier.utime) * 1e-6 if earlier is not None else 0.0
+    rows = []
+    for each in health.channels:
+        if each.channel.startswith("command:"):
+            continue
+        # less after a restart of the service
+        has_rate = seconds > 0.0 and each.count >= before.get(each.channel, each.count + 1)
+        rate = (each.count - before[each.channel]) / seconds if has_rate else each.rate_hz
+        age = "never" if math.isnan(each.age) else format_duration(each.age)
+        rows.append(
+            (
+                each.channel.removeprefix("sensor:"),
+                f"{rate:.1f}",
+                f"{age}, silent" if each.silent and each.count else age,
+                f"{each.used} of {each.measured}" if each.measured else "-",
+            )
         )
-        for name, each in sorted(drive.channels.items())
-        if not name.startswith("REPLY_")
-    ]
-    sensors = [
-        (each.channel.removeprefix("sensor:"), f"{each.rate_hz:.1f} Hz", f"{each.used} of {each.measured} used")
-        for each in (health.channels if health is not None else ())
-        if each.channel.startswith("sensor:")
-    ]
-    parts = [format_table(("sensor", "rate", "measurements"), sensors)] if sensors else []
-    parts.append(format_table(("channel", "Hz", "age", "count"), rows) if rows else "no message")
+    return format_table(("sensor", "Hz", "age", "used"), rows) if rows else "no sensor"
+
+
+def _format_channels(drive: Drive, now: int) -> str:
+    """Format the channels of the bus: live with age and rate, in a log with the mean rate of all of it."""
+    found = [(name, each) for name, each in sorted(drive.channels.items()) if not name.startswith("REPLY_")]
+    if now:
+        header = ("channel", "Hz", "age", "count")
+        rows = [
+            (name, _format_rate(each.rate), format_duration(max(now - each.last, 0) * 1e-6), str(each.count))
+            for name, each in found
+        ]
+    else:
+        header = ("channel", "mean Hz", "count", "")
+        rows = [(name, _format_rate(each.mean_rate), str(each.count), "") for name, each in found]
+    parts = [format_table(header, rows) if rows else "no message"]
     drivers = [(each.source, each.phase.name.lower(), f"{each.rate_hz:.1f} Hz") for each in drive.drivers.values()]
     if drivers:
         parts.append(format_table(("driver", "phase", "rate"), sorted(drivers)))
     return "\n\n".join(parts)
 
 
+def _format_rate(rate: float) -> str:
+    return "-" if math.isnan(rate) else f"{rate:.1f}"
+
+
 def _format_states(navigation: Any) -> str:
     """Format the states of the filter with their standard deviations."""
     count = len(navigation.names)
-    has_covariance = len(navigation.covariance) == count * count
     rows = []
     for n, (name, value) in enumerate(zip(navigation.names, navigation.values, strict=True)):
-        sigma = f"{math.sqrt(max(navigation.covariance[n * (count + 1)], 0.0)):.3g}" if has_covariance else "-"
-        rows.append((name, f"{value:.4g}", sigma))
+        sigma = math.sqrt(max(navigation.covariance[n * (count + 1)], 0.0))
+        rows.append((name, f"{value:.4g}", f"{sigma:.3g}"))
     return format_table(("state", "value", "sigma"), rows[:SHOWN_STATES]) if rows else "no state"
 
 

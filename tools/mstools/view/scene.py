@@ -13,7 +13,7 @@ Bodies that no constraints join to the base frame are drawn beside the vehicle.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
@@ -107,7 +107,7 @@ class VehicleScene:
         self._frames: FramePoses | None = None
         self._poses: dict[str, Pose] = {}
         self._segments: list[ConstraintLine] = []
-        self._labels: list[tuple[NameLabels, viser.LabelHandle]] = []
+        self._labels: list[tuple[NameLabels, str, viser.LabelHandle]] = []
         self._model: Model | None = None
         self._positions: Mapping[str, float] = {}
         self._path: tuple[str, ...] = ()
@@ -200,16 +200,15 @@ class VehicleScene:
         return size
 
     def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
-        shapes = body.visuals or body.collisions
-        for number, shape in enumerate(shapes or (_make_box(body),)):
-            color, opacity = BODY_COLOR, 0.2 if not shapes else 1.0
-            if shape.material is not None and shape.material.color is not None:
-                red, green, blue, opacity = shape.material.color
-                color = (round(255 * red), round(255 * green), round(255 * blue))
-            node = self._draw_shape(f"{root}/shape/{number}", shape, color, opacity)
+        for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
+            nodes = [self._draw_shape(f"{root}/{kind}/{number}", shape, kind) for number, shape in enumerate(shapes)]
+            drawn = [node for node in nodes if node is not None]
             # what can be clicked hides from the pointer what is behind it: frames in a stand-in box, and the gizmo
-            if node is not None and shapes and body.frames and not self.is_edited:
-                self._add_pick(node, lambda _: body.frames[0].full_name)
+            if kind != "box" and body.frames and not self.is_edited:
+                for node in drawn:
+                    self._add_pick(node, lambda _: body.frames[0].full_name)
+            if drawn:
+                break
         self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0), labels)
         if not body.frames:
             return
@@ -228,14 +227,19 @@ class VehicleScene:
         label = self._scene.add_label(
             node, text, position=place, visible=kind == shown, font_screen_scale=0.8, anchor="bottom-center"
         )
-        self._labels.append((kind, label))
+        self._labels.append((kind, text, label))
 
     def _add_pick(self, node: Any, find_frame: Callable[[Any], str]) -> None:
         """Make a node clickable."""
         node.on_click(lambda event: self._pick(find_frame(event), False))
         node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
 
-    def _draw_shape(self, name: str, shape: Shape, color: Rgb, opacity: float) -> Any:
+    def _draw_shape(self, name: str, shape: Shape, kind: str) -> Any:
+        """Draw a shape; None for a mesh that cannot be read."""
+        color, opacity = BODY_COLOR, 0.2 if kind == "box" else 1.0
+        if shape.material is not None and shape.material.color is not None:
+            red, green, blue, opacity = shape.material.color
+            color = (round(255 * red), round(255 * green), round(255 * blue))
         scene, place = self._scene, shape.pose
         transparency = opacity if opacity < 1.0 else None
         look: dict[str, Any] = {
@@ -253,15 +257,17 @@ class VehicleScene:
         try:
             mesh = read_mesh(shape.file, self._folder)
         except (OSError, ValueError) as error:
-            self.unread.append(f"{shape.file}: {error}")
+            problem = f"{shape.file}: {error}"
+            if problem not in self.unread:
+                self.unread.append(problem)
             return None
         vertices = np.asarray(mesh.vertices, np.float32) * np.array(shape.size, np.float32)
         return scene.add_mesh_simple(name, vertices, np.asarray(mesh.faces, np.uint32), side="double", **look)
 
-    def show_labels(self, shown: NameLabels) -> None:
-        """Show the names of bodies or frames."""
-        for kind, label in self._labels:
-            label.visible = kind == shown
+    def show_labels(self, shown: NameLabels, chosen: Collection[str] = ()) -> None:
+        """Show the names of bodies or frames, and those of some frames in any case."""
+        for kind, text, label in self._labels:
+            label.visible = kind == shown or (kind is NameLabels.FRAMES and text in chosen)
 
     # --- pictures
 
@@ -374,7 +380,7 @@ class VehicleScene:
             self._trail_span = begin, end = span
             step = max(1, -(-len(points) // MAX_TRAIL_POINTS))
             self._draw_line(self._trail, points[::-1][::step][::-1])
-        self._draw_line(self._trail_end, points[utimes >= end])
+        self._draw_line(self._trail_end, points[np.searchsorted(utimes, end) :])
 
     @staticmethod
     def _draw_line(lines: Any, points: Array) -> None:

@@ -37,8 +37,8 @@ PROGRESS_EVENTS: Final = 20_000
 class Source:
     """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
 
-    `folder` is that of the geometry file, in which its meshes are. `set_joints` moves the joints of a geometry file,
-    `set_model` shows it as edited.
+    `folder` is that of the geometry file, in which its meshes are; `damage` describes what a log lost. `set_joints`
+    moves the joints of a geometry file, `set_model` shows it as edited.
     """
 
     title: str
@@ -48,6 +48,7 @@ class Source:
     is_live: bool = False
     set_joints: Callable[[Mapping[str, float]], None] | None = None
     set_model: Callable[[Model], None] | None = None
+    damage: tuple[str, ...] = ()
     lock: threading.Lock = field(default_factory=threading.Lock)
     _resources: ExitStack = field(default_factory=ExitStack)
 
@@ -146,10 +147,12 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
         drive = Drive(prefix, loaded, base, keep_geometry=True)
     with LogFile(path) as log:
         contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
+        damage = tuple(map(str, log.damage))
     answers = LogPlatform(path, prefix, given, contents)
     if not drive.base_frame:
         drive.base_frame = answers.base_frame
-    return Source(path.name, drive, answers, model.resolve().parent if model is not None else None)
+    folder = model.resolve().parent if model is not None else None
+    return Source(path.name, drive, answers, folder, damage=damage)
 
 
 def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], None]) -> Iterator[LogEvent]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+import traceback
 from collections.abc import Callable
 from functools import partial
 from typing import Final
@@ -12,7 +13,15 @@ from modelserver.geometry.model import Model
 from mstools.edit.document import GeometryItem, ItemKind
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Page
-from mstools.view.panels import STATE_PERIOD_S, DisplayPanel, JointsPanel, QueryPanel, StatePanel, TimePanel
+from mstools.view.panels import (
+    STATE_PERIOD_S,
+    DisplayPanel,
+    JointsPanel,
+    QueryPanel,
+    StatePanel,
+    TimePanel,
+    escape_markdown,
+)
 from mstools.view.scene import NameLabels, VehicleScene
 from mstools.view.sources import Source
 
@@ -34,12 +43,13 @@ class Viewer:
         self._server = page.server
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._model: Model | None = None
-        self._labels = NameLabels.BODIES
+        self._named: tuple[NameLabels, tuple[str, str]] | None = None
         self._next_slider = self._next_state = self._next_fixes = 0.0
         gui = page.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"ModelServer: {source.title}")
+        self._title = ""
+        self._show_title("")
         self._scene = VehicleScene(page.server, source.folder, self._pick)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Query"):
@@ -80,12 +90,22 @@ class Viewer:
         if self._editor is not None:
             self._editor.close()
 
+    def _execute(self, action: Callable[[], None]) -> None:
+        """Execute an action of the page. An error of this program does not end it: changes may not be saved yet."""
+        try:
+            action()
+        except Exception as error:
+            traceback.print_exc()
+            text = f"{type(error).__name__}: {error}. Details are where modelserver view was started."
+            for client in self._server.get_clients().values():
+                client.add_notification("Internal error; nothing was done", text, color="red")
+
     def draw(self, now: float, seconds: float) -> None:
         """Draw one picture, `seconds` after the last one."""
         while not self._actions.empty():
-            self._actions.get()()
+            self._execute(self._actions.get())
         if self._editor is not None:
-            self._editor.update()
+            self._editor.update(now)
         source, display = self._source, self._display
         with source.lock:
             drive = source.drive
@@ -96,13 +116,13 @@ class Viewer:
             picture = drive.get_picture(utime)
             utimes, track = drive.get_track(picture.utime, display.trail_s)
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
-            model, origin = drive.model, drive.origin
+            origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
             if model is not None and model is not self._model:
-                self._set_model(model, drive.base_frame)
-            if display.labels is not self._labels:
-                self._labels = display.labels
-                self._scene.show_labels(self._labels)
+                self._set_model(model, base_frame)
+            if (named := (display.labels, self._query.frames)) != self._named:
+                self._named = named
+                self._scene.show_labels(*named)
             self._scene.follow = display.follow
             self._scene.show(picture)
             self._scene.show_trail(utimes, track)
@@ -116,13 +136,24 @@ class Viewer:
             self._time.show()
         if now >= self._next_state and self._state is not None:
             self._next_state = now + STATE_PERIOD_S
+            clock = time.time_ns() // 1000 if source.is_live else 0
             with source.lock:
-                self._state.show(drive, picture, utime, time.time_ns() // 1000 if source.is_live else 0)
+                self._state.show(drive, picture, utime, clock)
+                is_silent = source.is_live and bool(drive.find_silence(clock))
+            self._show_title("no message" if is_silent else "")
         if self._query.update(utime, now, picture.utime):
             self._scene.highlight_path(self._query.path)
 
+    def _show_title(self, note: str) -> None:
+        """Show the title over all tabs, with a note."""
+        title = f"ModelServer: {self._source.title}{f' - {note}' if note else ''}"
+        if title != self._title:
+            self._title = title
+            self._server.gui.set_panel_label(title)
+
     def _set_model(self, model: Model, base_frame: str) -> None:
-        size = self._scene.set_model(model, base_frame, self._labels)
+        size = self._scene.set_model(model, base_frame, self._display.labels)
+        self._named = None
         if self._model is None:
             self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
             self._server.initial_camera.position = (1.2 * size, 1.6 * size, 1.3 * size)
@@ -132,6 +163,5 @@ class Viewer:
             self._joints.set_model(model)
         if self._editor is not None:
             self._editor.show_gizmo()
-        if self._scene.unread:
-            rows = "\n".join(f"- {each}" for each in self._scene.unread)
-            self._notes.content = f"Meshes that are not drawn:\n\n{rows}"
+        rows = "\n".join(f"- {escape_markdown(each)}" for each in self._scene.unread)
+        self._notes.content = f"Meshes that are not drawn:\n\n{rows}" if rows else ""
