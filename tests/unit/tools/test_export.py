@@ -159,3 +159,32 @@ def test_given_a_file_that_exists_then_it_stays_unless_forced(
     assert out.read_text() == "mine"
     assert run(log, out, "--force") == 0
     assert out.stat().st_size > 1000
+
+
+def run_import(mcap: Path, out: Path, *options: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["import-bag", str(mcap), str(out), *options])
+    return int(ended.value.code or 0)
+
+
+def test_given_an_exported_file_then_import_bag_makes_the_log_again(log: Path, mcap: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.lcm"
+    assert run_import(mcap, again) == 0
+    with LogFile(log) as first, LogFile(again) as second:
+        assert [(e.utime, e.channel, e.data) for e in second] == [(e.utime, e.channel, e.data) for e in first]
+
+
+def test_given_a_file_without_lcm_messages_or_a_damaged_one_then_import_bag_says_so(
+    log: Path, mcap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain, cut, out = tmp_path / "plain.mcap", tmp_path / "cut.mcap", tmp_path / "out.lcm"
+    with pytest.raises(SystemExit):
+        main(["export", str(log), str(plain), "--no-raw"])
+    assert run_import(plain, out) != 0
+    assert "without --no-raw" in capsys.readouterr().err
+    cut.write_bytes(mcap.read_bytes()[:20_000])
+    assert run_import(cut, out) != 0
+    assert "cut.mcap: the MCAP file" in capsys.readouterr().err
+    assert run_import(mcap, out, "--topic", "/lcm/GPS=gps") != 0
+    assert "--topic goes with a ROS bag" in capsys.readouterr().err
+    assert not out.exists()

@@ -28,7 +28,7 @@ def command(
 
     It has the frames (/tf), the pose (/pose, /pose/fix), fixes (/fix/SOURCE), the shapes of the bodies (/model), health
     (/diagnostics) and events (/events) in Foxglove's schemas, and the LCM messages as they are (/lcm/CHANNEL). It needs
-    the extra foxglove: pip install 'modelserver[foxglove]'. import-bag is the reverse for ROS bags.
+    the extra foxglove: pip install 'modelserver[foxglove]'. import-bag makes the log of it again.
 
     Example: modelserver export drive.lcm drive.mcap
     """

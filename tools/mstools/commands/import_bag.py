@@ -27,13 +27,14 @@ from mstools.recordings.bag_messages import (
     TopicKind,
 )
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
+from mstools.recordings.mcap_log import is_mcap, open_mcap
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import show_progress
 
 
 def command(
-    bag: Annotated[Path, argument("BAG", "ROS 1 file, or folder of a ROS 2 recording.")],
+    bag: Annotated[Path, argument("BAG", "ROS 1 file, folder of a ROS 2 recording, or MCAP file of export.")],
     log: Annotated[Path, argument("LOG", "LCM event log to write.")],
     topic: Annotated[
         list[str] | None,
@@ -59,7 +60,7 @@ def command(
     force: Annotated[bool, option("--force", "Replace LOG if it exists.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a ROS bag to an LCM log of this project's types.
+    """Convert a ROS bag to an LCM log of this project's types, or an exported MCAP file back to its log.
 
     NavSatFix becomes GPS, Imu IMU, Odometry WHEELS, JointState JOINTS. A message's stamp is used as the time of
     measurement; the times of the log are the recorder's receive times. Options give what a bag does not state;
@@ -137,15 +138,51 @@ def import_bag(
         raise RecordingError(f"{log_path}: is a folder; give a file in it")
     if not log_path.parent.is_dir():
         raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
-    with open_bag(bag_path) as bag:
-        chosen, reports = choose_topics(bag.topics, dict(kinds or {}), str(bag_path))
-        part = log_path.with_name(f".{log_path.name}.{os.getpid()}.part")
+    part = log_path.with_name(f".{log_path.name}.{os.getpid()}.part")
+    try:
+        if is_mcap(bag_path):
+            reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
+        else:
+            with open_bag(bag_path) as bag:
+                chosen, of_topic = choose_topics(bag.topics, dict(kinds or {}), str(bag_path))
+                seconds = _write(bag, part, chosen, of_topic, options, prefix)
+                reports = list(of_topic.values())
+        os.replace(part, log_path)
+    finally:
+        part.unlink(missing_ok=True)
+    return ImportReport(str(log_path), reports, seconds)
+
+
+def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) -> tuple[list[TopicReport], float]:
+    """Write the LCM messages of an MCAP file; return the reports and the seconds between the first and the last."""
+    with open_mcap(mcap_path) as mcap:
+        reports = {
+            name: TopicReport(f"/lcm/{name}", type_name, f"{prefix}{name}")
+            for name, (type_name, _) in mcap.channels.items()
+        }
+        if not reports:
+            raise RecordingError(
+                f"{mcap_path}: no LCM messages (/lcm/...): modelserver export writes them without --no-raw. A ROS 2 "
+                "recording is given by its folder"
+            )
+        if has_kinds:
+            raise RecordingError(f"{mcap_path}: --topic goes with a ROS bag; this file has the messages as they were")
+        first = last = 0
+        out = lcm.EventLog(str(path), "w", overwrite=True)
         try:
-            seconds = _write(bag, part, chosen, reports, options, prefix)
-            os.replace(part, log_path)
+            with show_progress(
+                f"importing {mcap_path.name}", sum(count for _, count in mcap.channels.values())
+            ) as show:
+                for number, each in enumerate(mcap.read(), 1):
+                    report = reports[each.channel]
+                    out.write_event(each.utime, report.channel, each.data)
+                    report.written += 1
+                    first, last = first or each.utime, each.utime
+                    if number % 512 == 0:
+                        show(number)
         finally:
-            part.unlink(missing_ok=True)
-    return ImportReport(str(log_path), list(reports.values()), seconds)
+            out.close()
+    return list(reports.values()), (last - first) * 1e-6
 
 
 def choose_topics(
