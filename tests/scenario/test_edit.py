@@ -62,15 +62,29 @@ def edit(folder: Path, url: str, *more: str) -> Iterator[Page]:
         yield page
 
 
+def take_picture(page: Page) -> np.ndarray:
+    """Return the picture of a page once it does not change any more."""
+    before = np.zeros((1, 1, 3), int)
+    for _ in range(60):
+        page.wait_for_timeout(500)
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+        if picture.shape == before.shape and (np.abs(picture - before).sum(axis=2) > 90).sum() < 5:
+            break
+        before = picture
+    return picture
+
+
 def find_gizmo(page: Page) -> tuple[tuple[float, float], list[tuple[float, float]]]:
     """Return center and outermost points of the gizmo: where the scene differs without it."""
     box = find_fields(page, "Gizmo")
-    pictures = []
-    for is_shown in (True, False, True):
-        box.set_checked(is_shown)
-        page.wait_for_timeout(1500)
-        pictures.append(np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int))
-    changed = np.abs(pictures[0] - pictures[1]).sum(axis=2)[:, :SCENE_WIDTH] > 90
+    box.set_checked(False)
+    hidden = take_picture(page)
+    box.set_checked(True)
+    for _ in range(60):
+        shown = take_picture(page)
+        changed = np.abs(shown - hidden).sum(axis=2)[:, :SCENE_WIDTH] > 90
+        if changed.sum() > 50:
+            break
     rows, columns = np.nonzero(changed)
     assert len(rows) > 50, "there is no gizmo"
     center = (float(np.median(columns)), float(np.median(rows)))
@@ -196,8 +210,11 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(folde
                 page.mouse.move(x + 0.2 * part * dx, y + 0.2 * part * dy)
                 page.wait_for_timeout(100)
             page.mouse.up()
-            page.wait_for_timeout(700)
-            moved = page.get_by_text(re.compile("^geometry.yaml: ")).inner_text()
+            for _ in range(20):
+                page.wait_for_timeout(200)
+                moved = page.get_by_text(re.compile("^geometry.yaml: ")).inner_text()
+                if moved.endswith("not saved"):
+                    break
             if moved.endswith("not saved"):
                 break
         assert moved.endswith("not saved"), "no drag has moved the gizmo"
