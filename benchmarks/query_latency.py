@@ -30,6 +30,7 @@ from modelserver.messages import CHANNEL_OF, GetTransformation
 from modelserver.wire.channels import to_subscription_pattern
 from modelserver.wire.codec import decode, encode, pack_get_transformation
 from modelserver.wire.provider import resolve_url
+from modelserver.wire.receive_filter import open_receiver
 
 INTEREST, REFERENCE = "Digiclops:ImagePlane", "Raptor:CG"
 ROUNDS, CALLS = 40, 100
@@ -67,7 +68,8 @@ def run_minimal_server() -> None:
             1
         ]
         replies[question[_NAMES_AT:]] = encode(output.reply)
-    requests, sensors = lcm.LCM(resolve_url()), lcm.LCM(resolve_url())
+    (requests, receive), (sensors, ignore) = open_receiver(resolve_url()), open_receiver(resolve_url())
+    ignore.pass_only(["NOTHING"])
     sensors.subscribe("NOTHING", lambda channel, data: None)
 
     def answer(channel: str, data: bytes) -> None:
@@ -75,7 +77,9 @@ def run_minimal_server() -> None:
         reply = replies[names]
         requests.publish(client.decode(), reply[:8] + data[8:16] + _UTIME.pack(time.time_ns() // 1000) + reply[24:])
 
-    requests.subscribe(to_subscription_pattern(f"{MINIMAL}{CHANNEL_OF[GetTransformation]}"), answer)
+    channel = f"{MINIMAL}{CHANNEL_OF[GetTransformation]}"
+    receive.pass_only([channel])
+    requests.subscribe(to_subscription_pattern(channel), answer)
     poll = select.poll()
     poll.register(requests.fileno(), select.POLLIN)
     poll.register(sensors.fileno(), select.POLLIN)

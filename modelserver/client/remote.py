@@ -52,7 +52,8 @@ from modelserver.signing.signatures import Key, sign
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, SIGNED, to_subscription_pattern
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import handle_message, resolve_url
+from modelserver.wire.receive_filter import open_receiver
 
 REPLY_QUEUE_CAPACITY: Final = 64
 """Queued replies; further ones are lost."""
@@ -157,13 +158,14 @@ class Platform(PlatformClient):
         self._ids = random.Random(secrets.randbits(128))
         self._lock = threading.Lock()
         self._received: list[bytes] = []
-        self._lcm: lcm.LCM | None = open_lcm(self.url)
+        bus, receive_filter = open_receiver(self.url)
+        receive_filter.pass_only([self.reply_channel])
+        receive_filter.close()
+        self._lcm: lcm.LCM | None = bus
         self._last_request = 0.0
         received = self._received
         # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
-        subscription = self._lcm.subscribe(
-            to_subscription_pattern(self.reply_channel), lambda _, data: received.append(data)
-        )
+        subscription = bus.subscribe(to_subscription_pattern(self.reply_channel), lambda _, data: received.append(data))
         # between two requests only replies to programs of the same name arrive
         subscription.set_queue_capacity(REPLY_QUEUE_CAPACITY)
 

@@ -26,7 +26,8 @@ from typing import Final, Protocol, TypeAlias
 import lcm
 
 from modelserver.wire.channels import to_subscription_pattern
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import handle_message, resolve_url
+from modelserver.wire.receive_filter import open_receiver
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +168,8 @@ class LcmInbox:
 
     def __init__(self, url: str, queue_bytes: int):
         self._queue_bytes = queue_bytes
-        self.lcm = open_lcm(url)
+        self.lcm, self._filter = open_receiver(url)
+        self._channels: list[str] = []
         self._subscriptions: list[lcm.LCMSubscription] = []
         self.fileno = self.lcm.fileno()
         self.expected: int | None = None
@@ -182,6 +184,8 @@ class LcmInbox:
                 self._subscriptions[index].set_queue_capacity(limit.capacity)
             handler(name, data)
 
+        self._channels.append(channel)
+        self._filter.pass_only(self._channels)
         subscription = self.lcm.subscribe(to_subscription_pattern(channel), handle)
         # LCM drops silently beyond it; the loop drops and counts long before, unless a flood is faster than that
         subscription.set_queue_capacity(limit.capacity)
@@ -192,6 +196,7 @@ class LcmInbox:
         for each in self._subscriptions:
             self.lcm.unsubscribe(each)
         self._subscriptions.clear()
+        self._filter.close()
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """See `Inbox`."""
