@@ -180,9 +180,9 @@ class LcmInbox:
         limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
 
         def handle(name: str, data: bytes) -> None:
+            handler(name, data)  # first: a client may wait for its reply
             if limit.update(len(data)):
                 self._subscriptions[index].set_queue_capacity(limit.capacity)
-            handler(name, data)
 
         self._channels.append(channel)
         self._filter.pass_only(self._channels)
