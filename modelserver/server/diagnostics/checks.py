@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import quote
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
-from modelserver.wire.urls import GROUP, make_route_command
+from modelserver.wire.urls import UdpAddress, make_route_command
 
 
 class DiagnosisLevel(IntEnum):
@@ -129,34 +128,6 @@ MIB = 1 << 20
 
 LOST_PACKETS = "lost packets"
 """Subject of the diagnosis on dropped packets."""
-
-
-@dataclass(frozen=True, slots=True)
-class UdpAddress:
-    """An LCM provider over UDP multicast: group, port, time to live (hops), requested receive buffer (bytes)."""
-
-    group: str = GROUP
-    port: int = 7667
-    ttl: int = 0
-    buffer: int = 0
-
-
-def parse_udp_address(url: str) -> UdpAddress | None:
-    """Parse an LCM URL; None for another provider than udpm, and for an invalid URL."""
-    default = UdpAddress()
-    try:
-        parts = urlsplit(url)
-        options = dict(parse_qsl(parts.query))
-        if parts.scheme != "udpm":
-            return None
-        return UdpAddress(
-            parts.hostname or default.group,
-            parts.port or default.port,
-            int(options.get("ttl", default.ttl)),
-            int(options.get("recv_buf_size", 0)),
-        )
-    except ValueError:
-        return None
 
 
 @dataclass(frozen=True, slots=True)

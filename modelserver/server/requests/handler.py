@@ -2,7 +2,7 @@
 
 One pass of the server loop gives it a slice of at most a millisecond:
 
-1. Receive. The requests in liblcm's queue go into the per-client queues, undecoded. So fairness begins at the socket:
+1. Receive. The requests in the receive buffer go into the per-client queues, undecoded. So fairness begins there:
    in a queue shared by all clients a flood would delay everyone. Only the first request of a pass, if none waits, is
    answered before the next one is received: the latency of a single client.
 2. Answer queued requests in the order of the scheduler (`scheduler`).
@@ -63,8 +63,8 @@ STEP_ROOM_NS: Final = 1_500_000
 STARVED_NS: Final = 50_000_000
 """Deferred work without a step for so long gets one in any case."""
 
-PREPARE_NS: Final = 100_000
-"""Time for preparing replies before the loop looks for messages again."""
+PREPARE_NS: Final = 20_000
+"""Time for preparing replies before the loop looks for messages again: for one, since a client may be about to ask."""
 
 MAX_PREPARED: Final = 16
 """Pairs of frames whose replies are prepared at once."""
@@ -255,7 +255,7 @@ class RequestHandler:
         self.deferred = None
 
     def _receive(self, until_ns: int) -> bool:
-        """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
+        """Receive requests into their clients' queues; return whether more may wait in the receive buffer."""
         drain = self._bus.requests.drain
         for _ in range(MAX_RECEIVED // RECEIVE_BATCH):
             if drain(RECEIVE_BATCH) < RECEIVE_BATCH:
