@@ -66,6 +66,9 @@ STARVED_NS: Final = 50_000_000
 PREPARE_NS: Final = 20_000
 """Time for preparing replies before the loop looks for messages again: for one, since a client may be about to ask."""
 
+PREPARE_ROOM_NS: Final = 200_000
+"""Preparing begins only this long before the next tick."""
+
 MAX_PREPARED: Final = 16
 """Pairs of frames whose replies are prepared at once."""
 
@@ -209,7 +212,7 @@ class RequestHandler:
         now = self._clock.now()
         view = self._context.state.view
         if (
-            until_ns - now.monotonic_ns < 2 * PREPARE_NS
+            until_ns - now.monotonic_ns < PREPARE_ROOM_NS
             or not self._cache.is_of(view.model)
             or self.contention.is_contended(now.monotonic_ns)
         ):
