@@ -151,7 +151,7 @@ class BusFacts:
     delivered, delivered_large: whether an own message came back, and one of several packets.
     buffer: receive buffer that the kernel granted for `RECEIVE_BUFFER_BYTES`, bytes.
     buffer_default: receive buffer of programs that request none, bytes.
-    dropped: packets that receivers on the bus's port have lost so far.
+    dropped: packets that receivers on the bus's port have lost so far, at most.
     """
 
     url: str
@@ -251,10 +251,10 @@ def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
         why = "lcm-spy, lcm-logger and clients without recv_buf_size in their URL lose messages in bursts"
         yield Diagnosis(NOTE, subject, observed, why, _sysctl_command("net.core.rmem_default", RECEIVE_BUFFER_BYTES))
     if facts.dropped:
-        observed = f"running programs on this bus have lost {facts.dropped} packets so far"
+        observed = f"running programs on this bus have lost up to {facts.dropped} packets so far"
         why = (
             "one of them is too slow for the traffic, or its buffer is too small (recv_buf_size in its URL); the "
-            "command shows which: d of its skmem"
+            "command shows which: d of its skmem, which also counts packets that a socket filter drops"
         )
         yield Diagnosis(WARNING, LOST_PACKETS, observed, why, f"sudo ss -uanmp 'sport = :{address.port}'")
 
