@@ -11,6 +11,7 @@ import os
 import random
 import re
 import secrets
+import select
 import socket
 import struct
 import sys
@@ -50,12 +51,13 @@ from modelserver.messages import (
 from modelserver.signing.key_files import KEY_FILE_VARIABLE, read_keys
 from modelserver.signing.signatures import Key, sign
 from modelserver.transforms.transformation import Transformation
-from modelserver.wire.channels import REPLY_PREFIX, SIGNED, to_subscription_pattern
+from modelserver.wire.channels import REPLY_PREFIX, SIGNED
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.receiver import Receiver, open_receiver
 
-REPLY_QUEUE_CAPACITY: Final = 64
-"""Queued replies; further ones are lost."""
+MAX_DISCARDED: Final = 1024
+"""Queued replies that are discarded before a request."""
 
 IDLE_S: Final = 0.01
 """After this time without a request, queued replies (to programs of the same name) are discarded first."""
@@ -156,21 +158,18 @@ class Platform(PlatformClient):
         # ids need to differ between programs, not to be unguessable
         self._ids = random.Random(secrets.randbits(128))
         self._lock = threading.Lock()
-        self._received: list[bytes] = []
         self._lcm: lcm.LCM | None = open_lcm(self.url)
+        self._receiver = open_receiver(self.url)
+        self._receiver.subscribe(self.reply_channel)
+        self._poll = select.poll()
+        self._poll.register(self._receiver.fileno, select.POLLIN)
         self._last_request = 0.0
-        received = self._received
-        # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
-        subscription = self._lcm.subscribe(
-            to_subscription_pattern(self.reply_channel), lambda _, data: received.append(data)
-        )
-        # between two requests only replies to programs of the same name arrive
-        subscription.set_queue_capacity(REPLY_QUEUE_CAPACITY)
 
     def close(self) -> None:
         """Leave the bus. Further queries raise ValueError."""
         with self._lock:
             self._lcm = None
+            self._receiver.close()
 
     def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
         # packed without `_query`: the hot path
@@ -267,7 +266,7 @@ class Platform(PlatformClient):
         """Send a request up to `tries` times (0: 1 + retries) until a reply with its id is complete; return that."""
         tries = tries or 1 + self.retries
         request_id = request_id or request[_REQUEST_ID]
-        received = self._received
+        receive = self._receiver.receive
         with self._lock:
             bus = self._lcm
             if bus is None:
@@ -275,17 +274,17 @@ class Platform(PlatformClient):
             for tried in range(tries):
                 begin = time.monotonic()
                 if tried or begin > self._last_request + IDLE_S:
-                    _discard_unread(bus)
+                    _discard_unread(self._receiver)
                 self._last_request = begin
-                received.clear()
                 bus.publish(channel, request)
                 left = timeout
                 while left > 0:
-                    handle_message(bus, int(left * 1000) + 1 if left < MAX_WAIT_S else _MAX_WAIT_MS)
-                    for reply in received:
+                    self._poll.poll(int(left * 1000) + 1 if left < MAX_WAIT_S else _MAX_WAIT_MS)
+                    message = receive()
+                    if message is not None:
+                        reply = message[1]
                         if reply[_REQUEST_ID] == request_id and (is_complete is None or is_complete(reply)):
                             return reply
-                    received.clear()
                     left = begin + timeout - time.monotonic()
         raise NoServerError(
             f"no reply on {self.reply_channel} to a request on {channel} at {self.url} after "
@@ -323,9 +322,9 @@ def decode_pose_reply(data: bytes, frame_of_interest: str, frame_of_reference: s
     return answer or require_answer(_decode_reply(data, TransformReply).answer)
 
 
-def _discard_unread(bus: lcm.LCM) -> None:
-    for _ in range(REPLY_QUEUE_CAPACITY):
-        if not handle_message(bus):
+def _discard_unread(receiver: Receiver) -> None:
+    for _ in range(MAX_DISCARDED):
+        if receiver.receive() is None:
             return
 
 

@@ -1,8 +1,7 @@
 """The bus: what the loop needs of LCM (`Bus`), and its implementation (`LcmBus`).
 
-- Samples and requests have an LCM instance each, so that a flood of requests cannot delay samples in a shared queue.
-- LCM limits a channel's queue by messages, which may have 64 kB and more; `QueueLimit` turns a limit in bytes into one
-  in messages by a moving average of their length.
+- Samples and requests have a receiver each (`wire.receiver`), so that a flood of requests cannot delay samples in a
+  shared queue.
 - Multicast membership survives a network interface that goes down and up again. LCM joins the group once; the kernel
   drops the membership with the interface. It delivers a group's packets to every socket bound to their port as long as
   any socket of the machine is a member (IP_MULTICAST_ALL, ip(7)), so `MulticastMembership` joins again on a socket of
@@ -20,13 +19,12 @@ import select
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Final, Protocol, TypeAlias
 
-import lcm
-
-from modelserver.wire.channels import to_subscription_pattern
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, open_receiver
 
 log = logging.getLogger(__name__)
 
@@ -85,44 +83,9 @@ class MulticastMembership:
             self._socket = None
 
 
-MAX_QUEUED: Final = 50_000
-MIN_QUEUED: Final = 16
-"""Limits of the messages that LCM queues on a channel."""
-
 SENSOR_QUEUE_BYTES: Final = 4 << 20
 REQUEST_QUEUE_BYTES: Final = 1 << 20
-"""Bytes that LCM queues on a channel: 20,000 samples of wheels, 4,000 requests."""
-
-MESSAGE_OVERHEAD_BYTES: Final = 128
-"""Memory of LCM per message beside its data, about: a record with pointers and the channel's name."""
-
-
-class QueueLimit:
-    """Capacity of a channel's queue in messages for `limit_bytes`, by a moving average of the message length."""
-
-    __slots__ = ("_limit_bytes", "_mean", "capacity")
-
-    def __init__(self, limit_bytes: int):
-        self._limit_bytes = limit_bytes
-        self._mean = 256.0
-        self.capacity = self._compute_capacity()
-
-    def update(self, length: int) -> bool:
-        """Process the length of a message; return whether `capacity` has changed."""
-        # up fast, since many long messages may follow; down slowly
-        off = length - self._mean
-        if -0.1 * self._mean < off < 0.1 * self._mean:
-            return False
-        self._mean += off * (0.125 if off > 0.0 else 0.015625)
-        capacity = self._compute_capacity()
-        if 0.8 * self.capacity <= capacity <= 1.25 * self.capacity:
-            return False
-        self.capacity = capacity
-        return True
-
-    def _compute_capacity(self) -> int:
-        return max(MIN_QUEUED, min(MAX_QUEUED, int(self._limit_bytes / (self._mean + MESSAGE_OVERHEAD_BYTES))))
-
+"""Bytes that wait on a channel at most: 20,000 samples of wheels. Requests wait in the receive buffer, or in liblcm."""
 
 Handler: TypeAlias = Callable[[str, bytes], None]
 
@@ -158,70 +121,107 @@ class Bus(Protocol):
         """Wait until a message has arrived or the time is up; without `requests` for samples only."""
 
 
+MAX_READ_AHEAD: Final = 1000
+"""Messages that a drain queues at most; some two milliseconds."""
+
 MIN_SLEEP_S: Final = 20e-6
 """A wait that took longer has found the inboxes empty at first."""
 
 
-class LcmInbox:
-    """An inbox with its own LCM instance."""
+class ReceiverInbox:
+    """An inbox with a receiver of its own.
 
-    def __init__(self, url: str, queue_bytes: int):
+    Messages that a `drain` leaves wait in a queue of `queue_bytes` per channel: the socket's receive buffer is often
+    short, and all channels share it. Beyond these bytes they are dropped. 0: they wait in the receive buffer.
+    """
+
+    def __init__(self, receiver: Receiver, queue_bytes: int = 0):
+        self._receiver = receiver
         self._queue_bytes = queue_bytes
-        self.lcm = open_lcm(url)
-        self._subscriptions: list[lcm.LCMSubscription] = []
-        self.fileno = self.lcm.fileno()
+        self._handlers: dict[bytes, tuple[str, list[Handler]]] = {}
+        self._queue: deque[Message] = deque()
+        self._queued_bytes: dict[bytes, int] = {}
+        self.fileno = receiver.fileno
         self.expected: int | None = None
         """Messages that `LcmBus.wait` has found: 0, 1 (later ones are found by the next wait), None = unknown."""
 
+    @property
+    def is_queueing(self) -> bool:
+        """Whether messages wait in the queue."""
+        return bool(self._queue)
+
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
-        limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
-
-        def handle(name: str, data: bytes) -> None:
-            if limit.update(len(data)):
-                self._subscriptions[index].set_queue_capacity(limit.capacity)
-            handler(name, data)
-
-        subscription = self.lcm.subscribe(to_subscription_pattern(channel), handle)
-        # LCM drops silently beyond it; the loop drops and counts long before, unless a flood is faster than that
-        subscription.set_queue_capacity(limit.capacity)
-        self._subscriptions.append(subscription)
+        known = self._handlers.get(channel.encode())
+        if known is not None:
+            known[1].append(handler)
+            return
+        self._handlers[channel.encode()] = (channel, [handler])
+        self._receiver.subscribe(channel)
 
     def close(self) -> None:
-        """End all subscriptions, whose handlers keep the instance in memory."""
-        for each in self._subscriptions:
-            self.lcm.unsubscribe(each)
-        self._subscriptions.clear()
+        """Leave the bus: no handler is called any more."""
+        self._handlers.clear()
+        self._queue.clear()
+        self.expected = 0
+        self._receiver.close()
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """See `Inbox`."""
         expected, self.expected = self.expected, None
-        if expected == 0 or not limit:
+        if expected == 0 or not limit or not self._handlers:
             return 0
         if expected == 1:
             # saves a system call while a client waits for its reply
-            self.lcm.handle()
-            return 1
+            return self._handle(self._receiver.receive())
         end = time.monotonic() + seconds
         for count in range(limit):
-            if not handle_message(self.lcm):
+            if not self._handle(self._pop() if self._queue else self._receiver.receive()):
                 return count
             if time.monotonic() >= end:
-                return count + 1
+                limit = count + 1
+                break
+        self._read_ahead()
         return limit
+
+    def _handle(self, message: Message | None) -> int:
+        if message is None:
+            return 0
+        known = self._handlers.get(message[0])
+        if known is not None:
+            channel, handlers = known
+            for handler in handlers:
+                handler(channel, message[1])
+        return 1
+
+    def _pop(self) -> Message:
+        message = self._queue.popleft()
+        self._queued_bytes[message[0]] -= len(message[1]) + MESSAGE_OVERHEAD_BYTES
+        return message
+
+    def _read_ahead(self) -> None:
+        """Move messages from the receive buffer into the queue."""
+        for _ in range(MAX_READ_AHEAD if self._queue_bytes else 0):
+            message = self._receiver.receive()
+            if message is None:
+                return
+            size = self._queued_bytes.get(message[0], 0) + len(message[1]) + MESSAGE_OVERHEAD_BYTES
+            if size <= self._queue_bytes:
+                self._queued_bytes[message[0]] = size
+                self._queue.append(message)
 
 
 class LcmBus:
-    """Bus on LCM. Make it after forking, never before: LCM has a thread of its own."""
+    """Bus on LCM. Make it after forking, never before: liblcm may have a thread of its own."""
 
     def __init__(self, url: str = ""):
         self.url = resolve_url(url)
-        self.sensors: LcmInbox = LcmInbox(self.url, SENSOR_QUEUE_BYTES)
-        self.requests: LcmInbox = LcmInbox(self.url, REQUEST_QUEUE_BYTES)
+        self.publish = open_lcm(self.url).publish
+        self.sensors = ReceiverInbox(open_receiver(self.url, SENSOR_QUEUE_BYTES), SENSOR_QUEUE_BYTES)
+        self.requests = ReceiverInbox(open_receiver(self.url, REQUEST_QUEUE_BYTES))
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)
-        self.publish = self.requests.lcm.publish
         self._membership = MulticastMembership(self.url)
         self._renew_at = time.monotonic() + RENEW_S
 
@@ -231,6 +231,9 @@ class LcmBus:
         if begin >= self._renew_at:
             self._renew_at = begin + RENEW_S
             self._membership.renew()
+        if self.sensors.is_queueing:
+            self.sensors.expected = self.requests.expected = None
+            return
         if not requests:
             readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
             self.sensors.expected = None if readable else 0

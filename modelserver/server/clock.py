@@ -17,6 +17,9 @@ from typing import Final, NamedTuple
 
 from modelserver.core import Instant
 
+_new_tuple: Final = tuple.__new__
+"""Makes a NamedTuple at half of the cost of its constructor."""
+
 
 class Clock:
     """The host's clocks, the time source of the loop."""
@@ -31,7 +34,7 @@ class Clock:
 
     def now(self) -> Instant:
         """Return both times: monotonic, and microseconds since the Unix epoch."""
-        return Instant(time.monotonic_ns(), time.time_ns() // 1000)
+        return _new_tuple(Instant, (time.monotonic_ns(), time.time_ns() // 1000))
 
     def sleep(self, seconds: float) -> None:
         """Sleep."""

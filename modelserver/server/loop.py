@@ -199,16 +199,15 @@ class Loop:
         if self._reload_requested:
             self._reload_requested = False
             self.send((messages.LoadModel(),))
-        has_backlog = self._drain_sensors()
-        if has_backlog and self._has_backlog:
-            requests.contention.add_sensor_backlog(self._clock.monotonic_ns())
-        self._has_backlog = has_backlog
-        self._tick_if_due()
+        now_ns = self._drain_sensors(self._clock.monotonic_ns())
+        if now_ns >= timer.begin_ns:
+            self._tick()
+            now_ns = self._clock.monotonic_ns()
         begin_ns = timer.begin_ns
-        requests.serve(begin_ns, may_defer=not self._journal.wants_state)
-        if has_backlog or self._stop_requested:
+        now_ns = requests.serve(now_ns, begin_ns, may_defer=not self._journal.wants_state)
+        if self._has_backlog or self._stop_requested:
             return
-        seconds = max(0.0, (begin_ns - self._clock.monotonic_ns()) * 1e-9)
+        seconds = max(0.0, (begin_ns - now_ns) * 1e-9)
         if requests.is_flooded:
             # waking for each request of a flood would be most of the work
             self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), requests=False)
@@ -219,14 +218,21 @@ class Loop:
                 seconds = 0.0
             self._bus.wait(seconds)
 
-    def _drain_sensors(self) -> bool:
-        """Handle the samples that have arrived, up to the next tick; return whether more may wait."""
-        now_ns = self._clock.monotonic_ns()
-        limit_ns = min(MAX_SAMPLES_NS, max(MIN_SAMPLES_NS, self._timer.begin_ns - now_ns))
+    def _drain_sensors(self, begin_ns: int) -> int:
+        """Handle the samples that have arrived, from `begin_ns` up to the next tick; return when that ended."""
+        limit_ns = min(MAX_SAMPLES_NS, max(MIN_SAMPLES_NS, self._timer.begin_ns - begin_ns))
         count = self._bus.sensors.drain(SAMPLES_PER_PASS, limit_ns * 1e-9)
-        return count == SAMPLES_PER_PASS or (count > 0 and self._clock.monotonic_ns() - now_ns >= limit_ns)
+        if not count:
+            self._has_backlog = False
+            return begin_ns
+        now_ns = self._clock.monotonic_ns()
+        has_backlog = count == SAMPLES_PER_PASS or now_ns - begin_ns >= limit_ns
+        if has_backlog and self._has_backlog:
+            self._requests.contention.add_sensor_backlog(now_ns)
+        self._has_backlog = has_backlog
+        return now_ns
 
-    def _tick_if_due(self) -> None:
+    def _tick(self) -> None:
         tick = self._timer.start_tick()
         if tick is None:
             return

@@ -86,6 +86,8 @@ _CHANNEL: Final = 20
 """Offset of the reply channel in a request: behind fingerprint, id and the channel's length."""
 
 _LAST_POLICY: Final = max(Policy)
+_NOW: Final = bytes(_TIME.size)
+"""End of a request at the present time with the default policy, without waiting."""
 _REQUEST: Final = FINGERPRINTS[CACHED_TYPE]
 _REPLY: Final = FINGERPRINTS["get_transformation_reply_t"]
 
@@ -144,7 +146,7 @@ class StaticReplyCache:
     """
 
     def __init__(self) -> None:
-        self._entries: dict[bytes, bytes] = {}
+        self._entries: OrderedDict[bytes, bytes] = OrderedDict()
         self._model: object = None
         self._capacity = 0
 
@@ -166,18 +168,15 @@ class StaticReplyCache:
 
         `client` is the reply channel in the bytes of the request.
         """
-        if request[:8] != _REQUEST:
-            return None
         pair = request[_CHANNEL + len(client) : -_TIME.size]
-        entries = self._entries
-        rest = entries.pop(pair, None)
-        if rest is None:
+        rest = self._entries.get(pair)
+        if rest is None or request[:8] != _REQUEST:
             return None
-        # re-inserted as the newest: the first entry is the least recently used one
-        entries[pair] = rest
-        at, policy, wait_ms = _TIME.unpack(request[-_TIME.size :])
-        if not (0 <= at < MAX_UTIME and 0 <= policy <= _LAST_POLICY and wait_ms >= 0):
-            return None
+        self._entries.move_to_end(pair)
+        if not request.endswith(_NOW):
+            at, policy, wait_ms = _TIME.unpack_from(request, len(request) - _TIME.size)
+            if not (0 <= at < MAX_UTIME and 0 <= policy <= _LAST_POLICY and wait_ms >= 0):
+                return None
         return b"%b%b%b%b" % (_REPLY, request[8:16], UTIME.pack(utime), rest)
 
     def add(self, request: bytes, client: bytes, reply: Reply, encoded: bytes) -> None:
@@ -188,5 +187,5 @@ class StaticReplyCache:
         if reply.answer.transformation.utime or len(pair) > MAX_PAIR_BYTES:
             return
         if len(self._entries) >= self._capacity:
-            self._entries.pop(next(iter(self._entries), b""), None)
+            self._entries.popitem(last=False)
         self._entries[pair] = encoded[_AFTER_UTIME:]

@@ -43,14 +43,19 @@ def open_lcm(url: str) -> lcm.LCM:
     try:
         return lcm.LCM(url)
     except (OSError, RuntimeError) as error:
-        other = _PROVIDER_HINTS.get(url.partition("://")[0])
-        if other is not None:
-            raise BusError(f"cannot join the bus at {url}: {error}. {other}") from None
-        raise BusError(
-            f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
-            f"the machine a route for multicast? On one machine: sudo ip link set lo up multicast on && sudo "
-            f"{make_route_command(group_of(url))} (modelserver doctor checks it)"
-        ) from None
+        raise make_bus_error(url, error) from None
+
+
+def make_bus_error(url: str, error: Exception) -> BusError:
+    """Return an error for a bus that cannot be joined, with hints."""
+    other = _PROVIDER_HINTS.get(url.partition("://")[0])
+    if other is not None:
+        return BusError(f"cannot join the bus at {url}: {error}. {other}")
+    return BusError(
+        f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
+        f"the machine a route for multicast? On one machine: sudo ip link set lo up multicast on && sudo "
+        f"{make_route_command(group_of(url))} (modelserver doctor checks it)"
+    )
 
 
 def _check_descriptors(url: str) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 import socket
+from dataclasses import dataclass
 from typing import Final
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import find_nearest_names, quote
 
@@ -92,6 +93,34 @@ def group_of(url: str) -> str:
     except ValueError:
         return GROUP
     return named if re.fullmatch(r"2(2[4-9]|3[0-9])(\.[0-9]{1,3}){3}", named) else GROUP
+
+
+@dataclass(frozen=True, slots=True)
+class UdpAddress:
+    """An LCM provider over UDP multicast: group, port, time to live (hops), requested receive buffer (bytes)."""
+
+    group: str = GROUP
+    port: int = 7667
+    ttl: int = 0
+    buffer: int = 0
+
+
+def parse_udp_address(url: str) -> UdpAddress | None:
+    """Parse an LCM URL; None for another provider than udpm, and for an invalid URL."""
+    default = UdpAddress()
+    try:
+        parts = urlsplit(url)
+        options = dict(parse_qsl(parts.query))
+        if parts.scheme != "udpm":
+            return None
+        return UdpAddress(
+            parts.hostname or default.group,
+            parts.port or default.port,
+            int(options.get("ttl", default.ttl)),
+            int(options.get("recv_buf_size", 0)),
+        )
+    except ValueError:
+        return None
 
 
 def make_route_command(group: str, device: str = "lo") -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 
 import lcm
@@ -13,19 +14,11 @@ from hypothesis import strategies as st
 from support_lcm import TIMEOUT_S, reserved_url
 
 from modelserver.errors import BusError
-from modelserver.server.bus import (
-    MAX_QUEUED,
-    MESSAGE_OVERHEAD_BYTES,
-    MIN_QUEUED,
-    SENSOR_QUEUE_BYTES,
-    Bus,
-    Inbox,
-    LcmBus,
-    QueueLimit,
-)
+from modelserver.server.bus import SENSOR_QUEUE_BYTES, Bus, Inbox, LcmBus, ReceiverInbox
 from modelserver.server.clock import Clock, FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.wire.channels import CHANNELS
+from modelserver.wire.receiver import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, MIN_QUEUED, Message, QueueLimit
 
 ODD_CHANNELS = ["A.B", "A*", "A+", "(A)", "[A]", "A|B", "A-B", "^A$", "A{2}", "A?", "A\\B", "A/B", "#A", "A B", "."]
 
@@ -60,8 +53,8 @@ class Rig:
         return self.received
 
 
-@pytest.fixture(params=["fake", "lcm"])
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+@pytest.fixture(params=["fake", "udp", "lcm"])
+def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     if request.param == "fake":
         clock = FakeClock()
         rig = Rig(FakeBus(clock), clock)
@@ -69,6 +62,9 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
         return
     with reserved_url() as url:
+        if request.param == "lcm":
+            # as for other providers
+            monkeypatch.setattr("modelserver.wire.receiver.parse_udp_address", lambda url: None)
         bus = LcmBus(url)
         rig = Rig(bus, Clock())
         rig.subscribe("LAST")
@@ -298,3 +294,53 @@ def test_given_long_messages_that_are_not_handled_then_few_of_them_are_queued(ri
     while bus.sensors.drain(1000):
         pass
     assert most // 4 < len(taken) <= 1.5 * most
+
+
+class FullReceiver:
+    """A receiver with a list of messages that have arrived."""
+
+    fileno = 0
+
+    def __init__(self, messages: list[Message]):
+        self.messages = deque(messages)
+
+    def subscribe(self, channel: str) -> None: ...
+
+    def receive(self) -> Message | None:
+        return self.messages.popleft() if self.messages else None
+
+    def close(self) -> None: ...
+
+
+def test_given_more_messages_than_a_drain_handles_then_the_rest_is_queued_in_order() -> None:
+    receiver = FullReceiver([(b"A", bytes([n])) for n in range(10)])
+    inbox = ReceiverInbox(receiver, 4 << 20)
+    received: list[int] = []
+    inbox.subscribe("A", lambda channel, data: received.append(data[0]))
+    assert inbox.drain(3) == 3
+    assert (received, len(receiver.messages), inbox.is_queueing) == ([0, 1, 2], 0, True)
+    receiver.messages.append((b"A", bytes([10])))
+    assert inbox.drain(100) == 8
+    assert (received, inbox.is_queueing) == (list(range(11)), False)
+
+
+def test_given_a_flood_that_is_not_handled_then_its_channel_queues_so_many_bytes_and_displaces_no_other() -> None:
+    flood: list[Message] = [(b"A", bytes(60_000))] * 200
+    receiver = FullReceiver([*flood, (b"B", b"1")])
+    inbox = ReceiverInbox(receiver, SENSOR_QUEUE_BYTES)
+    received: list[tuple[str, int]] = []
+    for channel in "AB":
+        inbox.subscribe(channel, lambda name, data: received.append((name, len(data))))
+    assert inbox.drain(1) == 1
+    assert not receiver.messages
+    while inbox.drain(1000):
+        pass
+    assert received == [("A", 60_000)] * (1 + SENSOR_QUEUE_BYTES // (60_000 + MESSAGE_OVERHEAD_BYTES)) + [("B", 1)]
+
+
+def test_given_an_inbox_without_a_queue_then_what_a_drain_leaves_stays_in_the_receiver() -> None:
+    receiver = FullReceiver([(b"A", b"1")] * 5)
+    inbox = ReceiverInbox(receiver)
+    inbox.subscribe("A", lambda channel, data: None)
+    assert inbox.drain(2) == 2
+    assert (len(receiver.messages), inbox.is_queueing) == (3, False)

@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import quote
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
-from modelserver.wire.urls import GROUP, make_route_command
+from modelserver.wire.urls import UdpAddress, make_route_command
 
 
 class DiagnosisLevel(IntEnum):
@@ -132,34 +131,6 @@ LOST_PACKETS = "lost packets"
 
 
 @dataclass(frozen=True, slots=True)
-class UdpAddress:
-    """An LCM provider over UDP multicast: group, port, time to live (hops), requested receive buffer (bytes)."""
-
-    group: str = GROUP
-    port: int = 7667
-    ttl: int = 0
-    buffer: int = 0
-
-
-def parse_udp_address(url: str) -> UdpAddress | None:
-    """Parse an LCM URL; None for another provider than udpm, and for an invalid URL."""
-    default = UdpAddress()
-    try:
-        parts = urlsplit(url)
-        options = dict(parse_qsl(parts.query))
-        if parts.scheme != "udpm":
-            return None
-        return UdpAddress(
-            parts.hostname or default.group,
-            parts.port or default.port,
-            int(options.get("ttl", default.ttl)),
-            int(options.get("recv_buf_size", 0)),
-        )
-    except ValueError:
-        return None
-
-
-@dataclass(frozen=True, slots=True)
 class NetworkInterface:
     """A network interface and its flags."""
 
@@ -180,7 +151,7 @@ class BusFacts:
     delivered, delivered_large: whether an own message came back, and one of several packets.
     buffer: receive buffer that the kernel granted for `RECEIVE_BUFFER_BYTES`, bytes.
     buffer_default: receive buffer of programs that request none, bytes.
-    dropped: packets that receivers on the bus's port have lost so far.
+    dropped: packets that receivers on the bus's port have lost so far, at most.
     """
 
     url: str
@@ -280,10 +251,10 @@ def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
         why = "lcm-spy, lcm-logger and clients without recv_buf_size in their URL lose messages in bursts"
         yield Diagnosis(NOTE, subject, observed, why, _sysctl_command("net.core.rmem_default", RECEIVE_BUFFER_BYTES))
     if facts.dropped:
-        observed = f"running programs on this bus have lost {facts.dropped} packets so far"
+        observed = f"running programs on this bus have lost up to {facts.dropped} packets so far"
         why = (
             "one of them is too slow for the traffic, or its buffer is too small (recv_buf_size in its URL); the "
-            "command shows which: d of its skmem"
+            "command shows which: d of its skmem, which also counts packets that a socket filter drops"
         )
         yield Diagnosis(WARNING, LOST_PACKETS, observed, why, f"sudo ss -uanmp 'sport = :{address.port}'")
 

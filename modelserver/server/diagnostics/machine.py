@@ -19,8 +19,9 @@ from typing import Final
 
 from modelserver.errors import BusError
 from modelserver.messages import Gauges
-from modelserver.server.diagnostics.checks import BusFacts, ClockFacts, NetworkInterface, UdpAddress, parse_udp_address
+from modelserver.server.diagnostics.checks import BusFacts, ClockFacts, NetworkInterface
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
+from modelserver.wire.urls import UdpAddress, parse_udp_address
 
 STATM = Path("/proc/self/statm")
 SCHEDSTAT = Path("/proc/thread-self/schedstat")
@@ -136,13 +137,19 @@ def get_granted_buffer(size: int) -> int:
 
 
 def count_dropped(port: int, proc: Path = PROC) -> int | None:
-    """Count the packets that the sockets on a port have lost; None if unknown."""
+    """Count the packets that the sockets on a port have lost, at most; None if unknown.
+
+    The kernel counts packets that a socket filter drops (`wire.socket_filter`) as drops of the socket, too. Its count
+    of full buffers has only lost ones, but those of all ports.
+    """
     try:
         lines = (proc / "net/udp").read_text().splitlines()[1:]
-    except OSError:
+        names, values = (line.split() for line in (proc / "net/snmp").read_text().splitlines() if line[:4] == "Udp:")
+    except (OSError, ValueError):
         return None
     rows = [line.split() for line in lines]
-    return sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
+    dropped = sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
+    return min(dropped, int(dict(zip(names, values, strict=True)).get("RcvbufErrors", dropped)))
 
 
 def _read_int(path: Path, word: int = 0) -> int | None:

@@ -2,7 +2,7 @@
 
 One pass of the server loop gives it a slice of at most a millisecond:
 
-1. Receive. The requests in liblcm's queue go into the per-client queues, undecoded. So fairness begins at the socket:
+1. Receive. The requests in the receive buffer go into the per-client queues, undecoded. So fairness begins there:
    in a queue shared by all clients a flood would delay everyone. Only the first request of a pass, if none waits, is
    answered before the next one is received: the latency of a single client.
 2. Answer queued requests in the order of the scheduler (`scheduler`).
@@ -19,6 +19,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from itertools import islice, product
 from typing import Final, Protocol
 
@@ -62,11 +63,17 @@ STEP_ROOM_NS: Final = 1_500_000
 STARVED_NS: Final = 50_000_000
 """Deferred work without a step for so long gets one in any case."""
 
-PREPARE_NS: Final = 100_000
-"""Time for preparing replies before the loop looks for messages again."""
+PREPARE_NS: Final = 20_000
+"""Time for preparing replies before the loop looks for messages again: for one, since a client may be about to ask."""
+
+PREPARE_ROOM_NS: Final = 200_000
+"""Preparing begins only this long before the next tick."""
 
 MAX_PREPARED: Final = 16
 """Pairs of frames whose replies are prepared at once."""
+
+_new_tuple: Final = tuple.__new__
+"""Makes a NamedTuple at half of the cost of its constructor."""
 
 REJECTIONS_PER_PASS: Final = 2
 REJECTIONS_WAITING: Final = 128
@@ -152,18 +159,21 @@ class RequestHandler:
         answered, self._answered = self._answered, 0
         return answered
 
-    def serve(self, due_ns: int, may_defer: bool = True) -> None:
-        """Make one pass; `due_ns` is when the next tick begins. Without `may_defer` no deferred reply is begun."""
+    def serve(self, begin: int, due_ns: int, may_defer: bool = True) -> int:
+        """Make one pass from `begin` on; return when it ended, nanoseconds as `due_ns`, when the next tick begins.
+
+        Without `may_defer` no deferred reply is begun.
+        """
         scheduler, clock = self._scheduler, self._clock
-        begin = clock.monotonic_ns()
-        end = min(begin + SLICE_NS, max(due_ns, begin + SLICE_NS // 4))
         contention = self.contention
         if contention.wants_delay(begin):
             contention.add_delay(self._run_delay(), begin)
         scheduler.set_contended(contention.is_contended(begin), begin)
         self._is_first = True
         unread = self._receive(begin + SLICE_NS // 2)
+        # the reply to a client that waits for it has been sent here: what follows is less urgent
         now = clock.monotonic_ns() if scheduler.queued else begin
+        end = min(begin + SLICE_NS, max(due_ns, begin + SLICE_NS // 4))
         defers = self.deferred is not None or (may_defer and scheduler.deferred > 0)
         # each kind of work gets half if both wait
         until = end - SLICE_NS // 2 if defers else end
@@ -182,12 +192,15 @@ class RequestHandler:
         scheduler.spend((now - begin) * 1e-9, now)
         self.is_flooded = bool(self._dropped)
         self.is_ready = unread or scheduler.is_ready or stepped or bool(self._rejections)
+        report = scheduler.report(now)
+        if not self._dropped and report is None:
+            return now
         if self._dropped:
             self._count_dropped()
-        report = scheduler.report(now)
         if report is not None and report != self._report:
             self._report = report
             self._context.step(messages.HealthWarning("requests", report), clock.now())
+        return clock.monotonic_ns()
 
     def prepare(self, until_ns: int) -> bool:
         """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
@@ -199,7 +212,7 @@ class RequestHandler:
         now = self._clock.now()
         view = self._context.state.view
         if (
-            until_ns - now.monotonic_ns < 2 * PREPARE_NS
+            until_ns - now.monotonic_ns < PREPARE_ROOM_NS
             or not self._cache.is_of(view.model)
             or self.contention.is_contended(now.monotonic_ns)
         ):
@@ -245,7 +258,7 @@ class RequestHandler:
         self.deferred = None
 
     def _receive(self, until_ns: int) -> bool:
-        """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
+        """Receive requests into their clients' queues; return whether more may wait in the receive buffer."""
         drain = self._bus.requests.drain
         for _ in range(MAX_RECEIVED // RECEIVE_BATCH):
             if drain(RECEIVE_BATCH) < RECEIVE_BATCH:
@@ -262,7 +275,7 @@ class RequestHandler:
             now_ns = monotonic_ns()
             name = SIGNED_CLIENT if signed else client_of(data)
             client = scheduler.client(name, now_ns)
-            request = QueuedRequest(name, channel, type_name, data)
+            request = _new_tuple(QueuedRequest, (name, channel, type_name, data))
             if self._is_first and scheduler.admit(client, now_ns):
                 self._is_first = False
                 self._answer(request)
@@ -382,11 +395,11 @@ class RequestHandler:
         reply = self._model_cache().find(data, client, now.utime)
         if reply is None:
             return False
-        header = messages.RequestHeader(0, client.decode("utf-8", "replace"))
-        if not core.is_answerable(header, context.state.settings.reply_prefix):
+        reply_channel = _find_reply_channel(client, context.state.settings.reply_prefix)
+        if not reply_channel:
             return False
         self._journal.record_message(RecordKind.CACHED, (channel, data), now)
-        context.publish(header.reply_channel, reply)
+        context.publish(reply_channel, reply)
         self._answered += 1
         return True
 
@@ -437,6 +450,13 @@ def client_of(data: bytes) -> bytes:
     end = 19 + int.from_bytes(data[16:20], "big")
     # names that begin with a control character are reserved: `SIGNED_CLIENT`
     return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
+
+
+@lru_cache(maxsize=1024)
+def _find_reply_channel(client: bytes, prefix: str) -> str:
+    """Return the reply channel of a client, empty if the server may not reply on it."""
+    header = messages.RequestHeader(0, client.decode("utf-8", "replace"))
+    return header.reply_channel if core.is_answerable(header, prefix) else ""
 
 
 REQUEST_TYPES: Mapping[str, type[messages.Request]] = {

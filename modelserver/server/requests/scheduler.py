@@ -147,6 +147,7 @@ class ClientQueue:
     reply_bytes: float
     seen_ns: int
     charged_ns: int
+    bytes_charged_ns: int
     requests: deque[QueuedRequest] = field(default_factory=deque)
     deferred: deque[DeferredRequest] = field(default_factory=deque)
     received: int = 0
@@ -164,9 +165,10 @@ class RequestScheduler:
         self._limits = limits
         self._max_clients = max_clients
         self._burst = max(1.0, limits.client_hz * BURST_S)
+        self._tokens_per_ns = limits.client_hz * 1e-9
         self._burst_bytes = max(float(MAX_REPLY_BYTES), limits.client_reply_bytes)
         self._clients: dict[bytes, ClientQueue] = {}
-        self._others = ClientQueue(b"", self._burst, self._burst_bytes, now_ns, now_ns)
+        self._others = ClientQueue(b"", self._burst, self._burst_bytes, now_ns, now_ns, now_ns)
         self._within: deque[ClientQueue] = deque()
         self._beyond: deque[ClientQueue] = deque()
         self._deferring: deque[ClientQueue] = deque()
@@ -211,10 +213,13 @@ class RequestScheduler:
         """Return whether a new request may be answered without queueing, and charge its client."""
         if self.queued:
             return False
-        self._refill(client, now_ns)
-        if client.tokens < 1.0 and not self.may_exceed:
+        tokens = self._refill(client, now_ns)
+        if tokens >= 1.0:
+            client.tokens = tokens - 1.0
+        elif self.may_exceed:
+            client.tokens = min(tokens, 0.0)
+        else:
             return False
-        client.tokens = max(min(client.tokens, 0.0), client.tokens - 1.0)
         return True
 
     def enqueue(self, client: ClientQueue, request: QueuedRequest, now_ns: int) -> QueuedRequest | None:
@@ -284,6 +289,9 @@ class RequestScheduler:
             client = ring.popleft()
             deferred = client.deferred[0]
             self._refill(client, now_ns)
+            seconds, client.bytes_charged_ns = (now_ns - client.bytes_charged_ns) * 1e-9, now_ns
+            refilled = client.reply_bytes + seconds * self._limits.client_reply_bytes
+            client.reply_bytes = min(self._burst_bytes, refilled)
             if client.reply_bytes < min(deferred.reply_bytes, self._burst_bytes):
                 ring.append(client)
                 continue
@@ -332,11 +340,14 @@ class RequestScheduler:
         self._rejections = 0
         return "; ".join(texts)
 
-    def _refill(self, client: ClientQueue, now_ns: int) -> None:
-        seconds = (now_ns - client.charged_ns) * 1e-9
+    def _refill(self, client: ClientQueue, now_ns: int) -> float:
+        """Refill the bucket of requests; return its tokens."""
+        tokens = client.tokens + (now_ns - client.charged_ns) * self._tokens_per_ns
         client.charged_ns = now_ns
-        client.tokens = min(self._burst, client.tokens + seconds * self._limits.client_hz)
-        client.reply_bytes = min(self._burst_bytes, client.reply_bytes + seconds * self._limits.client_reply_bytes)
+        if tokens > self._burst:  # cheaper than min()
+            tokens = self._burst
+        client.tokens = tokens
+        return tokens
 
     def _append(self, client: ClientQueue) -> None:
         (self._within if client.tokens >= 1.0 else self._beyond).append(client)
@@ -358,7 +369,7 @@ class RequestScheduler:
                 del self._clients[each]
             if not silent:
                 return self._others
-        client = self._clients[name] = ClientQueue(name, self._burst, self._burst_bytes, now_ns, now_ns)
+        client = self._clients[name] = ClientQueue(name, self._burst, self._burst_bytes, now_ns, now_ns, now_ns)
         return client
 
     def _describe(self, client: ClientQueue) -> str:

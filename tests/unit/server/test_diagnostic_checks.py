@@ -20,16 +20,15 @@ from modelserver.server.diagnostics.checks import (
     DiscoveredServers,
     NetworkInterface,
     Server,
-    UdpAddress,
     evaluate_bus,
     evaluate_clock,
     evaluate_servers,
     filter_by_level,
     get_worst_level,
-    parse_udp_address,
 )
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, resolve_url
+from modelserver.wire.urls import UdpAddress, parse_udp_address
 
 LO = NetworkInterface("lo", multicast=True, loopback=True)
 ETH = NetworkInterface("eth0")

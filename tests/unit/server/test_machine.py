@@ -10,9 +10,9 @@ import pytest
 
 from modelserver.errors import BusError
 from modelserver.server.diagnostics import machine
-from modelserver.server.diagnostics.checks import UdpAddress
 from modelserver.server.diagnostics.machine import read_gauges, read_resident_bytes
 from modelserver.wire.channels import DEFAULT_URL
+from modelserver.wire.urls import UdpAddress
 
 UDP = """  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid timeout inode ref p drops
   1: 00000000:1DF3 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 1 2 0000000000000000 5
@@ -20,9 +20,16 @@ UDP = """  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retr
   3: 00000000:0035 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 3 2 0000000000000000 99
 """
 
+SNMP = """Tcp: ActiveOpens PassiveOpens
+Tcp: 1 2
+Udp: InDatagrams NoPorts InErrors OutDatagrams RcvbufErrors SndbufErrors
+Udp: 1000 0 {errors} 1000 {lost} 0
+"""
 
-def folder(tmp_path: Path) -> Path:
-    for name, text in (("net/udp", UDP), ("sys/net/core/rmem_default", "212992\n")):
+
+def folder(tmp_path: Path, lost: int = 100) -> Path:
+    snmp = SNMP.format(errors=lost + 500, lost=lost)
+    for name, text in (("net/udp", UDP), ("net/snmp", snmp), ("sys/net/core/rmem_default", "212992\n")):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
@@ -78,6 +85,7 @@ def test_given_a_buffer_asked_for_then_the_kernel_gives_it_or_less() -> None:
 def test_given_the_kernels_table_then_dropped_packets_on_the_port_are_summed(tmp_path: Path) -> None:
     assert machine.count_dropped(7667, folder(tmp_path)) == 12
     assert machine.count_dropped(7668, tmp_path) == 0
+    assert machine.count_dropped(7667, folder(tmp_path, lost=0)) == 0, "a socket filter drops packets too"
     assert machine.count_dropped(7667, tmp_path / "none") is None
 
 

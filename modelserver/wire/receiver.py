@@ -1,0 +1,263 @@
+"""Receive the messages of some channels within the thread that waits for them.
+
+liblcm receives in a thread of its own, which copies each message into a queue and wakes the program by a pipe. A query
+passes two such threads, and to wake a thread on an idle processor costs more than to answer (`python -m benchmarks
+query_latency`). So service and `Platform` read the packets of LCM's UDP multicast themselves (`UdpReceiver`), from a
+socket whose filter drops other channels (`socket_filter`). They publish by liblcm. Other providers than udpm:// are
+received by liblcm (`LcmReceiver`).
+
+Format (udp_lcm_protocol of the LCM manual), numbers big-endian:
+
+- short message: "LC02", sequence number (4 bytes), channel, NUL, data;
+- fragment of a long one: "LC03", sequence number (4), size of the data (4), offset of the fragment in it (4), number of
+  the fragment (2), count of fragments (2); the first one has channel and NUL before its data.
+
+As in liblcm, a sender's fragments count if the first comes first, and a message with a lost fragment is lost.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import weakref
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, Protocol, TypeAlias
+
+import lcm
+
+from modelserver.wire.channels import to_subscription_pattern
+from modelserver.wire.provider import handle_message, make_bus_error, open_lcm
+from modelserver.wire.socket_filter import set_channel_filter
+from modelserver.wire.urls import UdpAddress, parse_udp_address
+
+Message: TypeAlias = tuple[bytes, bytes]
+"""Channel and data."""
+
+
+class Receiver(Protocol):
+    """Queue of received messages. `fileno` is readable if one may have arrived."""
+
+    fileno: int
+
+    def subscribe(self, channel: str) -> None:
+        """Receive the messages of a channel too."""
+
+    def receive(self) -> Message | None:
+        """Return the next message that has arrived, None without one. It does not wait."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+def open_receiver(url: str, queue_bytes: int = 1 << 20) -> Receiver:
+    """Join the bus to receive; `queue_bytes` per channel is what liblcm may queue. Raises BusError with hints."""
+    address = parse_udp_address(url)
+    if address is None:
+        return LcmReceiver(url, queue_bytes)
+    try:
+        return UdpReceiver(address)
+    except OSError as error:
+        raise make_bus_error(url, error) from None
+
+
+_SHORT, _FRAGMENT = b"LC02", b"LC03"
+_CHANNEL_AT: Final = 8
+"""Offset of the channel in a short message."""
+
+_FRAGMENT_HEADER: Final = struct.Struct(">4sIIIHH")
+"""Magic, sequence number, size, offset, number, count."""
+
+MAX_PACKET: Final = 1 << 16
+"""Bytes of the longest UDP packet, rounded up."""
+
+MAX_PARTIAL_BYTES: Final = 1 << 24
+"""Bytes of all messages of which fragments are missing; the oldest one is dropped for a new one. As in liblcm."""
+
+MAX_IGNORED: Final = 64
+"""Packets without a message that one call of `receive` reads, so that a flood of them does not hold it."""
+
+
+@dataclass(slots=True)
+class _PartialMessage:
+    sequence: int
+    channel: bytes
+    data: bytearray
+    missing: int
+
+
+class FragmentAssembler:
+    """Assembles long messages from their fragments; one of each sender at a time."""
+
+    def __init__(self) -> None:
+        self.channels: set[bytes] = set()
+        """Channels whose messages are assembled."""
+        self._partial: dict[object, _PartialMessage] = {}
+
+    def add(self, sender: object, packet: bytes) -> Message | None:
+        """Process a fragment; return the message that it completes, None if it completes none."""
+        if len(packet) < _FRAGMENT_HEADER.size:
+            return None
+        _, sequence, size, offset, number, count = _FRAGMENT_HEADER.unpack_from(packet)
+        partial = self._partial.get(sender)
+        if partial is not None and (partial.sequence, len(partial.data)) != (sequence, size):
+            del self._partial[sender]  # its other fragments are lost
+            partial = None
+        start = _FRAGMENT_HEADER.size
+        if number == 0:
+            end = packet.find(0, start)
+            channel = packet[start:end]
+            if partial is None and end > start and channel in self.channels and size <= MAX_PARTIAL_BYTES:
+                self._make_room(size)
+                partial = self._partial[sender] = _PartialMessage(sequence, channel, bytearray(size), count)
+            start = end + 1
+        if partial is None:
+            return None
+        length = len(packet) - start
+        if offset + length > size:
+            del self._partial[sender]
+            return None
+        partial.data[offset : offset + length] = packet[start:]
+        partial.missing -= 1
+        if partial.missing > 0:
+            return None
+        del self._partial[sender]
+        return partial.channel, bytes(partial.data)
+
+    @property
+    def partial_bytes(self) -> int:
+        """Bytes of all messages of which fragments are missing."""
+        return sum(len(each.data) for each in self._partial.values())
+
+    def _make_room(self, size: int) -> None:
+        while self._partial and self.partial_bytes + size > MAX_PARTIAL_BYTES:
+            del self._partial[next(iter(self._partial))]
+
+
+class UdpReceiver:
+    """Receiver on a multicast group, whose queue is the socket's receive buffer. Raises OSError."""
+
+    def __init__(self, address: UdpAddress):
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        weakref.finalize(self, self._socket.close)
+        self._assembler = FragmentAssembler()
+        try:
+            set_channel_filter(self._socket, ())  # before the first packet
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if address.buffer:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, address.buffer)
+            self._socket.bind((address.group, address.port))
+            # the interface is that of the group's route, as for liblcm
+            membership = socket.inet_aton(address.group) + socket.inet_aton("0.0.0.0")
+            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+            self._socket.setblocking(False)
+        except OSError:
+            self._socket.close()
+            raise
+        self.fileno = self._socket.fileno()
+        self._receive = self._socket.recvfrom
+
+    def subscribe(self, channel: str) -> None:
+        """See `Receiver`."""
+        self._assembler.channels.add(channel.encode())
+        set_channel_filter(self._socket, self._assembler.channels)
+
+    def receive(self) -> Message | None:
+        """See `Receiver`."""
+        for _ in range(MAX_IGNORED):
+            try:
+                packet, sender = self._receive(MAX_PACKET)
+            except BlockingIOError:
+                return None
+            magic = packet[:4]
+            if magic == _SHORT:
+                end = packet.find(0, _CHANNEL_AT)
+                if end > 0:
+                    return packet[_CHANNEL_AT:end], packet[end + 1 :]
+            elif magic == _FRAGMENT:
+                message = self._assembler.add(sender, packet)
+                if message is not None:
+                    return message
+        return None
+
+    def close(self) -> None:
+        """See `Receiver`."""
+        self._socket.close()
+
+
+MAX_QUEUED: Final = 50_000
+MIN_QUEUED: Final = 16
+"""Limits of the messages that LCM queues on a channel."""
+
+MESSAGE_OVERHEAD_BYTES: Final = 128
+"""Memory of LCM per message beside its data, about: a record with pointers and the channel's name."""
+
+
+class QueueLimit:
+    """Capacity of a channel's queue in messages for `limit_bytes`, by a moving average of the message length."""
+
+    __slots__ = ("_limit_bytes", "_mean", "capacity")
+
+    def __init__(self, limit_bytes: int):
+        self._limit_bytes = limit_bytes
+        self._mean = 256.0
+        self.capacity = self._compute_capacity()
+
+    def update(self, length: int) -> bool:
+        """Process the length of a message; return whether `capacity` has changed."""
+        # up fast, since many long messages may follow; down slowly
+        off = length - self._mean
+        if -0.1 * self._mean < off < 0.1 * self._mean:
+            return False
+        self._mean += off * (0.125 if off > 0.0 else 0.015625)
+        capacity = self._compute_capacity()
+        if 0.8 * self.capacity <= capacity <= 1.25 * self.capacity:
+            return False
+        self.capacity = capacity
+        return True
+
+    def _compute_capacity(self) -> int:
+        return max(MIN_QUEUED, min(MAX_QUEUED, int(self._limit_bytes / (self._mean + MESSAGE_OVERHEAD_BYTES))))
+
+
+class LcmReceiver:
+    """Receiver by liblcm, for other providers.
+
+    liblcm limits a channel's queue by messages, which may have 64 kB and more; `QueueLimit` turns a limit in bytes into
+    one in messages by a moving average of their length. Beyond it liblcm drops messages.
+    """
+
+    def __init__(self, url: str, queue_bytes: int):
+        self._bus = open_lcm(url)
+        self._queue_bytes = queue_bytes
+        self._subscriptions: list[lcm.LCMSubscription] = []
+        self.fileno = self._bus.fileno()
+        self._received: deque[Message] = deque()
+
+    def subscribe(self, channel: str) -> None:
+        """See `Receiver`."""
+        limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
+        # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
+        received, subscriptions, name = self._received, self._subscriptions, channel.encode()
+
+        def handle(_: str, data: bytes) -> None:
+            received.append((name, data))
+            if limit.update(len(data)):
+                subscriptions[index].set_queue_capacity(limit.capacity)
+
+        subscription = self._bus.subscribe(to_subscription_pattern(channel), handle)
+        subscription.set_queue_capacity(limit.capacity)
+        self._subscriptions.append(subscription)
+
+    def receive(self) -> Message | None:
+        """See `Receiver`."""
+        if not self._received and not handle_message(self._bus):
+            return None
+        return self._received.popleft() if self._received else None
+
+    def close(self) -> None:
+        """See `Receiver`."""
+        # the subscriptions' handlers keep the instance in memory
+        for each in self._subscriptions:
+            self._bus.unsubscribe(each)
+        self._subscriptions.clear()

@@ -1,0 +1,161 @@
+"""Receiving without liblcm's thread: what it sends is received, whatever else arrives."""
+
+from __future__ import annotations
+
+import random
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import lcm
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support_lcm import TIMEOUT_S, reserved_url
+
+from modelserver.errors import BusError
+from modelserver.wire import receiver as module
+from modelserver.wire.provider import resolve_url
+from modelserver.wire.receiver import (
+    MAX_IGNORED,
+    MAX_PARTIAL_BYTES,
+    FragmentAssembler,
+    LcmReceiver,
+    Message,
+    Receiver,
+    UdpReceiver,
+    open_receiver,
+)
+from modelserver.wire.urls import parse_udp_address
+
+
+def wait_for(receiver: Receiver) -> Message:
+    """Return the next message."""
+    end = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < end:
+        message = receiver.receive()
+        if message is not None:
+            return message
+    raise TimeoutError("no message")
+
+
+@pytest.fixture(params=[UdpReceiver, LcmReceiver])
+def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Receiver, lcm.LCM]]:
+    """A receiver of either kind, and a publisher."""
+    if request.param is LcmReceiver:
+        monkeypatch.setattr(module, "parse_udp_address", lambda url: None)
+    with reserved_url() as url, closing(open_receiver(resolve_url(url))) as receiver:
+        assert isinstance(receiver, request.param)
+        yield receiver, lcm.LCM(resolve_url(url))
+
+
+def test_given_messages_that_liblcm_sends_then_those_of_the_channels_are_received(
+    pair: tuple[Receiver, lcm.LCM],
+) -> None:
+    receiver, publisher = pair
+    receiver.subscribe("A")
+    receiver.subscribe("LONG")
+    assert receiver.receive() is None
+    long = random.Random(1).randbytes(700_000)
+    for channel, data in (("A", b""), ("OTHER", b"x"), ("LONG", long), ("OTHER", long), ("A", b"\0\xff")):
+        publisher.publish(channel, data)
+    assert [wait_for(receiver) for _ in range(3)] == [(b"A", b""), (b"LONG", long), (b"A", b"\0\xff")]
+    assert receiver.receive() is None
+
+
+def test_given_no_route_then_the_error_names_what_to_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    def reject(address: object) -> None:
+        raise OSError(19, "No such device")
+
+    monkeypatch.setattr(module, "UdpReceiver", reject)
+    with pytest.raises(BusError, match=r"No such device.*sudo ip route replace 239\.1\.2\.3/32 dev lo"):
+        open_receiver("udpm://239.1.2.3:7667?ttl=0")
+
+
+def test_given_a_flood_of_packets_without_a_message_then_receive_returns_and_the_message_behind_is_received() -> None:
+    with reserved_url() as url:
+        address = parse_udp_address(url)
+        assert address is not None
+        receiver = UdpReceiver(address)
+        receiver.subscribe("A")
+        publisher = lcm.LCM(url)
+        with closing(receiver), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            for packet in (b"LC03", b"LC03" + bytes(30), b"LC02\0\0\0\1A", b"no LCM", b"") * MAX_IGNORED:
+                sender.sendto(packet, (address.group, address.port))
+            publisher.publish("A", b"data")
+            assert receiver.receive() is None
+            assert wait_for(receiver) == (b"A", b"data")
+
+
+# --- fragments ------------------------------------------------------------------------------------------------
+
+
+def split(channel: bytes, data: bytes, sequence: int = 1, length: int = 4) -> list[bytes]:
+    """Return the fragments of a message."""
+    starts = range(0, max(len(data), 1), length)
+    return [
+        struct.pack(">4sIIIHH", b"LC03", sequence, len(data), start, number, len(starts))
+        + (b"" if number else channel + b"\0")
+        + data[start : start + length]
+        for number, start in enumerate(starts)
+    ]
+
+
+def make_assembler() -> FragmentAssembler:
+    assembler = FragmentAssembler()
+    assembler.channels = {b"A"}
+    return assembler
+
+
+@given(st.binary(max_size=50), st.binary(max_size=50), st.randoms(use_true_random=False))
+def test_given_fragments_of_two_senders_then_both_messages_are_assembled(
+    first: bytes, second: bytes, order: random.Random
+) -> None:
+    assembler = make_assembler()
+    waiting = {"first": split(b"A", first), "second": split(b"A", second)}
+    found = {}
+    while any(waiting.values()):
+        sender = order.choice([each for each in waiting if waiting[each]])
+        message = assembler.add(sender, waiting[sender].pop(0))
+        if message is not None:
+            found[sender] = message
+    assert found == {"first": (b"A", first), "second": (b"A", second)}
+
+
+def test_given_a_lost_fragment_then_only_its_message_is_lost() -> None:
+    assembler = make_assembler()
+    lost = [split(b"A", b"12345678", 1)[0], split(b"A", b"12345678", 2)[1]]
+    assert [assembler.add(1, each) for each in (*lost, *split(b"A", b"abcdefgh", 3))] == [
+        None,
+        None,
+        None,
+        (b"A", b"abcdefgh"),
+    ]
+
+
+def test_given_fragments_of_another_channel_then_none_is_assembled() -> None:
+    assembler = make_assembler()
+    assert [assembler.add(1, each) for each in split(b"B", b"12345678")] == [None, None]
+
+
+@given(st.lists(st.binary(max_size=30).map(lambda data: b"LC03" + data) | st.sampled_from(split(b"A", b"12345678"))))
+def test_given_any_fragments_then_each_message_has_the_length_in_its_header(packets: list[bytes]) -> None:
+    assembler = make_assembler()
+    for packet in packets:
+        message = assembler.add(1, packet)
+        assert message is None or len(message[1]) == int.from_bytes(packet[8:12], "big")
+
+
+def test_given_first_fragments_of_many_long_messages_then_their_memory_is_bounded() -> None:
+    assembler = make_assembler()
+    size = MAX_PARTIAL_BYTES // 4
+    for sender in range(20):
+        head = struct.pack(">4sIIIHH", b"LC03", 1, size, 0, 0, 2)
+        assert assembler.add(sender, head + b"A\0" + bytes(10)) is None
+    assert assembler.partial_bytes <= MAX_PARTIAL_BYTES
+    too_long = struct.pack(">4sIIIHH", b"LC03", 1, MAX_PARTIAL_BYTES + 1, 0, 0, 2)
+    assert assembler.add("other", too_long + b"A\0") is None
+    assert assembler.partial_bytes == MAX_PARTIAL_BYTES
