@@ -123,7 +123,7 @@ def test_two_minutes_with_a_small_fault_hold(fault: str, tmp_path: Path, capsys:
 @pytest.mark.slow
 def test_on_a_steady_circle_with_an_unknown_latency_the_bound_covers_the_heading() -> None:
     fault = integrity.BY_NAME["steady_circle"]
-    # the gyro's scale turns the heading there, which fixes cannot tell from a latency that grows
+    # the gyro's scale turns the heading there, which fixes cannot separate from a latency that grows
     scenario = Scenario(VEHICLES["rover"], 450.0, np.random.default_rng((51, 23, 0, 2)), has_velocity=False)
     fault.inject(scenario)
     looks = integrity.observe(scenario)

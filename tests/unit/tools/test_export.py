@@ -174,7 +174,7 @@ def test_given_an_exported_file_then_import_bag_makes_the_log_again(log: Path, m
         assert [(e.utime, e.channel, e.data) for e in second] == [(e.utime, e.channel, e.data) for e in first]
 
 
-def test_given_a_file_without_lcm_messages_or_a_damaged_one_then_import_bag_says_so(
+def test_given_a_file_without_lcm_messages_or_a_damaged_one_then_import_bag_ends_with_the_reason(
     log: Path, mcap: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain, cut, out = tmp_path / "plain.mcap", tmp_path / "cut.mcap", tmp_path / "out.lcm"

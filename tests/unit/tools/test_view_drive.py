@@ -310,7 +310,7 @@ def test_given_a_log_with_two_geometries_then_each_time_has_its_own(model: Model
     assert [event.kind for event in drive.events] == [EventKind.GEOMETRY]
 
 
-def test_given_a_service_that_stops_then_that_is_said_after_some_seconds() -> None:
+def test_given_a_service_that_stops_then_that_is_reported_after_some_seconds() -> None:
     drive = Drive("v_")
     assert "no message of a service yet" in drive.find_silence(START)
     drive.feed("v_POSE", make_pose(0.0, 1.0), START)

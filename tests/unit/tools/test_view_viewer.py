@@ -63,7 +63,7 @@ def test_given_a_mesh_file_with_markup_in_its_name_then_it_is_listed_as_text(pag
     assert r"\<b\>\{x\}\*.stl: not found" in viewer._notes.content
 
 
-def test_given_no_service_then_the_page_says_so_and_shows_no_time(page: Page) -> None:
+def test_given_no_service_then_the_page_reports_it_and_shows_no_time(page: Page) -> None:
     source = make_live()
     viewer = Viewer(page, source)
     viewer.draw(0.0, 0.0)

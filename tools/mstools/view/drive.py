@@ -474,8 +474,8 @@ class Drive:
         """
         if not utime or not self._geometries:
             return self.model, self.base_frame
-        begun = [each for each in self._geometries if each[0] <= utime]
-        _, model, base_frame = begun[-1] if begun else self._geometries[0]
+        earlier = [each for each in self._geometries if each[0] <= utime]
+        _, model, base_frame = earlier[-1] if earlier else self._geometries[0]
         return model, base_frame
 
     def find_silence(self, now: int) -> str:
