@@ -28,7 +28,7 @@ as in `tree`. Numbers that are not finite give results that are not.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -36,7 +36,7 @@ import numpy.typing as npt
 
 from modelserver.dynamics.mass_covariance import MassUncertainty, compute_center_covariance
 from modelserver.dynamics.rates import compute_configuration, compute_rate_bias, compute_rate_map
-from modelserver.dynamics.tree import GROUND, Link, Tree, TreeJoint, build_tree
+from modelserver.dynamics.tree import GROUND, Tree, TreeJoint, TreeLink, build_tree
 from modelserver.errors import MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.geometry.inertia import RigidInertia
 from modelserver.geometry.joint import JointType
@@ -316,12 +316,20 @@ class Dynamics:
 
     def frame_pose(self, q: Values, frame: str) -> Pose:
         """Return the pose of a frame in the world. Raises UnknownBodyError, UnknownFrameError."""
-        link, X_FP = self._locate(frame)
-        if link.joint == GROUND:
-            return X_FP
+        (found,) = self.frame_poses(q, (frame,))
+        return found
+
+    def frame_poses(self, q: Values, frames: Iterable[str]) -> list[Pose]:
+        """Return the poses of frames in the world. Raises as `frame_pose`."""
+        located = [self._locate(frame) for frame in frames]
         self._pin.forwardKinematics(self._model, self._data, self._configure(q)[1])
-        M = self._data.oMi[link.joint + 1]
-        return Pose(M.translation.tolist(), so3.from_matrix(M.rotation)) @ X_FP
+        found = []
+        for link, X_FP in located:
+            if link.joint != GROUND:
+                M = self._data.oMi[link.joint + 1]
+                X_FP = Pose(M.translation.tolist(), so3.from_matrix(M.rotation)) @ X_FP
+            found.append(X_FP)
+        return found
 
     def jacobian(self, q: Values, frame: str) -> Array:
         """Return the Jacobian (6, n) of a frame: J q' is its velocity and angular velocity along the world's axes."""
@@ -337,7 +345,7 @@ class Dynamics:
         J[:3] -= so3.skew(arm) @ J[3:]
         return np.asarray(J @ S)
 
-    def _locate(self, frame: str) -> tuple[Link, Pose]:
+    def _locate(self, frame: str) -> tuple[TreeLink, Pose]:
         """Return the link of a frame's body, and the frame's pose in Pinocchio's frame of the link's joint."""
         found = self.model.frame(frame)
         link = self.tree.links.get(found.body)

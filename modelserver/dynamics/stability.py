@@ -32,7 +32,7 @@ from modelserver.dynamics.multibody import CenterOfMass, Dynamics, Values
 from modelserver.errors import MalformedRequestError
 from modelserver.geometry.names import format_names
 from modelserver.transforms import so3
-from modelserver.transforms.so3 import Array
+from modelserver.transforms.so3 import Array, Vector3
 
 STEP: Final = 1e-5
 """Meters, and share of the weight, over which the margin is differenced."""
@@ -61,13 +61,15 @@ class Stability(NamedTuple):
 
 
 class SupportPolygon(NamedTuple):
-    """Contacts on a plane: all points (k, 3), the unit normal (3) towards the center of mass, and the order of those
-    that are corners, counterclockwise seen from above.
+    """Contacts on a plane: all points (k, 3), their mean (3), axes x, y, normal (3, 3), and the corners.
+
+    The normal points towards the center of mass; the corners are numbers of points, counterclockwise seen from there.
     """
 
     names: tuple[str, ...]
     points: Array
-    normal: Array
+    mean: Array
+    axes: Array
     corners: tuple[int, ...]
 
     @classmethod
@@ -75,17 +77,14 @@ class SupportPolygon(NamedTuple):
         """Return the polygon of contact points (3) by name. Raises MalformedRequestError where they span no area."""
         names, points = tuple(contacts), np.array(list(contacts.values()), dtype=float).reshape(-1, 3)
         mean = points.mean(axis=0) if len(points) else np.zeros(3)
-        spread = np.linalg.svd(points - mean)[1] if len(points) >= 3 else np.zeros(3)
+        _, spread, axes = np.linalg.svd(points - mean) if len(points) >= 3 else (None, np.zeros(3), np.eye(3))
         if not spread[1] > 1e-6 * max(spread[0], 1e-3):
             raise MalformedRequestError(
                 f"the contacts {format_names(names)} span no area; a support polygon needs three that are not on a line"
             )
-        axes = np.linalg.svd(points - mean)[2]
-        x, normal = axes[0], axes[2]
-        if (center - mean) @ normal < 0.0:
-            normal = -normal
-        y = np.cross(normal, x)
-        return cls(names, points, normal, _find_hull((points - mean) @ np.column_stack((x, y))))
+        normal = axes[2] if (center - mean) @ axes[2] >= 0.0 else -axes[2]
+        axes = np.vstack((axes[0], np.cross(normal, axes[0]), normal))
+        return cls(names, points, mean, axes, _find_hull(((points - mean) @ axes[:2].T).tolist()))
 
 
 def compute_margin(polygon: SupportPolygon, center: Array, force: Array, moment: Array) -> tuple[float, int]:
@@ -97,30 +96,42 @@ def compute_margin(polygon: SupportPolygon, center: Array, force: Array, moment:
 
 def compute_edge_angle(polygon: SupportPolygon, number: int, center: Array, force: Array, moment: Array) -> float:
     """Return theta about the edge from the corner `number` to the next one."""
-    start, end = (polygon.points[polygon.corners[n % len(polygon.corners)]] for n in (number, number + 1))
-    a = (end - start) / np.linalg.norm(end - start)
-    arm = end - center
-    arm = arm - a * (a @ arm)
-    tipping = force - a * (a @ force) + np.cross(arm, a * (a @ moment)) / (arm @ arm)
-    return math.atan2(float(a @ np.cross(arm, tipping)), float(arm @ tipping))
+    # plain floats: numpy costs ten times as much for three numbers
+    corners, points = polygon.corners, polygon.points
+    start, end = points[corners[number]].tolist(), points[corners[(number + 1) % len(corners)]].tolist()
+    c, f = so3.to_vector3(center.tolist()), so3.to_vector3(force.tolist())
+    along = (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+    a = so3.scale(1.0 / math.hypot(*along), along)
+    arm = _reject((end[0] - c[0], end[1] - c[1], end[2] - c[2]), a)
+    turning = _dot(a, so3.to_vector3(moment.tolist())) / _dot(arm, arm)
+    tipping = so3.add(_reject(f, a), so3.cross(arm, so3.scale(turning, a)))
+    return math.atan2(_dot(a, so3.cross(arm, tipping)), _dot(arm, tipping))
+
+
+def _dot(a: Vector3, b: Vector3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _reject(v: Vector3, unit: Vector3) -> Vector3:
+    """Return the part of a vector that is normal to a unit vector."""
+    return so3.add(v, so3.scale(-_dot(v, unit), unit))
 
 
 def compute_loads(polygon: SupportPolygon, center: Array, force: Array, moment: Array) -> Array:
     """Return the normal forces (k,) of the contacts, newtons; nan where they cannot balance without pulling."""
-    mean = polygon.points.mean(axis=0)
-    x = np.linalg.svd(polygon.points - mean)[2][0]
-    axes = np.vstack((x, np.cross(polygon.normal, x)))
+    x, y, normal = polygon.axes
     # about a point of the contact plane, where the friction has no moment along the plane
-    about = moment + np.cross(center - mean, force)
-    # the moment of a load N at x, y about the two axes of the plane is N y, -N x
-    A = np.vstack((np.ones(len(polygon.points)), axes @ (polygon.points - mean).T))
-    wanted = np.array([-polygon.normal @ force, axes[1] @ about, -axes[0] @ about])
+    about = moment + np.cross(center - polygon.mean, force)
+    # the moment of a load N at x, y is N y about x, -N x about y
+    A = np.vstack((np.ones(len(polygon.points)), polygon.axes[:2] @ (polygon.points - polygon.mean).T))
+    wanted = np.array([-normal @ force, y @ about, -x @ about])
     active = list(range(len(polygon.points)))
     loads = np.full(len(polygon.points), math.nan)
     while len(active) >= 3:
         part = A[:, active]
         gram = part @ part.T
-        if np.linalg.matrix_rank(gram) < 3:
+        # three on a line balance nothing beside it
+        if not abs(np.linalg.det(gram)) > 1e-12 * np.trace(gram) ** 3:
             break
         found = part.T @ np.linalg.solve(gram, wanted)
         if found.min() >= -1e-9 * abs(wanted[0]):
@@ -196,11 +207,12 @@ def assess_stability(
         (3, 3) of the attitude, rad2, and of the acceleration of the center of mass, along the axes of the world; by
         default exact.
     """
-    c = dynamics.center_of_mass(q)
     root = dynamics.tree.root
     center = dynamics.center_of_mass(q, frame=root, sigma=sigma)
-    R = dynamics.frame_pose(q, root).rotation
-    points = {name: dynamics.frame_pose(q, name).position for name in contacts}
+    X_WR, *placed = dynamics.frame_poses(q, (root, *contacts))
+    R = X_WR.rotation
+    c = X_WR.transform(center.position)
+    points = {name: X.position for name, X in zip(contacts, placed, strict=True)}
     P_c = None if center.covariance is None else R @ center.covariance @ R.T
     weight = dynamics.mass * np.array([0.0, 0.0, -dynamics.gravitational_acceleration])
     P_f = np.zeros((3, 3))
@@ -208,27 +220,27 @@ def assess_stability(
         # a tilt of the vehicle by d turns the force in it by -d
         G = so3.skew(weight)
         P_f = G @ tilt_covariance @ G.T
-    static = compute_tip_over(points, c.position, weight, np.zeros(3), P_c, P_f)
+    static = compute_tip_over(points, c, weight, np.zeros(3), P_c, P_f)
     dynamic = None
     if v is not None and a is not None:
         _, rate = dynamics.momentum(q, v, a)
         if acceleration_covariance is not None:
             P_f = P_f + dynamics.mass**2 * acceleration_covariance
         if np.isfinite(rate).all():
-            dynamic = compute_tip_over(points, c.position, weight - rate[:3], -rate[3:], P_c, P_f)
+            dynamic = compute_tip_over(points, c, weight - rate[:3], -rate[3:], P_c, P_f)
     return Stability(static, dynamic, center)
 
 
-def _find_hull(points: Array) -> tuple[int, ...]:
+def _find_hull(points: Sequence[Sequence[float]]) -> tuple[int, ...]:
     """Return the corners of the convex hull of points (k, 2), counterclockwise (A. Andrew's monotone chain, 1979)."""
-    order = sorted(range(len(points)), key=lambda n: (points[n][0], points[n][1]))
+    order = sorted(range(len(points)), key=lambda n: tuple(points[n]))
 
     def half(numbers: Sequence[int]) -> list[int]:
         chain: list[int] = []
         for n in numbers:
             while len(chain) >= 2:
-                (ax, ay), (bx, by) = points[chain[-1]] - points[chain[-2]], points[n] - points[chain[-1]]
-                if ax * by - ay * bx > 1e-12:
+                (ax, ay), (bx, by), (cx, cy) = points[chain[-2]], points[chain[-1]], points[n]
+                if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) > 1e-12:
                     break
                 chain.pop()
             chain.append(n)

@@ -46,7 +46,7 @@ class TreeJoint(NamedTuple):
     offset: float = 0.0
 
 
-class Link(NamedTuple):
+class TreeLink(NamedTuple):
     """A body: the number of the joint that moves it, the pose of its origin in that one's far frame, its inertia."""
 
     body: str
@@ -63,7 +63,7 @@ class Tree(NamedTuple):
     coordinates: tuple[str, ...]
     defaults: tuple[float, ...]
     joints: tuple[TreeJoint, ...]
-    links: Mapping[str, Link]
+    links: Mapping[str, TreeLink]
     cut: tuple[str, ...]
 
     @property
@@ -111,7 +111,7 @@ def build_tree(model: Model, root: str = "", floating: bool = True, cut_loops: b
     joints: list[TreeJoint] = []
     if floating:
         joints.append(TreeJoint(root, free, True, GROUND, Pose.identity(), tuple(range(6))))
-    links: dict[str, Link] = {}
+    links: dict[str, TreeLink] = {}
     # a crossing, and the joint that moves the body it leaves, with that body's pose in the joint's far frame
     stack: list[tuple[Crossing | None, int, Pose]] = [(None, len(joints) - 1, base_frame.pose.inverse())]
     while stack:
@@ -132,7 +132,7 @@ def build_tree(model: Model, root: str = "", floating: bool = True, cut_loops: b
                 moves = (columns[drive.leader], drive.multiplier, drive.offset)
                 joints.append(TreeJoint(constraint.name, constraint.joint, crossing.forward, joint, X_FN, *moves))
                 joint = len(joints) - 1
-        links[body] = Link(body, joint, X_FB, _get_inertia(model, body))
+        links[body] = TreeLink(body, joint, X_FB, _get_inertia(model, body))
         stack += [(each, joint, X_FB) for each in reversed(below[body])]
     cut = tuple(_find_open_loops(model, links, used))
     if cut and not cut_loops:
@@ -156,7 +156,7 @@ def _get_inertia(model: Model, body: str) -> RigidInertia | None:
     return found
 
 
-def _find_open_loops(model: Model, links: Mapping[str, Link], used: set[str]) -> Iterator[str]:
+def _find_open_loops(model: Model, links: Mapping[str, TreeLink], used: set[str]) -> Iterator[str]:
     """Yield the constraints that close a loop in which something moves."""
     for each in model.constraints:
         if each.name not in used and each.from_.partition(":")[0] in links:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VALUES = {"errors", "version", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "estimation.history"}
-CORE = GEOMETRY | POSES | {"joints", "estimation", "query"}
+CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
 FILES = {"files.kinds", "files.regular"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
 SIGNING = {"signing.signatures", "signing.key_files"}
@@ -48,7 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "query": CORE,
     "core": CORE,
     "simulation": GEOMETRY | {"messages", "earth"},
-    "config.vehicle_file": GEOMETRY | FILES | {"messages", "estimation", "config.reader"},
+    "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
     "config.reader": {"errors"},
     "wire": WIRE,
     "server": SERVER,

@@ -34,7 +34,7 @@ def pendulum(mass: float = 2.0, length: float = 0.5, **joint) -> ModelBuilder:
     builder = ModelBuilder("pendulum")
     builder.add_body("Base", inertia=point(10.0, 0, 0, 0).matrix()).add_frame("Origin")
     builder.add_body("Arm", inertia=point(mass, 0, 0, -length).matrix()).add_frame("Pivot")
-    builder.add_constraint("Swing", "Base:Origin", "Arm:Pivot", joint=Joint(JointType.REVOLUTE, (0, 1, 0), **joint))
+    builder.add_constraint("Hinge", "Base:Origin", "Arm:Pivot", joint=Joint(JointType.REVOLUTE, (0, 1, 0), **joint))
     return builder
 
 
@@ -109,15 +109,15 @@ def test_given_free_motion_of_ten_seconds_then_energy_is_conserved(seed, types, 
 def test_given_pendulum_then_equations_are_those_of_the_textbook():
     m, length, g = 2.0, 0.5, 9.80665
     dynamics = pendulum(m, length).build().dynamics("fixed")
-    assert dynamics.coordinates == ("Swing",)
-    q = {"Swing": 0.3}
+    assert dynamics.coordinates == ("Hinge",)
+    q = {"Hinge": 0.3}
     assert dynamics.mass_matrix(q)[0, 0] == pytest.approx(m * length**2)
     assert dynamics.gravity(q)[0] == pytest.approx(m * g * length * math.sin(0.3))
-    assert dynamics.bias(q, {"Swing": 5.0})[0] == pytest.approx(m * g * length * math.sin(0.3))
+    assert dynamics.bias(q, {"Hinge": 5.0})[0] == pytest.approx(m * g * length * math.sin(0.3))
     assert dynamics.forward(q, {}, {})[0] == pytest.approx(-g / length * math.sin(0.3))
     assert dynamics.kinetic_energy(q, [2.0]) == pytest.approx(0.5 * m * length**2 * 4.0)
     assert dynamics.potential_energy(q) == pytest.approx(-m * g * length * math.cos(0.3))
-    assert dynamics.by_name([0.3]) == {"Swing": 0.3}
+    assert dynamics.by_name([0.3]) == {"Hinge": 0.3}
 
 
 def test_given_joint_passed_backward_then_the_coordinate_keeps_its_sense():
@@ -125,10 +125,10 @@ def test_given_joint_passed_backward_then_the_coordinate_keeps_its_sense():
     backward = pendulum().build().dynamics("floating", "Arm:Pivot")
     # the arm held, the base moves the other way: D of the joint is that of the base about the pivot, nothing here
     assert backward.coordinates == ("Arm:Pivot.x", "Arm:Pivot.y", "Arm:Pivot.z", "Arm:Pivot.rx", "Arm:Pivot.ry",
-                                    "Arm:Pivot.rz", "Swing")  # fmt: skip
-    X = backward.frame_pose({"Swing": 0.3}, "Base:Origin")
+                                    "Arm:Pivot.rz", "Hinge")  # fmt: skip
+    X = backward.frame_pose({"Hinge": 0.3}, "Base:Origin")
     assert X.is_close(Pose.from_rpy((0, 0, 0), pitch=-0.3))
-    assert forward.frame_pose({"Swing": 0.3}, "Arm:Pivot").is_close(X.inverse())
+    assert forward.frame_pose({"Hinge": 0.3}, "Arm:Pivot").is_close(X.inverse())
 
 
 def test_given_force_on_surroundings_then_it_enters_the_bias_with_its_jacobian():
@@ -222,7 +222,7 @@ def sampled_center(model, q, frame: str, rng: np.random.Generator, relative: flo
 
     from modelserver.geometry import Model
 
-    def moved(pose: Pose, sigma: Sigma | None) -> Pose:
+    def perturb(pose: Pose, sigma: Sigma | None) -> Pose:
         if sigma is None:
             return pose
         # dp and dtheta along the axes of the parent
@@ -234,10 +234,10 @@ def sampled_center(model, q, frame: str, rng: np.random.Generator, relative: flo
         return Pose(pose.position + error[:3], turn.wxyz)
 
     bodies = tuple(
-        replace(body, frames=tuple(replace(each, pose=moved(each.pose, each.sigma)) for each in body))
+        replace(body, frames=tuple(replace(each, pose=perturb(each.pose, each.sigma)) for each in body))
         for body in model.bodies
     )
-    constraints = tuple(replace(each, pose=moved(each.pose, each.sigma)) for each in model.constraints)
+    constraints = tuple(replace(each, pose=perturb(each.pose, each.sigma)) for each in model.constraints)
     changed = Model(bodies, constraints)
     masses = {body.name: body.mass * (1 + relative * rng.normal()) for body in model.bodies}
     return changed.dynamics("fixed", masses=masses).center_of_mass(q, frame=frame)
@@ -324,7 +324,7 @@ def test_given_loop_then_the_error_names_its_constraint_or_it_is_cut():
         model.dynamics()
     dynamics = model.dynamics("fixed", cut_loops=True)
     assert dynamics.cut == ("RodPin",)
-    assert dynamics.coordinates == ("Swing", "RodSlide")
+    assert dynamics.coordinates == ("Hinge", "RodSlide")
 
 
 def test_given_rigid_loop_then_it_changes_nothing():
@@ -343,16 +343,16 @@ def test_given_rigid_loop_then_it_changes_nothing():
         ({"payload": {"Arm:Pivot": -1.0}}, "must be positive"),
     ],
 )
-def test_given_impossible_options_then_the_error_says_what_is_expected(options, message):
+def test_given_impossible_options_then_the_error_states_what_is_expected(options, message):
     with pytest.raises(MalformedRequestError, match=message):
         pendulum().build().dynamics(**options)
 
 
 def test_given_unknown_names_then_the_nearest_is_suggested():
     dynamics = pendulum().build().dynamics("fixed")
-    with pytest.raises(MalformedRequestError, match="Swung") as error:
-        dynamics.mass_matrix({"Swung": 0.0})
-    assert error.value.nearest == ("Swing",)
+    with pytest.raises(MalformedRequestError, match="Hunge") as error:
+        dynamics.mass_matrix({"Hunge": 0.0})
+    assert error.value.nearest == ("Hinge",)
     with pytest.raises(MalformedRequestError, match=r"q has shape \(2,\); expected \(1,\)"):
         dynamics.mass_matrix([0.0, 0.0])
     with pytest.raises(UnknownFrameError):

@@ -120,12 +120,12 @@ def test_given_uncertain_center_then_sigma_is_first_order():
 @pytest.mark.parametrize(
     "contacts", [{}, {"a": [0, 0, 0], "b": [1, 0, 0]}, {"a": [0, 0, 0], "b": [1, 0, 0], "c": [2, 0, 0]}]
 )
-def test_given_contacts_on_a_line_then_the_error_says_what_is_needed(contacts):
+def test_given_contacts_on_a_line_then_the_error_states_what_is_needed(contacts):
     with pytest.raises(MalformedRequestError, match="three that are not on a line"):
         compute_tip_over({name: np.array(at, dtype=float) for name, at in contacts.items()}, CENTER, WEIGHT, NONE)
 
 
-def test_given_no_gravity_then_the_error_says_so():
+def test_given_no_gravity_then_the_error_states_so():
     with pytest.raises(MalformedRequestError, match="needs gravity"):
         compute_tip_over(CONTACTS, CENTER, NONE, NONE)
 
