@@ -210,3 +210,27 @@ class MujocoTwin:
 def is_close(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-8) -> bool:
     """Return whether two arrays agree, relative to the largest entry."""
     return bool(np.abs(a - b).max() <= tolerance * max(np.abs(b).max(), 1.0))
+
+
+def ball(mass: float, *at: float):
+    small = 1e-9 * mass
+    return RigidInertia(mass, at, ((small, 0, 0), (0, small, 0), (0, 0, small))).matrix()  # type: ignore[arg-type]
+
+
+def cart_with_mast() -> Model:
+    """Return a cart of 80 kg with a mast that slides sideways, and 20 kg at its top."""
+    builder = ModelBuilder("cart")
+    cart = builder.add_body("Cart", inertia=ball(80.0, 0.0, 0.0, 0.5))
+    cart.add_frame("Origin")
+    for name, x, y in (
+        ("front_left", 0.5, 0.4),
+        ("front_right", 0.5, -0.4),
+        ("rear_left", -0.5, 0.4),
+        ("rear_right", -0.5, -0.4),
+    ):
+        cart.add_frame(name, Pose((x, y, 0.0)))
+    builder.add_body("Mast", inertia=ball(20.0, 0.0, 0.0, 1.0)).add_frame("Foot")
+    builder.add_constraint(
+        "Slide", "Cart:Origin", "Mast:Foot", joint=Joint(JointType.PRISMATIC, (0, 1, 0), sigma=(0.01,))
+    )
+    return builder.build()

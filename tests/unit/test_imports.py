@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
     "core": CORE,
-    "simulation": GEOMETRY | {"messages", "earth"},
+    "simulation": GEOMETRY | {"messages", "dynamics", "earth"},
     "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
     "config.reader": {"errors"},
     "wire": WIRE,

@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from support_dynamics import cart_with_mast
 
 from modelserver.dynamics import assess_stability, compute_tip_over
 from modelserver.errors import MalformedRequestError
-from modelserver.geometry import Joint, JointType, ModelBuilder
-from modelserver.geometry.inertia import RigidInertia
 from modelserver.transforms import Pose
 
 M, G, H = 100.0, 9.80665, 0.6
@@ -22,25 +21,6 @@ CENTER = np.array([0.1, 0.0, H])
 WEIGHT = np.array([0.0, 0.0, -M * G])
 NONE = np.zeros(3)
 Y = np.array([0.0, 1.0, 0.0])
-
-
-def ball(mass: float, *at: float):
-    small = 1e-9 * mass
-    return RigidInertia(mass, at, ((small, 0, 0), (0, small, 0), (0, 0, small))).matrix()  # type: ignore[arg-type]
-
-
-def vehicle():
-    """Return a cart of 80 kg with a mast that slides sideways, and 20 kg at its top."""
-    builder = ModelBuilder("cart")
-    cart = builder.add_body("Cart", inertia=ball(80.0, 0.0, 0.0, 0.5))
-    cart.add_frame("Origin")
-    for name, at in CONTACTS.items():
-        cart.add_frame(name.replace(" ", "_"), Pose(at))
-    builder.add_body("Mast", inertia=ball(20.0, 0.0, 0.0, 1.0)).add_frame("Foot")
-    builder.add_constraint(
-        "Slide", "Cart:Origin", "Mast:Foot", joint=Joint(JointType.PRISMATIC, (0, 1, 0), sigma=(0.01,))
-    )
-    return builder.build()
 
 
 FRAMES = [f"Cart:{name.replace(' ', '_')}" for name in CONTACTS]
@@ -136,7 +116,7 @@ class TestVehicle:
         pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
 
     def test_given_mast_aside_and_tilt_then_static_margin_is_that_of_a_hand_calculation(self):
-        dynamics = vehicle().dynamics()
+        dynamics = cart_with_mast().dynamics()
         q = {"Slide": 0.5, "Cart:Origin.rx": -0.1}
         found = assess_stability(dynamics, q, FRAMES)
         # 20 % of the mass moves by 0.5 m: the center is 0.1 m to the left, 0.6 m up; it leans 0.1 rad to the left
@@ -146,7 +126,7 @@ class TestVehicle:
         assert found.dynamic is None
 
     def test_given_accelerations_of_base_and_mast_then_both_count(self):
-        dynamics = vehicle().dynamics()
+        dynamics = cart_with_mast().dynamics()
         a = {"Cart:Origin.y": -2.0, "Slide": -3.0}
         found = assess_stability(dynamics, {}, FRAMES, {}, a)
         assert found.dynamic is not None
@@ -157,12 +137,12 @@ class TestVehicle:
         assert found.dynamic.margin < found.static.margin
 
     def test_given_sigmas_then_they_widen_the_margin(self):
-        dynamics = vehicle().dynamics()
+        dynamics = cart_with_mast().dynamics()
         assert math.isnan(assess_stability(dynamics, {}, FRAMES, sigma={"Slide": math.nan}).static.sigma)
         assert assess_stability(dynamics, {}, FRAMES, sigma={}).static.sigma == 0.0  # all frames are at an origin
         from modelserver.dynamics import MassUncertainty
 
-        dynamics = vehicle().dynamics(uncertainty=MassUncertainty(unstated_is_exact=True))
+        dynamics = cart_with_mast().dynamics(uncertainty=MassUncertainty(unstated_is_exact=True))
         square = 0.4**2 + H**2
         found = assess_stability(dynamics, {}, FRAMES, sigma={"Slide": 0.01})
         assert found.static.sigma == pytest.approx(H / square * 0.2 * 0.01, rel=1e-5)
@@ -170,7 +150,7 @@ class TestVehicle:
         assert tilted.static.sigma == pytest.approx(0.02, rel=1e-5)
 
     def test_given_payload_then_the_margin_falls(self):
-        model = vehicle()
+        model = cart_with_mast()
         before = assess_stability(model.dynamics(), {}, FRAMES).static.margin
         after = assess_stability(model.dynamics(payload={"Mast:Foot": 50.0}), {"Slide": 0.3}, FRAMES).static.margin
         assert after < before

@@ -164,12 +164,12 @@ def _compute(
             plain: Dynamics = geometry.dynamics("floating", root, **options)
             data["without changes"] = _describe_stability(assess_stability(plain, base, names, v, a, sigma=sigma))
     # with the base held, the rows and columns of the joints are left
-    kept = slice(0 if floating else 6, None)
-    D = dynamics.mass_matrix(q)[kept, kept]
+    shown = slice(0 if floating else 6, None)
+    D = dynamics.mass_matrix(q)[shown, shown]
     if equations:
         at = [q.get(name, value) for name, value in dynamics.by_name(dynamics.default_position).items()]
         gravity = dynamics.gravity(q).tolist()
-        data |= _describe_equations(dynamics.coordinates[kept], at[kept], gravity[kept], D)
+        data |= _describe_equations(dynamics.coordinates[shown], at[shown], gravity[shown], D)
     return data, D
 
 
