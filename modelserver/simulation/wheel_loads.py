@@ -46,11 +46,7 @@ class WheelLoads:
     def compute(self, motion: TrajectoryMotion) -> dict[str, float]:
         """Return the load of each wheel at an instant, newtons; nan where the vehicle would tip."""
         if motion.attitude is None:
-            q, w, dw = (
-                so3.exponential((0.0, 0.0, motion.yaw)),
-                (0.0, 0.0, motion.yaw_rate),
-                (0.0, 0.0, motion.yaw_acceleration),
-            )
+            w, dw = (0.0, 0.0, motion.yaw_rate), (0.0, 0.0, motion.yaw_acceleration)
         else:
             w, dw = motion.attitude.rate, motion.attitude.acceleration
         R = np.array(so3.matrix_rows(motion.orientation()))
