@@ -99,7 +99,7 @@ class Dynamics:
     ModelServerError
         The extra `dynamics` is not installed.
 
-    One object serves one thread at a time: Pinocchio's work space is in it. Nothing else in it changes.
+    One object serves one thread at a time: Pinocchio's work space is in it, and the configuration of the last state.
     """
 
     def __init__(
@@ -136,8 +136,10 @@ class Dynamics:
         fixed = [each for each in self.tree.links.values() if each.joint == GROUND and each.inertia is not None]
         self._ground = _combine(*(_transform(each.X_FB, each.inertia) for each in fixed if each.inertia is not None))
         self._moving_mass = math.fsum(each.mass for each in self._model.inertias.tolist()[1:])
+        self._ground_share = np.array(self._ground.center) * (self._ground.mass / (self.mass or 1.0))
         self._columns = {name: number for number, name in enumerate(tree.coordinates)}
         self._default = np.array(tree.defaults)
+        self._configured: tuple[bytes, Array, Array] = (b"none", self._default, self._default)
         # rows of Pinocchio's velocity, and numbers of its configuration, of each joint
         self._rows = [slice(each.idx_v, each.idx_v + each.nv) for each in self._model.joints[1:]]
         self._numbers = [slice(each.idx_q, each.idx_q + each.nq) for each in self._model.joints[1:]]
@@ -150,8 +152,14 @@ class Dynamics:
                 self._S[rows, each.columns[0]] = self._Q[numbers, each.columns[0]] = each.multiplier
                 self._q_offset[numbers] = each.offset
         n = len(tree.coordinates)
-        self._is_direct = not self._several and np.array_equal(self._S, np.eye(n)) and not self._q_offset.any()
         self._is_square = self._model.nv == n
+        # where Pinocchio's coordinates are ours, maybe in another order
+        self._is_direct = (
+            self._is_square and not self._several and not self._q_offset.any() and _is_permutation(self._S)
+        )
+        self._order = self._inverse_order = None
+        if self._is_direct and not np.array_equal(self._S, np.eye(n)):
+            self._order, self._inverse_order = self._S.argmax(axis=1), self._S.argmax(axis=0)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -182,7 +190,7 @@ class Dynamics:
         q, q_pin, S = self._configure(q)
         D = self._pin.crba(self._model, self._data, q_pin).reshape((self._model.nv,) * 2)
         if self._is_direct:
-            return np.array(D)
+            return np.array(D) if self._inverse_order is None else D[self._inverse_order][:, self._inverse_order]
         D = S.T @ D @ S
         return np.asarray((D + D.T) / 2.0)
 
@@ -191,7 +199,7 @@ class Dynamics:
         q, q_pin, S = self._configure(q)
         v = self._read(v, "v")
         if self._is_direct:
-            tau = np.array(self._pin.nonLinearEffects(self._model, self._data, q_pin, v))
+            tau = self._restore(self._pin.nonLinearEffects(self._model, self._data, q_pin, self._arrange(v)))
         else:
             tau = S.T @ self._pin.rnea(self._model, self._data, q_pin, S @ v, self._rate_bias(q, v))
         return tau if forces is None else tau + self._project(q, forces)
@@ -200,14 +208,15 @@ class Dynamics:
         """Return the gravity vector G(q) (n,): the joint forces that hold the vehicle still."""
         _, q_pin, S = self._configure(q)
         tau = self._pin.computeGeneralizedGravity(self._model, self._data, q_pin)
-        return np.array(tau) if self._is_direct else np.asarray(S.T @ tau)
+        return self._restore(tau) if self._is_direct else np.asarray(S.T @ tau)
 
     def inverse(self, q: Values, v: Values, a: Values, forces: Forces | None = None) -> Array:
         """Return the joint forces tau (n,) that cause the accelerations a = q'' (eq. 7)."""
         q, q_pin, S = self._configure(q)
         v, a = self._read(v, "v"), self._read(a, "a")
         if self._is_direct:
-            tau = np.array(self._pin.rnea(self._model, self._data, q_pin, v, a))
+            v, a = self._arrange(v), self._arrange(a)
+            tau = self._restore(self._pin.rnea(self._model, self._data, q_pin, v, a))
         else:
             tau = S.T @ self._pin.rnea(self._model, self._data, q_pin, S @ v, S @ a + self._rate_bias(q, v))
         return tau if forces is None else tau + self._project(q, forces)
@@ -223,14 +232,15 @@ class Dynamics:
             tau = tau - self._project(q, forces)
         try:
             if self._is_direct:
-                a = np.array(self._pin.aba(self._model, self._data, q_pin, v, tau))
+                a_pin = self._pin.aba(self._model, self._data, q_pin, self._arrange(v), self._arrange(tau))
+                a = self._restore(a_pin)
             elif self._is_square:
                 a_pin = self._pin.aba(self._model, self._data, q_pin, S @ v, np.linalg.solve(S.T, tau))
-                a = np.linalg.solve(S, a_pin - self._rate_bias(q, v))
+                a = np.asarray(np.linalg.solve(S, a_pin - self._rate_bias(q, v)))
             else:
                 D = self.mass_matrix(q)
                 np.linalg.cholesky(D)  # raises where D is not positive definite
-                a = np.linalg.solve(D, tau - self.bias(q, v))
+                a = np.asarray(np.linalg.solve(D, tau - self.bias(q, v)))
         except np.linalg.LinAlgError:
             a = np.full(len(q), math.nan)
         if not np.isfinite(a).all() and np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(tau).all():
@@ -276,7 +286,7 @@ class Dynamics:
             )
         q, q_pin, S = self._configure(q)
         velocity, share = None, self._moving_mass / self.mass
-        c = np.array(self._ground.center) * (1.0 - share)
+        c = self._ground_share
         if share:  # else Pinocchio divides by no mass
             c = c + share * self._pin.centerOfMass(self._model, self._data, q_pin)
         if v is not None:
@@ -382,11 +392,13 @@ class Dynamics:
         """Return the coordinates (n,), Pinocchio's configuration, and the map S of rates (see the module)."""
         q = self._read(values, "q")
         if self._is_direct:
-            return q, q, self._S
+            return q, self._arrange(q), self._S
+        # several quantities are usually wanted of one state
+        key = q.tobytes()
+        if key == self._configured[0]:
+            return q, *self._configured[1:]
         q_pin = self._Q @ q + self._q_offset
-        if not self._several:
-            return q, q_pin, self._S
-        S = self._S.copy()
+        S = self._S.copy() if self._several else self._S
         for n in self._several:
             each = self.tree.joints[n]
             position = q[each.columns[0] : each.columns[-1] + 1].tolist()
@@ -394,7 +406,16 @@ class Dynamics:
             S[self._rows[n], each.columns[0] : each.columns[-1] + 1] = compute_rate_map(
                 each.joint, each.forward, position
             )
+        self._configured = (key, q_pin, S)
         return q, q_pin, S
+
+    def _arrange(self, values: Array) -> Array:
+        """Return numbers of the coordinates in Pinocchio's order, where they are the same."""
+        return values if self._order is None else values[self._order]
+
+    def _restore(self, values: Any) -> Array:
+        """Return a copy of numbers in Pinocchio's order in that of the coordinates."""
+        return np.array(values) if self._inverse_order is None else np.asarray(values[self._inverse_order])
 
     def _rate_bias(self, q: Array, v: Array) -> Array:
         """Return S' q', the acceleration of Pinocchio's velocities at q'' = 0."""
@@ -424,6 +445,10 @@ class Dynamics:
         return MalformedRequestError(
             f"the mass matrix is singular: {what}; state the inertia of what moves, or a rotation vector short of 2 pi"
         )
+
+
+def _is_permutation(S: Array) -> bool:
+    return bool(((S == 0.0) | (S == 1.0)).all() and (S.sum(axis=0) == 1.0).all() and (S.sum(axis=1) == 1.0).all())
 
 
 def _with_masses(model: Model, tree: Tree, masses: Mapping[str, float], payload: Mapping[str, float]) -> Tree:
