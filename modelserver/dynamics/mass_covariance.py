@@ -55,8 +55,11 @@ def compute_center_covariance(
     positions: Mapping[str, Coordinates],
     sigmas: Mapping[str, float],
     uncertainty: MassUncertainty,
+    is_frame_exact: bool = False,
 ) -> Array | None:
     """Return the covariance (3, 3) of the center of mass in a frame, along its axes; None where a sigma is missing.
+
+    With `is_frame_exact` the frame's own survey counts as exact: the covariance is that relative to its body.
 
     `positions` are those of the tree's joints, `sigmas` those of its coordinates, nan where unknown.
     """
@@ -89,7 +92,8 @@ def compute_center_covariance(
         number = parents[number]
     own = len(parents)
     on_path.add(own)
-    passed.append(_Passed(Edge(EdgeKind.FRAME, frame, True, K.pose, K.sigma), X_RB[K.body], p_K, own))
+    if not is_frame_exact:
+        passed.append(_Passed(Edge(EdgeKind.FRAME, frame, True, K.pose, K.sigma), X_RB[K.body], p_K, own))
 
     motions: dict[tuple[str, ...], tuple[Array, Array]] = {}
     for edge, X_RF, p_T, behind in passed:

@@ -302,14 +302,19 @@ class Dynamics:
                 own = self.jacobian(q, frame) @ v
                 velocity = R.T @ (velocity - own[:3] - np.cross(own[3:], c))
             c = R.T @ c
-        covariance = None
-        if sigma is not None:
-            positions = {each.name: self._position_of(each, q) for each in self.tree.joints}
-            sigmas = self.by_name(self._read(sigma, "sigma"))
-            covariance = compute_center_covariance(
-                self.model, self.tree, frame or self.tree.root, positions, sigmas, self.uncertainty
-            )
+        covariance = None if sigma is None else self.center_covariance(q, sigma, frame or self.tree.root)
         return CenterOfMass(self.mass, c, velocity, covariance)
+
+    def center_covariance(self, q: Values, sigma: Values, frame: str, is_frame_exact: bool = False) -> Array | None:
+        """Return the covariance (3, 3) of the center of mass in a frame, m2, as `center_of_mass` does.
+
+        With `is_frame_exact` the survey of the frame itself counts as exact.
+        """
+        q, sigmas = self._read(q, "q"), self.by_name(self._read(sigma, "sigma"))
+        positions = {each.name: self._position_of(each, q) for each in self.tree.joints}
+        return compute_center_covariance(
+            self.model, self.tree, frame, positions, sigmas, self.uncertainty, is_frame_exact
+        )
 
     def inertia(self, q: Values, frame: str = "") -> Array:
         """Return the inertia of the whole (6, 6) about a frame, as `Body.inertia`; by default about the world's origin.

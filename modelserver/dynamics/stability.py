@@ -16,8 +16,9 @@ and angular momentum about c, so that the motion of joints counts as well as tha
 Loads: the normal forces N_i >= 0 at the contacts balance force and moment. Four and more are not determined by that;
 they are those of equal springs under a stiff vehicle, N_i linear in the position, a contact without load left out.
 
-Sigma of theta: first order, by central differences in c and f. Limits: contacts are points on a plane (a mean one is
-taken), do not slip, and cannot pull; where they are is taken as exact.
+Sigma of theta: first order, by central differences in c and f, with c relative to the body of the first contact.
+Limits: contacts are points on a plane (a mean one is taken), do not slip, and cannot pull; where they are on their body
+counts as exact.
 """
 
 from __future__ import annotations
@@ -210,10 +211,13 @@ def assess_stability(
     root = dynamics.tree.root
     center = dynamics.center_of_mass(q, frame=root, sigma=sigma)
     X_WR, *placed = dynamics.frame_poses(q, (root, *contacts))
-    R = X_WR.rotation
     c = X_WR.transform(center.position)
     points = {name: X.position for name, X in zip(contacts, placed, strict=True)}
-    P_c = None if center.covariance is None else R @ center.covariance @ R.T
+    P_c = None
+    if sigma is not None and contacts:
+        P = dynamics.center_covariance(q, sigma, contacts[0], is_frame_exact=True)
+        R = placed[0].rotation
+        P_c = None if P is None else R @ P @ R.T
     weight = dynamics.mass * np.array([0.0, 0.0, -dynamics.gravitational_acceleration])
     P_f = np.zeros((3, 3))
     if tilt_covariance is not None:

@@ -94,7 +94,7 @@ def test_given_free_motion_of_ten_seconds_then_energy_is_conserved(seed, types, 
     model = random_model(random.Random(seed), 4, types)
     dynamics = model.dynamics(base, gravity=9.80665 if base == "fixed" else 0.0)
     n = len(dynamics.coordinates)
-    start = np.concatenate((np.zeros(n), 0.05 * np.random.default_rng(seed).uniform(-1, 1, n)))
+    start = np.concatenate((np.zeros(n), 0.3 * np.random.default_rng(seed).uniform(-1, 1, n)))
 
     def rate(_, y):
         return np.concatenate((y[n:], dynamics.forward(y[:n], y[n:], np.zeros(n))))
@@ -274,6 +274,18 @@ def test_given_sigmas_then_covariance_of_the_center_is_that_of_samples(frame):
         [sampled_center(model, q + sigma * samples.normal(size=n), frame, samples, 0.02).position for _ in range(800)]
     )
     assert np.cov(points.T) == pytest.approx(P, abs=0.12 * np.trace(P) / 3)
+
+
+def test_given_survey_of_the_frame_itself_then_it_counts_unless_it_is_exact():
+    builder = ModelBuilder("box")
+    box = builder.add_body("Box", inertia=point(10.0, 1.0, 0, 0).matrix())
+    box.add_frame("Origin").add_frame("Corner", Pose((0, 0, 1.0)), sigma=Sigma((0.01, 0.02, 0.03), (0.1, 0, 0)))
+    dynamics = builder.build().dynamics("fixed")
+    P = dynamics.center_of_mass([], frame="Box:Corner", sigma=[]).covariance
+    # the center is 1 m ahead and 1 m below: a roll of 0.1 rad moves it by 0.1 m to the side
+    assert P is not None
+    assert np.diag(P) == pytest.approx([0.01**2, 0.02**2 + 0.1**2, 0.03**2])
+    assert dynamics.center_covariance([], [], "Box:Corner", is_frame_exact=True) == pytest.approx(np.zeros((3, 3)))
 
 
 def test_given_missing_sigma_then_the_covariance_is_not_known():

@@ -62,6 +62,8 @@ def test_given_payload_and_pose_of_the_arm_then_margin_is_printed_beside_that_wi
     assert found["stability"]["margin_deg"] == pytest.approx(math.degrees(math.atan2(0.1, 0.3)))
     assert found["without changes"]["margin_deg"] == pytest.approx(math.degrees(math.atan2(0.4, 0.6)))
     assert sum(found["stability"]["loads"].values()) == pytest.approx(200 * 9.80665)
+    pattern = ["--contact", "Cart:[FR][LR]"]
+    assert json.loads(run(capsys, *[each for each in words if each not in CONTACTS], *pattern)) == found
     assert "TIPS" in run(capsys, *words[:-1], "--acceleration", "0", "-4", "0")
 
 
@@ -96,6 +98,7 @@ def test_given_vehicle_file_then_its_contacts_and_base_frame_are_used(capsys, ge
         (["--joint", "Slide=1"], "needs --model or --config"),
         (["--model", "{}", "--joint", "Slide"], "'Slide' is not NAME=NUMBER"),
         (["--model", "{}", "--joint", "Slid=1"], "Nearest: Slide"),
+        (["--model", "{}", "--contact", "Cart:?Z"], "has no frame '?Z'"),
         (["--model", "{}", "--payload", "Arm:Food=1"], "Arm has no frame 'Food'"),
     ],
 )

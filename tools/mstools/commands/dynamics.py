@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,6 +30,7 @@ from mstools.terminal.output import escape, to_json
 
 if TYPE_CHECKING:
     from modelserver.dynamics import CenterOfMass, Dynamics, Stability
+    from modelserver.geometry.model import Model
 
 
 def command(
@@ -45,7 +48,8 @@ def command(
     ] = None,
     masses: Annotated[list[str] | None, option("--mass BODY=KG", "Another mass of a body. May be repeated.")] = None,
     contacts: Annotated[
-        list[str] | None, option("--contact FRAME", "Contact with the ground. May be repeated, three at least.")
+        list[str] | None,
+        option("--contact FRAME", "Contact with the ground, or a pattern like Cart:*Wheel. May be repeated."),
     ] = None,
     tilt: Annotated[
         tuple[float, float], typer.Option("--tilt-deg", metavar="ROLL PITCH", help="Attitude of the root frame.")
@@ -155,7 +159,7 @@ def _compute(
     inertia = dynamics.inertia(q, frame or root)
     data = _describe_mass(center.mass, frame or root, center.position, center.covariance, inertia)
     data |= {"massless": list(dynamics.massless), "cut": list(dynamics.cut)}
-    names = list(contacts or known.contacts)
+    names = _match_frames(geometry, contacts) if contacts else list(known.contacts)
     if names:
         v = None if a is None else dict[str, float]()
         found = assess_stability(dynamics, q, names, v, a, sigma=sigma)
@@ -171,6 +175,13 @@ def _compute(
         gravity = dynamics.gravity(q).tolist()
         data |= _describe_equations(dynamics.coordinates[shown], at[shown], gravity[shown], D)
     return data, D
+
+
+def _match_frames(model: Model, patterns: Sequence[str]) -> list[str]:
+    """Return the frames that the patterns name; one without a wildcard is a name, known or not."""
+    frames = [frame.full_name for body in model.bodies for frame in body]
+    found = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in patterns)
+    return list(dict.fromkeys(chain.from_iterable(found)))
 
 
 def _parse_numbers(given: Sequence[str] | None, hint: str) -> dict[str, float]:
