@@ -13,7 +13,7 @@ First order, as all covariances along paths.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,9 @@ from modelserver.geometry.topology import Crossing, Edge, EdgeKind, list_crossin
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
+
+EDGES_IN_STEP = 32
+"""Edges between two steps: about half a millisecond."""
 
 
 class MassUncertainty(NamedTuple):
@@ -48,7 +51,7 @@ class _Passed(NamedTuple):
     behind: int
 
 
-def compute_center_covariance(
+def iterate_center_covariance(
     model: Model,
     tree: Tree,
     frame: str,
@@ -56,8 +59,10 @@ def compute_center_covariance(
     sigmas: Mapping[str, float],
     uncertainty: MassUncertainty,
     is_frame_exact: bool = False,
-) -> Array | None:
-    """Return the covariance (3, 3) of the center of mass in a frame, along its axes; None where a sigma is missing.
+) -> Generator[None, None, Array | None]:
+    """Return in steps the covariance (3, 3) of the center of mass in a frame, along its axes.
+
+    None where a sigma is missing. The steps are for a caller that has other things to do between.
 
     With `is_frame_exact` the frame's own survey counts as exact: the covariance is that relative to its body.
 
@@ -67,7 +72,12 @@ def compute_center_covariance(
     crossings = model.spanning_tree(base)
     entered = {each.far_body: number + 1 for number, each in enumerate(crossings)}
     parents = [0, *(entered.get(each.near_body, 0) for each in crossings)]
-    X_RB, passed = _list_edges(model, tree, crossings, positions)
+    X_RB: dict[str, Pose] = {}
+    passed: list[_Passed] = []
+    for each in _iterate_edges(model, tree, crossings, positions, X_RB):
+        passed.append(each)
+        if len(passed) % EDGES_IN_STEP == 0:
+            yield
     masses, moments = np.zeros(len(parents)), np.zeros((len(parents), 3))
     centers: list[tuple[float, Array]] = []
     for body, link in tree.links.items():
@@ -96,7 +106,9 @@ def compute_center_covariance(
         passed.append(_Passed(Edge(EdgeKind.FRAME, frame, True, K.pose, K.sigma), X_RB[K.body], p_K, own))
 
     motions: dict[tuple[str, ...], tuple[Array, Array]] = {}
-    for edge, X_RF, p_T, behind in passed:
+    for number, (edge, X_RF, p_T, behind) in enumerate(passed, 1):
+        if number % EDGES_IN_STEP == 0:
+            yield
         share = 0.0 if behind == own else float(masses[behind]) / total
         is_behind = behind in on_path
         if share == 0.0 and not is_behind:
@@ -136,14 +148,18 @@ def compute_center_covariance(
     return np.asarray(R.T @ P @ R)
 
 
-def _list_edges(
-    model: Model, tree: Tree, crossings: Sequence[Crossing], positions: Mapping[str, Coordinates]
-) -> tuple[dict[str, Pose], list[_Passed]]:
-    """Return the pose of each body's origin in the root frame, and the edges of the tree."""
+def _iterate_edges(
+    model: Model,
+    tree: Tree,
+    crossings: Sequence[Crossing],
+    positions: Mapping[str, Coordinates],
+    X_RB: dict[str, Pose],
+) -> Iterator[_Passed]:
+    """Yield the edges of the tree; put the pose of each body's origin in the root frame into `X_RB`."""
     base, _ = names.split(tree.root)
     root = model.frame(tree.root)
-    X_RB = {base: root.pose.inverse()}
-    passed = [_Passed(Edge(EdgeKind.FRAME, tree.root, False, root.pose, root.sigma), X_RB[base], np.zeros(3), 0)]
+    X_RB[base] = root.pose.inverse()
+    yield _Passed(Edge(EdgeKind.FRAME, tree.root, False, root.pose, root.sigma), X_RB[base], np.zeros(3), 0)
     for number, crossing in enumerate(crossings, 1):
         near, far = model.frame(crossing.near_frame), model.frame(crossing.far_frame)
         edges = [
@@ -156,7 +172,6 @@ def _list_edges(
             X_FT = edge.pose if edge.joint is None else edge.joint.compute_pose(positions[edge.name])
             X_next = X @ (X_FT if edge.forward else X_FT.inverse())
             F, T = (X, X_next) if edge.forward else (X_next, X)
-            passed.append(_Passed(edge, F, T.position, number))
+            yield _Passed(edge, F, T.position, number)
             X = X_next
         X_RB[crossing.far_body] = X
-    return X_RB, passed

@@ -28,16 +28,16 @@ as in `tree`. Numbers that are not finite give results that are not.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.dynamics.mass_covariance import MassUncertainty, compute_center_covariance
+from modelserver.dynamics.mass_covariance import MassUncertainty, iterate_center_covariance
 from modelserver.dynamics.rates import compute_configuration, compute_rate_bias, compute_rate_map
 from modelserver.dynamics.tree import GROUND, Tree, TreeJoint, TreeLink, build_tree
-from modelserver.errors import MalformedRequestError, ModelServerError, find_nearest_names, quote
+from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.geometry.inertia import RigidInertia
 from modelserver.geometry.joint import JointType
 from modelserver.geometry.model import Model
@@ -48,6 +48,9 @@ from modelserver.transforms.so3 import Array
 
 STANDARD_GRAVITY: Final = 9.80665
 """m/s2."""
+
+MAX_VELOCITIES: Final = 200
+"""Velocities of all joints and the base: Pinocchio's work space grows with the third power, 0.5 GB for so many."""
 
 Values: TypeAlias = npt.ArrayLike | Mapping[str, float]
 """A number for each coordinate: an array (n,), or by name; coordinates that are not named have their default, 0."""
@@ -96,6 +99,8 @@ class Dynamics:
         A body without mass, a loop, or arguments as above that cannot be.
     UnknownBodyError, UnknownFrameError
         With the nearest names.
+    LimitError
+        More than `MAX_VELOCITIES`.
     ModelServerError
         The extra `dynamics` is not installed.
 
@@ -124,6 +129,11 @@ class Dynamics:
             raise MalformedRequestError(
                 f"no mass is stated for {format_names(tree.massless)}; state the inertia in the geometry file, or "
                 "count such bodies as massless (allow_massless)"
+            )
+        count = sum(each.joint.count for each in tree.joints)
+        if count > MAX_VELOCITIES:
+            raise LimitError(
+                f"the joints around {tree.root} have {count} velocities; dynamics takes {MAX_VELOCITIES} at most"
             )
         self.model = model
         self.tree = _with_masses(model, tree, masses or {}, payload or {})
@@ -310,9 +320,21 @@ class Dynamics:
 
         With `is_frame_exact` the survey of the frame itself counts as exact.
         """
+        work = self.iterate_center_covariance(q, sigma, frame, is_frame_exact)
+        while True:
+            try:
+                next(work)
+            except StopIteration as end:
+                found: Array | None = end.value
+                return found
+
+    def iterate_center_covariance(
+        self, q: Values, sigma: Values, frame: str, is_frame_exact: bool = False
+    ) -> Generator[None, None, Array | None]:
+        """Return in steps what `center_covariance` does: with many bodies it takes milliseconds."""
         q, sigmas = self._read(q, "q"), self.by_name(self._read(sigma, "sigma"))
         positions = {each.name: self._position_of(each, q) for each in self.tree.joints}
-        return compute_center_covariance(
+        return iterate_center_covariance(
             self.model, self.tree, frame, positions, sigmas, self.uncertainty, is_frame_exact
         )
 

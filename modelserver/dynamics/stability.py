@@ -209,7 +209,7 @@ def assess_stability(
         default exact.
     """
     root = dynamics.tree.root
-    center = dynamics.center_of_mass(q, frame=root, sigma=sigma)
+    center = dynamics.center_of_mass(q, frame=root)
     X_WR, *placed = dynamics.frame_poses(q, (root, *contacts))
     c = X_WR.transform(center.position)
     points = {name: X.position for name, X in zip(contacts, placed, strict=True)}

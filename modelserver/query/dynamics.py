@@ -45,11 +45,19 @@ MAX_COORDINATES: Final = 100
 """In one answer: its mass matrix takes 40 kB."""
 
 
-class VehicleDynamics(NamedTuple):
-    """The dynamics of a geometry, with the path of all joints that take part."""
+MAX_BODIES_WITH_SIGMA: Final = 50
+"""Bodies with which health reports have the sigma of the margin: it takes some 25 us for each, ten times a second."""
 
-    floating: Dynamics
-    fixed: Dynamics
+BASE_COORDINATES: Final = 6
+
+
+class VehicleDynamics(NamedTuple):
+    """The dynamics of a geometry on a floating base, with the path of all joints that take part.
+
+    With the base at rest, its rows and columns of the joints are those of a fixed and level base.
+    """
+
+    dynamics: Dynamics
     joints: KinematicPath
 
 
@@ -68,25 +76,23 @@ class MotionState(NamedTuple):
 @lru_cache(maxsize=4)
 def prepare(model: Model, base_frame: str, settings: DynamicsSettings) -> VehicleDynamics:
     """Return the dynamics of a geometry, made once. Raises as `Dynamics`."""
-    uncertainty = MassUncertainty(settings.mass_sigma, settings.center_sigma, unstated_is_exact=True)
-    floating, fixed = (
-        Dynamics(
-            model,
-            base,
-            base_frame,
-            allow_massless=settings.allow_massless,
-            cut_loops=settings.cut_loops,
-            uncertainty=uncertainty,
-        )
-        for base in ("floating", "fixed")
+    dynamics = Dynamics(
+        model,
+        "floating",
+        base_frame,
+        allow_massless=settings.allow_massless,
+        cut_loops=settings.cut_loops,
+        uncertainty=MassUncertainty(settings.mass_sigma, settings.center_sigma, unstated_is_exact=True),
     )
-    edges = [Edge(EdgeKind.JOINT, each.name, True, Pose.identity(), joint=each.joint) for each in fixed.tree.joints]
-    return VehicleDynamics(floating, fixed, KinematicPath.from_edges(edges))
+    # the first joint is the base
+    joints = dynamics.tree.joints[1:]
+    edges = [Edge(EdgeKind.JOINT, each.name, True, Pose.identity(), joint=each.joint) for each in joints]
+    return VehicleDynamics(dynamics, KinematicPath.from_edges(edges))
 
 
 def check_dynamics(model: Model, base_frame: str, settings: DynamicsSettings) -> None:
     """Compute the dynamics of a geometry once. Raises as `Dynamics` and `assess_stability`."""
-    dynamics = prepare(model, base_frame, settings).fixed
+    dynamics = prepare(model, base_frame, settings).dynamics
     dynamics.center_of_mass(dynamics.default_position)
     if settings.contacts:
         assess_stability(dynamics, dynamics.default_position, settings.contacts)
@@ -101,26 +107,26 @@ def compute_dynamics(view: PlatformView, request: GetDynamics, now: int) -> Step
         )
     known = prepare(view.model, view.base_frame, view.dynamics)
     yield
-    dynamics = known.floating if request.is_floating else known.fixed
-    n = len(dynamics.coordinates)
+    dynamics = known.dynamics
+    shown = slice(0 if request.is_floating else BASE_COORDINATES, None)
+    n = len(dynamics.coordinates[shown])
     if request.with_equations and n > MAX_COORDINATES:
         raise LimitError(f"the equations have {n} coordinates; at most {MAX_COORDINATES} are sent in one reply")
     state = _lookup_floating(view, known, request.time, now) if request.is_floating else None
     state = state or _lookup_fixed(view, known, request.time, now)
     yield
     frame = request.frame or view.base_frame
-    center = dynamics.center_of_mass(state.q, frame=frame, sigma=state.sigma)
-    yield
+    center = dynamics.center_of_mass(state.q, frame=frame)
+    P = yield from dynamics.iterate_center_covariance(state.q, state.sigma, frame)
     inertia = dynamics.inertia(state.q, frame)
     equations: tuple[tuple[float, ...], ...] = ((),) * 5
     coordinates: tuple[str, ...] = ()
     if request.with_equations:
-        coordinates = dynamics.coordinates
-        gravity, bias = dynamics.gravity(state.q), dynamics.bias(state.q, state.v)
-        D = dynamics.mass_matrix(state.q)
-        equations = tuple([tuple(each.ravel().tolist()) for each in (state.q, state.v, gravity, bias, D)])
+        coordinates = dynamics.coordinates[shown]
+        vectors = (state.q, state.v, dynamics.gravity(state.q), dynamics.bias(state.q, state.v))
+        D = dynamics.mass_matrix(state.q)[shown, shown]
+        equations = (*(tuple(each[shown].tolist()) for each in vectors), tuple(D.ravel().tolist()))
     position, rate, gravity_row, bias_row, mass_matrix = equations
-    P = center.covariance
     covariance = None if P is None or not np.isfinite(P).all() else tuple(P.ravel().tolist())
     return DynamicsAnswer(
         state.utime,
@@ -148,9 +154,9 @@ def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
     latest = TimeQuery()
     tilt = acceleration = None
     if view.localizer is None:
-        dynamics, state = known.fixed, _lookup_fixed(view, known, latest, now)
+        state = _lookup_fixed(view, known, latest, now)
     else:
-        dynamics, state = known.floating, _lookup_floating(view, known, latest, now)
+        state = _lookup_floating(view, known, latest, now)
         assert state.motion is not None
         P = state.motion.pose.transformation.covariance
         tilt = np.full((3, 3), math.nan) if P is None else P[3:, 3:]
@@ -158,12 +164,12 @@ def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
         acceleration = np.full((3, 3), math.nan) if second is None else np.array(second).reshape(6, 6)[:3, :3]
     moves = bool(np.isfinite(state.v).all() and np.isfinite(state.a).all()) and view.localizer is not None
     found: Stability = assess_stability(
-        dynamics,
+        known.dynamics,
         state.q,
         settings.contacts,
         state.v if moves else None,
         state.a if moves else None,
-        sigma=state.sigma,
+        sigma=state.sigma if len(known.dynamics.tree.links) <= MAX_BODIES_WITH_SIGMA else None,
         tilt_covariance=tilt,
         acceleration_covariance=acceleration,
     )
@@ -201,7 +207,7 @@ def find_stability(view: PlatformView, now: int) -> tuple[StabilityHealth, str]:
 
 def _lookup_fixed(view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int) -> MotionState:
     utime, joints = view.lookup_joints(known.joints, time, now)
-    return _collect(view, known.fixed, known.joints, utime, joints)
+    return _collect(view, known, utime, joints)
 
 
 def _lookup_floating(view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int) -> MotionState:
@@ -209,7 +215,7 @@ def _lookup_floating(view: PlatformView, known: VehicleDynamics, time: TimeQuery
     has_time = bool(time.at) and time.policy is not Policy.LATEST
     at = TimeQuery(estimate.utime, time.policy if has_time else Policy.PREDICTED)
     motion = compute_motion(view, view.base_frame, names.WORLD_ENU, "", at, now)
-    state = _collect(view, known.floating, known.joints, estimate.utime, joints)
+    state = _collect(view, known, estimate.utime, joints)
     X = motion.pose.transformation.pose
     phi = so3.logarithm(X.wxyz)
     J = so3.left_jacobian(phi)
@@ -222,14 +228,13 @@ def _lookup_floating(view: PlatformView, known: VehicleDynamics, time: TimeQuery
     return state._replace(invalid=invalid, motion=motion)
 
 
-def _collect(
-    view: PlatformView, dynamics: Dynamics, path: KinematicPath, utime: int, joints: JointReadings
-) -> MotionState:
-    """Return the coordinates of the joints; those of a floating base are 0, and exact."""
+def _collect(view: PlatformView, known: VehicleDynamics, utime: int, joints: JointReadings) -> MotionState:
+    """Return the coordinates of the joints; those of the base are 0, and exact."""
+    dynamics = known.dynamics
     q = dynamics.default_position
     v, a, sigma = np.zeros(len(q)), np.zeros(len(q)), np.zeros(len(q))
     column = {name: number for number, name in enumerate(dynamics.coordinates)}
-    for item, readings in zip(path.joints, joints.readings, strict=True):
+    for item, readings in zip(known.joints.joints, joints.readings, strict=True):
         drive = view.model.drives[item.name]
         if drive.leader == item.name:
             for name, reading in zip(drive.names, readings, strict=True):

@@ -14,7 +14,7 @@ from support_dynamics import MOVING, MujocoTwin, is_close, random_inertia, rando
 from modelserver import load_model
 from modelserver.dynamics import CenterOfMass, Dynamics, MassUncertainty
 from modelserver.dynamics.rates import compute_rate_bias, compute_rate_map
-from modelserver.errors import MalformedRequestError, UnknownFrameError
+from modelserver.errors import LimitError, MalformedRequestError, UnknownFrameError
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
 from modelserver.geometry.inertia import RigidInertia
 from modelserver.transforms import Pose
@@ -391,6 +391,26 @@ def test_given_nothing_that_moves_then_there_are_no_coordinates():
     assert dynamics.center_of_mass([], []).position == pytest.approx([0.5, 0.0, 0.5])
     assert dynamics.inertia([])[0, 0] == pytest.approx(20.0)
     assert dynamics.jacobian([], "Box:Origin").shape == (6, 0)
+
+
+def test_given_too_many_joints_then_the_limit_is_named():
+    model = random_model(random.Random(1), 202, (JointType.PRISMATIC,), mimics=False)
+    with pytest.raises(LimitError, match="have 201 velocities; dynamics takes 200 at most"):
+        model.dynamics("fixed")
+
+
+def test_given_many_bodies_then_the_covariance_comes_in_steps():
+    dynamics = random_model(random.Random(1), 60, (JointType.REVOLUTE,)).dynamics(
+        uncertainty=MassUncertainty(unstated_is_exact=True)
+    )
+    q, sigma = dynamics.default_position, np.full(len(dynamics.coordinates), 0.01)
+    found = []
+
+    def work():
+        found.append((yield from dynamics.iterate_center_covariance(q, sigma, "B1:Base")))
+
+    assert sum(1 for _ in work()) > 10
+    assert found[0] == pytest.approx(dynamics.center_covariance(q, sigma, "B1:Base"))
 
 
 def test_given_import_of_the_package_then_pinocchio_is_not_loaded():
