@@ -225,6 +225,13 @@ def test_given_body_without_mass_then_the_vehicle_file_is_rejected_with_its_name
     load_vehicle(replace(config, dynamics=replace(config.dynamics, allow_massless=True)), str(path))
 
 
+def test_given_no_pinocchio_then_the_vehicle_file_is_rejected_with_what_to_install(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    path = write_vehicle(tmp_path, VEHICLE + DYNAMICS, GEOMETRY)
+    with pytest.raises(ConfigError, match=r"dynamics needs Pinocchio .* pip install 'modelserver\[dynamics\]'"):
+        load_vehicle(load_config(path), str(path))
+
+
 @pytest.mark.parametrize(("section", "loaded"), [("", "False"), ("dynamics: {}\n", "True")])
 def test_given_vehicle_file_then_pinocchio_is_loaded_only_with_the_section(tmp_path, section, loaded) -> None:
     path = write_vehicle(tmp_path, VEHICLE + section, GEOMETRY)
