@@ -17,6 +17,30 @@ from modelserver.geometry import Body, Joint, JointType, Mimic, Model, ModelBuil
 from modelserver.geometry.inertia import RigidInertia, from_spatial_inertia
 from modelserver.transforms import Pose, so3
 
+CART = """\
+modelserver: geometry/1
+name: cart
+bodies:
+  Cart:
+    inertia: {mass: 80, center: [0, 0, 0.5], moments: [5, 8, 10]}
+    frames:
+      Base:
+      Antenna: {xyz: [-0.4, 0.2, 1.2]}
+      Imu: {xyz: [0.1, 0, 0.3]}
+      Mast: {xyz: [0.5, 0.1, 1.0]}
+      FL: {xyz: [0.5, 0.4, 0]}
+      FR: {xyz: [0.5, -0.4, 0]}
+      RL: {xyz: [-0.5, 0.4, 0]}
+      RR: {xyz: [-0.5, -0.4, 0]}
+  Arm:
+    inertia: {mass: 20, center: [0, 0, 1], moments: [1, 1, 1]}
+    frames:
+      Foot:
+constraints:
+  Slide: {from: Cart:Base, to: Arm:Foot, joint: {type: prismatic, axis: [0, 1, 0], default: 0, sigma: 0.01}}
+"""
+"""A cart of 80 kg with an arm of 20 kg that slides sideways; its contacts are 1 m and 0.8 m apart."""
+
 MOVING = tuple(each for each in JointType if each is not JointType.FIXED)
 
 

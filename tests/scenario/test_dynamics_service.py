@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from conftest import Daemon
+from support_dynamics import CART
 from support_lcm import invoke
 from support_samples import VEHICLE
 
@@ -17,25 +18,7 @@ from modelserver.errors import UnknownFrameError
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
 
-GEOMETRY = """\
-modelserver: geometry/1
-name: cart
-bodies:
-  Cart:
-    inertia: {mass: 80, center: [0, 0, 0.5], moments: [5, 8, 10]}
-    frames:
-      Base:
-      FL: {xyz: [0.5, 0.4, 0]}
-      FR: {xyz: [0.5, -0.4, 0]}
-      RL: {xyz: [-0.5, 0.4, 0]}
-      RR: {xyz: [-0.5, -0.4, 0]}
-  Arm:
-    inertia: {mass: 20, center: [0, 0, 1], moments: [1, 1, 1]}
-    frames:
-      Foot:
-constraints:
-  Slide: {from: Cart:Base, to: Arm:Foot, joint: {type: prismatic, axis: [0, 1, 0], default: 0.1, sigma: 0.01}}
-"""
+GEOMETRY = CART.replace("default: 0", "default: 0.1")
 PUBLISH = "publish: {rate_hz: 50, health_hz: 20}\n"
 DYNAMICS = "dynamics: {contacts: [Cart:FL, Cart:FR, Cart:RL, Cart:RR]}\n"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support_dynamics import CART as GEOMETRY
 from support_journal import JournalRig
 from support_samples import ME, VEHICLE, write_vehicle
 
@@ -31,29 +32,6 @@ from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import decode
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
-
-GEOMETRY = """\
-modelserver: geometry/1
-name: cart
-bodies:
-  Cart:
-    inertia: {mass: 80, center: [0, 0, 0.5], moments: [5, 8, 10]}
-    frames:
-      Base:
-      Antenna: {xyz: [-0.4, 0.2, 1.2]}
-      Imu: {xyz: [0.1, 0, 0.3]}
-      Mast: {xyz: [0.5, 0.1, 1.0]}
-      FL: {xyz: [0.5, 0.4, 0]}
-      FR: {xyz: [0.5, -0.4, 0]}
-      RL: {xyz: [-0.5, 0.4, 0]}
-      RR: {xyz: [-0.5, -0.4, 0]}
-  Arm:
-    inertia: {mass: 20, center: [0, 0, 1], moments: [1, 1, 1]}
-    frames:
-      Foot:
-constraints:
-  Slide: {from: Cart:Base, to: Arm:Foot, joint: {type: prismatic, axis: [0, 1, 0], default: 0, sigma: 0.01}}
-"""
 
 DYNAMICS = "dynamics: {contacts: [Cart:FL, Cart:FR, Cart:RL, Cart:RR], mass_sigma: 0, center_sigma: 0.01}\n"
 

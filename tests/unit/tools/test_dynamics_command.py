@@ -6,36 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support_dynamics import CART
 
 from mstools.cli import main
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
 
-GEOMETRY = """\
-modelserver: geometry/1
-name: cart
-bodies:
-  Cart:
-    inertia: {mass: 80, center: [0, 0, 0.5], moments: [5, 8, 10]}
-    frames:
-      Base:
-      FL: {xyz: [0.5, 0.4, 0]}
-      FR: {xyz: [0.5, -0.4, 0]}
-      RL: {xyz: [-0.5, 0.4, 0]}
-      RR: {xyz: [-0.5, -0.4, 0]}
-  Arm:
-    inertia: {mass: 20, center: [0, 0, 1], moments: [1, 1, 1]}
-    frames:
-      Foot:
-constraints:
-  Slide: {from: Cart:Base, to: Arm:Foot, joint: {type: prismatic, axis: [0, 1, 0], default: 0, sigma: 0.01}}
-"""
 CONTACTS = [word for name in ("FL", "FR", "RL", "RR") for word in ("--contact", f"Cart:{name}")]
 
 
 @pytest.fixture
 def geometry(tmp_path: Path) -> str:
-    (tmp_path / "geometry.yaml").write_text(GEOMETRY)
+    (tmp_path / "geometry.yaml").write_text(CART)
     return str(tmp_path / "geometry.yaml")
 
 
