@@ -19,7 +19,7 @@ import numpy as np
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
 from modelserver.dynamics.rates import compute_turn_bias
 from modelserver.dynamics.settings import DynamicsSettings
-from modelserver.errors import ForbiddenError, LimitError, ModelServerError
+from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
@@ -156,11 +156,16 @@ def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
     if view.localizer is None:
         state = _lookup_fixed(view, known, latest, now)
     else:
-        state = _lookup_floating(view, known, latest, now)
-        assert state.motion is not None
-        P = state.motion.pose.transformation.covariance
+        P = None
+        try:
+            state = _lookup_floating(view, known, latest, now)
+            if state.motion is not None:
+                P = state.motion.pose.transformation.covariance
+        except NoPoseError:
+            # Odom is level too, and needs no fix; how level, it does not state
+            state = _lookup_floating(view, known, latest, now, names.ODOM)
         tilt = np.full((3, 3), math.nan) if P is None else P[3:, 3:]
-        second = state.motion.acceleration_covariance
+        second = None if state.motion is None else state.motion.acceleration_covariance
         acceleration = np.full((3, 3), math.nan) if second is None else np.array(second).reshape(6, 6)[:3, :3]
     moves = bool(np.isfinite(state.v).all() and np.isfinite(state.a).all()) and view.localizer is not None
     found: Stability = assess_stability(
@@ -210,11 +215,13 @@ def _lookup_fixed(view: PlatformView, known: VehicleDynamics, time: TimeQuery, n
     return _collect(view, known, utime, joints)
 
 
-def _lookup_floating(view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int) -> MotionState:
+def _lookup_floating(
+    view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int, world: str = names.WORLD_ENU
+) -> MotionState:
     estimate, joints = view.lookup_vehicle_and_joints(known.joints, time, now)
     has_time = bool(time.at) and time.policy is not Policy.LATEST
     at = TimeQuery(estimate.utime, time.policy if has_time else Policy.PREDICTED)
-    motion = compute_motion(view, view.base_frame, names.WORLD_ENU, "", at, now)
+    motion = compute_motion(view, view.base_frame, world, "", at, now)
     state = _collect(view, known, estimate.utime, joints)
     X = motion.pose.transformation.pose
     phi = so3.logarithm(X.wxyz)

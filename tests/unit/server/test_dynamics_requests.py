@@ -154,6 +154,15 @@ def test_given_contacts_and_a_drive_then_health_has_margin_and_loads(rig: Journa
     assert "stability" not in dict(last_health(rig).warnings)
 
 
+def test_given_no_fixes_then_the_margin_comes_from_odom_and_its_sigma_is_not_known(tmp_path: Path) -> None:
+    rig = JournalRig(tmp_path, VEHICLE.replace("  gps: {channel: GPS, frame: Cart:Antenna}\n", "") + DYNAMICS, GEOMETRY)
+    rig.drive(6.0)
+    rig.run_cycles(60)
+    stability = last_health(rig).stability
+    assert stability.margin == pytest.approx(math.atan2(0.4, 0.6), abs=0.05)
+    assert math.isnan(stability.margin_sigma)
+
+
 def test_given_arm_far_aside_then_health_warns_at_once(tmp_path: Path) -> None:
     rig = JournalRig(tmp_path, VEHICLE.partition("sensors:")[0] + DYNAMICS, GEOMETRY)
     rig.run_cycles(60)
