@@ -44,7 +44,6 @@ from modelserver.transforms.so3 import Array
 MAX_COORDINATES: Final = 100
 """In one answer: its mass matrix takes 40 kB."""
 
-
 MAX_BODIES_WITH_SIGMA: Final = 50
 """Bodies with which health reports have the sigma of the margin: it takes some 25 us for each, ten times a second."""
 
@@ -62,7 +61,7 @@ class VehicleDynamics(NamedTuple):
 
 
 class MotionState(NamedTuple):
-    """Coordinates, rates, accelerations and sigmas (n,) at an instant; `pose` and `motion` are those of the base."""
+    """Coordinates, rates, accelerations and sigmas (n,) at an instant; `motion` is that of a floating base."""
 
     utime: int
     q: Array
@@ -194,11 +193,11 @@ def find_stability(view: PlatformView, now: int) -> tuple[StabilityHealth, str]:
     """Return the tip-over stability now, and the warning about it; empty for none. An error becomes the warning."""
     try:
         found = compute_stability(view, now)
+    except NoPoseError:
+        # the report has the reason already
+        return StabilityHealth(), ""
     except ModelServerError as error:
-        # before the first pose there is nothing to warn of
-        settings = view.dynamics
-        limit = math.nan if settings is None else settings.margin_limit
-        return StabilityHealth(limit=limit), "" if not len(view.history) and view.localizer else str(error)
+        return StabilityHealth(), f"the tip-over margin is not known: {error}"
     except Exception as error:
         # a fault of the engine must not stop the ticks
         return StabilityHealth(), f"the tip-over margin cannot be computed: {type(error).__name__}: {error}"
