@@ -125,6 +125,7 @@ class Dynamics:
         if not math.isfinite(gravity):
             raise MalformedRequestError(f"gravity is {gravity}; it is a finite number of m/s2, e.g. {STANDARD_GRAVITY}")
         tree = build_tree(model, root, base == "floating", cut_loops)
+        tree = _with_masses(model, tree, masses or {}, payload or {})
         if tree.massless and not allow_massless:
             raise MalformedRequestError(
                 f"no mass is stated for {format_names(tree.massless)}; state the inertia in the geometry file, or "
@@ -136,7 +137,7 @@ class Dynamics:
                 f"the joints around {tree.root} have {count} velocities; dynamics takes {MAX_VELOCITIES} at most"
             )
         self.model = model
-        self.tree = _with_masses(model, tree, masses or {}, payload or {})
+        self.tree = tree
         self.uncertainty = uncertainty
         self.gravitational_acceleration = gravity
         self.mass = math.fsum(link.inertia.mass for link in self.tree.links.values() if link.inertia is not None)

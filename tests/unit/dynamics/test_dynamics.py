@@ -314,6 +314,7 @@ def test_given_body_without_mass_then_the_error_names_it_or_it_counts_as_massles
         model.dynamics()
     dynamics = model.dynamics("fixed", allow_massless=True)
     assert dynamics.massless == ("Camera",)
+    assert model.dynamics(payload={"Camera:Lens": 0.5}).mass == pytest.approx(12.5)
     assert dynamics.mass_matrix([0.2]) == pytest.approx(pendulum().build().dynamics("fixed").mass_matrix([0.2]))
 
 

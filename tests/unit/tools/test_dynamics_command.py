@@ -49,6 +49,17 @@ def test_given_payload_and_pose_of_the_arm_then_margin_is_printed_beside_that_wi
     assert "TIPS" in run(capsys, *words[:-1], "--acceleration", "0", "-4", "0")
 
 
+def test_given_joint_without_sigma_then_that_of_center_and_margin_is_not_known(capsys, geometry) -> None:
+    words = ["--model", geometry, *CONTACTS, "--json"]
+    known = json.loads(run(capsys, *words))
+    assert known["stability"]["sigma_deg"] > 0.0
+    path = Path(geometry)
+    path.write_text(path.read_text().replace(", sigma: 0.01", ""))
+    found = json.loads(run(capsys, *words))
+    assert found["center_sigma"] is None
+    assert found["stability"]["sigma_deg"] is None
+
+
 def test_given_tilt_then_gravity_acts_on_the_joints_and_the_matrix_is_written(capsys, geometry, tmp_path) -> None:
     npy = tmp_path / "D.npy"
     words = ["--model", geometry, "--tilt-deg", "30", "0", "--equations", "--npy", str(npy), "--json"]

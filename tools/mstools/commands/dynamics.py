@@ -152,7 +152,10 @@ def _compute(
         name: value
         for each in geometry.joints.values()
         if each.joint.mimic is None and each.name in {joint.name for joint in dynamics.tree.joints}
-        for name, value in zip(geometry.drives[each.name].names, each.joint.sigma, strict=False)
+        # one without a sigma makes that of what it moves unknown
+        for name, value in zip(
+            geometry.drives[each.name].names, each.joint.sigma or (math.nan,) * each.joint.count, strict=True
+        )
     }
     q = base | moved
     center: CenterOfMass = dynamics.center_of_mass(q, frame=frame or root, sigma=sigma)
