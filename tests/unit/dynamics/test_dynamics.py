@@ -4,7 +4,6 @@ import math
 import random
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +19,6 @@ from modelserver.geometry.inertia import RigidInertia
 from modelserver.transforms import Pose
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
-
-URDFS = Path(__file__).resolve().parents[4] / "shared/data/geometry/urdf"
 
 
 def point(mass: float, *at: float) -> RigidInertia:
@@ -64,11 +61,8 @@ def test_given_random_trees_of_all_joints_then_equations_agree_with_mujoco(seed)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["clearpath_a200", "clearpath_j100"])
 @pytest.mark.parametrize("base", ["floating", "fixed"])
-def test_given_public_urdf_then_equations_agree_with_mujoco(name, base):
-    path = URDFS / f"{name}.urdf"
-    if not path.exists():
-        pytest.skip(f"no {path}")
-    model = load_model(path)
+def test_given_public_urdf_then_equations_agree_with_mujoco(data_dir, name, base):
+    model = load_model(data_dir / "geometry/urdf" / f"{name}.urdf")
     dynamics = model.dynamics(base, allow_massless=True)
     assert dynamics.mass == pytest.approx({"clearpath_a200": 46.034 + 4 * 2.637, "clearpath_j100": 18.432}[name])
     twin = MujocoTwin(model, dynamics.coordinates, dynamics.tree.root, base == "floating")
