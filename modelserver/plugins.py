@@ -1,4 +1,4 @@
-"""Named objects of this package and of installed packages, which add theirs by entry points."""
+"""Named objects of this package and of installed packages, which add theirs by entry points; objects loaded late."""
 
 from __future__ import annotations
 
@@ -83,3 +83,10 @@ class PluginRegistry(Mapping[str, T]):
         from importlib.metadata import entry_points
 
         return entry_points(group=self._group)
+
+
+def load_object(module: str, name: str) -> Any:
+    """Return an object of a module that is imported now, so that what needs it only on request does not load it."""
+    from importlib import import_module
+
+    return getattr(import_module(module), name)

@@ -17,6 +17,8 @@ from modelserver.messages import (
     Direction,
     DriverHealth,
     DriverPhase,
+    DynamicsAnswer,
+    DynamicsReply,
     EdgeReport,
     Envelope,
     Explanation,
@@ -24,6 +26,7 @@ from modelserver.messages import (
     FixType,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetHistory,
     GetHTransform,
@@ -65,6 +68,7 @@ from modelserver.messages import (
     SetHTransform,
     SetStateVector,
     SnapshotPart,
+    StabilityHealth,
     StateVectorReply,
     SwitchMode,
     TimeQuery,
@@ -289,6 +293,28 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             ),
         ),
     ),
+    "get_dynamics_request_t": (
+        GetDynamics(_REQUEST),
+        GetDynamics(_REQUEST, "Räptor:CG", True, True, _TIME),
+    ),
+    "get_dynamics_reply_t": (
+        DynamicsReply(_UNKNOWN),
+        DynamicsReply(
+            _OK,
+            DynamicsAnswer(
+                UTIME, Invalid(0), "Raptor:CG", 900.0, (0.1, 0.2, 0.3), tuple(float(each) for each in range(36)),
+                (), (), (), (), (), (),
+            ),
+        ),
+        DynamicsReply(
+            _OK,
+            DynamicsAnswer(
+                UTIME, Invalid.STALE_JOINT, "", 900.0, (0.1, 0.2, 0.3), tuple(float(each) for each in range(36)),
+                ("Nod", "Räd"), (0.1, 0.2), (1.0, 2.0), (0.5, -0.5), (3.0, math.nan), (1.0, 0.5, 0.5, 2.0),
+                tuple(float(each) for each in range(1, 10)),  # type: ignore[arg-type]
+            ),
+        ),
+    ),
     "reload_model_request_t": (ReloadModel(_REQUEST), ReloadModel(_REQUEST, True)),
     "reload_model_reply_t": (ReloadReply(_UNKNOWN), ReloadReply(_OK, "cd34", ("frame a:b moves by 2 mm", ""))),
     "set_state_vector_request_t": (SetStateVector(_REQUEST, answer()), SetStateVector(_REQUEST, bare_answer())),
@@ -310,6 +336,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             LocalizationHealth(
                 Mode.NO_GPS, Phase.ALIGNED, True, 1.5, 0.05, 12.0, 0.3, 50.27, -111.18, 700.0, 39.7, 0.5, 99.0
             ),
+            StabilityHealth(0.5, 0.01, 0.4, 0.02, 0.1, ("Raptor:A", "Raptor:B"), (2000.0, 2500.0)),
             (ChannelHealth("sensor:gps", 99, 1.0, 0.4, 2e-3), ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True)),
             (RejectedCount("GPS", "truncated", 4), RejectedCount("sensor:gps", "stale", 1)),
             (("journal", "the disk is full"),),

@@ -12,6 +12,8 @@ from .decisions_t import decisions_t as decisions_t
 from .driver_health_t import driver_health_t as driver_health_t
 from .get_body_frame_list_request_t import get_body_frame_list_request_t as get_body_frame_list_request_t
 from .get_body_list_request_t import get_body_list_request_t as get_body_list_request_t
+from .get_dynamics_reply_t import get_dynamics_reply_t as get_dynamics_reply_t
+from .get_dynamics_request_t import get_dynamics_request_t as get_dynamics_request_t
 from .get_explanation_reply_t import get_explanation_reply_t as get_explanation_reply_t
 from .get_explanation_request_t import get_explanation_request_t as get_explanation_request_t
 from .get_h_transform_request_t import get_h_transform_request_t as get_h_transform_request_t
@@ -49,6 +51,7 @@ from .sensor_header_t import sensor_header_t as sensor_header_t
 from .set_h_transform_request_t import set_h_transform_request_t as set_h_transform_request_t
 from .set_state_vector_request_t import set_state_vector_request_t as set_state_vector_request_t
 from .signed_t import signed_t as signed_t
+from .stability_health_t import stability_health_t as stability_health_t
 from .time_query_t import time_query_t as time_query_t
 from .vehicle_command_t import vehicle_command_t as vehicle_command_t
 from .vehicle_status_t import vehicle_status_t as vehicle_status_t

@@ -17,11 +17,11 @@ class health_t(object):
     @value Health
     """
 
-    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_waiting", "ticks_missed", "handler_errors", "tick_latency_p50", "tick_latency_p90", "tick_latency_p99", "tick_latency_max", "invalid_text", "host", "pid", "requests_queued", "memory", "cpu_share", "localization", "num_channels", "channels", "num_rejected", "rejected", "num_warnings", "warning_subjects", "warning_texts"]
+    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_waiting", "ticks_missed", "handler_errors", "tick_latency_p50", "tick_latency_p90", "tick_latency_p99", "tick_latency_max", "invalid_text", "host", "pid", "requests_queued", "memory", "cpu_share", "localization", "stability", "num_channels", "channels", "num_rejected", "rejected", "num_warnings", "warning_subjects", "warning_texts"]
 
-    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "double", "double", "string", "string", "int32_t", "int32_t", "int64_t", "double", "mslcm.localization_health_t", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
+    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "double", "double", "string", "string", "int32_t", "int32_t", "int64_t", "double", "mslcm.localization_health_t", "mslcm.stability_health_t", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_warnings"], ["num_warnings"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_warnings"], ["num_warnings"]]
 
     STARTING = 0
     """ No valid pose was published yet. """
@@ -193,6 +193,13 @@ class health_t(object):
         LCM Type: mslcm.localization_health_t
         """
 
+        self.stability = mslcm.stability_health_t()
+        """
+        The tip-over stability in short.
+        @default StabilityHealth()
+        LCM Type: mslcm.stability_health_t
+        """
+
         self.num_channels = 0
         """
         Number of sources of samples and commands, and of configured sensors without samples yet.
@@ -271,6 +278,8 @@ class health_t(object):
         buf.write(struct.pack(">iiqd", self.pid, self.requests_queued, self.memory, self.cpu_share))
         assert self.localization._get_packed_fingerprint() == mslcm.localization_health_t._get_packed_fingerprint()
         self.localization._encode_one(buf)
+        assert self.stability._get_packed_fingerprint() == mslcm.stability_health_t._get_packed_fingerprint()
+        self.stability._encode_one(buf)
         buf.write(struct.pack(">i", self.num_channels))
         for i0 in range(self.num_channels):
             assert self.channels[i0]._get_packed_fingerprint() == mslcm.channel_health_t._get_packed_fingerprint()
@@ -318,6 +327,7 @@ class health_t(object):
         self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
         self.pid, self.requests_queued, self.memory, self.cpu_share = struct.unpack(">iiqd", buf.read(24))
         self.localization = mslcm.localization_health_t._decode_one(buf)
+        self.stability = mslcm.stability_health_t._decode_one(buf)
         self.num_channels = struct.unpack(">i", buf.read(4))[0]
         self.channels = []
         for i0 in range(self.num_channels):
@@ -341,7 +351,7 @@ class health_t(object):
     def _get_hash_recursive(parents):
         if health_t in parents: return 0
         newparents = parents + [health_t]
-        tmphash = (0xed405a70b97f078d+ mslcm.localization_health_t._get_hash_recursive(newparents)+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x479e0852bbcf895+ mslcm.localization_health_t._get_hash_recursive(newparents)+ mslcm.stability_health_t._get_hash_recursive(newparents)+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -17,10 +17,13 @@ from modelserver.client.batch_reply import BatchQuery, check_batch
 from modelserver.client.times import Time, to_utime
 from modelserver.errors import WireError
 from modelserver.messages import (
+    DynamicsAnswer,
+    DynamicsReply,
     Explanation,
     ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetHistory,
     GetHTransform,
@@ -105,6 +108,24 @@ class FrameClient(ABC):
         time = TimeQuery(to_utime(at), policy, wait_ms)
         request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
         return require_answer(self._query(request, ExplanationReply).answer)
+
+    def get_dynamics(
+        self,
+        frame: str = "",
+        *,
+        equations: bool = False,
+        floating: bool = False,
+        at: Time = 0,
+        policy: Policy = Policy.INTERPOLATED,
+    ) -> DynamicsAnswer:
+        """Return mass, center of mass and inertia in a frame, by default the base frame, with the joints at that time.
+
+        With `equations` also coordinates, mass matrix, gravity vector and bias vector; `floating`: of a base that moves
+        in World:ENU. Needs the section `dynamics` of the vehicle file; `PlatformMirror` has none. Raises as
+        `get_transformation`; ForbiddenError where it is not configured.
+        """
+        request = GetDynamics(self._header(), frame, equations, floating, TimeQuery(to_utime(at), policy))
+        return require_answer(self._query(request, DynamicsReply).answer)
 
     def _header(self) -> RequestHeader:
         return RequestHeader(0, "")

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver.config import reader
+from modelserver.dynamics.settings import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.magnetometer import MagnetometerCalibration
@@ -434,6 +435,8 @@ class VehicleConfig:
     commands: CommandsConfig = field(default_factory=CommandsConfig)
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
     journal: JournalConfig = field(default_factory=JournalConfig)
+    dynamics: DynamicsSettings | None = None
+    """Dynamics of the vehicle and its tip-over margin; without the section there are none."""
     drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
     """For each driver's name its type of device and that type's settings. The service does not read them;
     `msdrivers.settings` does."""

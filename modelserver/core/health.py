@@ -25,6 +25,7 @@ from modelserver.core.state import (
 from modelserver.earth.geodesy import compute_geodetic
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.geometry.names import WORLD_UTM
+from modelserver.query.dynamics import find_stability
 from modelserver.version import __version__
 
 MIN_MESSAGES = 3
@@ -34,13 +35,18 @@ MIN_DROPPED = 20
 """Measurements of a source that are dropped in a row before a warning: 8 s of wheels, 2 s of a GPS receiver."""
 
 
+STABILITY = "stability"
+"""Subject of the warning about the tip-over margin."""
+
+
 def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant) -> tuple[CoreState, Outputs]:
     """Return the state after a tick, and the report that is due, if any."""
     is_full = now.monotonic_ns >= state.health_due_ns
     inputs = state.health_inputs
     if not is_full and now.monotonic_ns < inputs.due_ns:
         return state, ()
-    conditions = evaluate_conditions(state, now)
+    stability, warning = _find_stability(state, now)
+    conditions = evaluate_conditions(state, now, is_unstable=bool(warning))
     if gauges is not None:
         cpu_share = messages.NAN
         if inputs.gauges_ns and now.monotonic_ns > inputs.gauges_ns:
@@ -53,7 +59,7 @@ def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant
         return state, ()
     if is_full:
         state = _update_rates(state, now)
-    report = messages.PublishHealth(_make_report(state, now))
+    report = messages.PublishHealth(_make_report(state, now, stability, warning))
     if is_full:
         # from now, not from the due time: after a pause one report is enough
         due = now.monotonic_ns + state.settings.health_period_ns
@@ -61,7 +67,7 @@ def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant
     return state, (report,)
 
 
-def evaluate_conditions(state: CoreState, now: Instant) -> HealthConditions:
+def evaluate_conditions(state: CoreState, now: Instant, is_unstable: bool = False) -> HealthConditions:
     """Return the conditions whose change is reported at once."""
     silent = tuple([name for name, traffic in state.traffic.items() if _is_silent(name, traffic, now)])
     return HealthConditions(
@@ -72,6 +78,7 @@ def evaluate_conditions(state: CoreState, now: Instant) -> HealthConditions:
         tuple(_list_missing(state)),
         state.warnings,
         tuple([(name, reason) for name, reason, _ in _find_unusable(state, now)]),
+        is_unstable,
     )
 
 
@@ -95,6 +102,13 @@ def _find_unusable(state: CoreState, now: Instant) -> Iterator[tuple[str, str, s
             yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
 
 
+def _find_stability(state: CoreState, now: Instant) -> tuple[messages.StabilityHealth, str]:
+    """Return the tip-over stability and its warning; nothing is loaded for it unless it is configured."""
+    if state.view.dynamics is None or not state.view.dynamics.contacts:
+        return messages.StabilityHealth(), ""
+    return find_stability(state.view, now.utime)
+
+
 def _is_silent(name: str, traffic: SourceTraffic, now: Instant) -> bool:
     return (
         traffic.count >= MIN_MESSAGES
@@ -115,7 +129,7 @@ def _update_rates(state: CoreState, now: Instant) -> CoreState:
     return state._replace(traffic={name: start_period(traffic) for name, traffic in state.traffic.items()})
 
 
-def _make_report(state: CoreState, now: Instant) -> messages.Health:
+def _make_report(state: CoreState, now: Instant, stability: messages.StabilityHealth, warning: str) -> messages.Health:
     latencies = sorted(state.tick_latencies)
     estimate = None if state.localizer is None else state.localizer.estimate(now.utime)
     gauges = state.health_inputs.gauges
@@ -124,6 +138,9 @@ def _make_report(state: CoreState, now: Instant) -> messages.Health:
         messages.ChannelHealth(channel, 0, 0.0, messages.NAN, messages.NAN, True) for channel in _list_missing(state)
     ]
     invalid = state.view.invalid | (messages.VALID if estimate is None else estimate.invalid)
+    warnings = {**state.warnings, **{name: text for name, _, text in _find_unusable(state, now)}}
+    if warning:
+        warnings[STABILITY] = warning
     return messages.Health(
         utime=now.utime,
         uptime=(now.monotonic_ns - state.started_ns) * 1e-9,
@@ -146,15 +163,14 @@ def _make_report(state: CoreState, now: Instant) -> messages.Health:
         tick_latency_max=percentile(latencies, 1.0),
         channels=tuple(sorted(channels, key=lambda each: each.channel)),
         rejected=tuple(messages.RejectedCount(*key, count) for key, count in sorted(state.rejected.items())),
-        warnings=tuple(
-            sorted({**state.warnings, **{name: text for name, _, text in _find_unusable(state, now)}}.items())
-        ),
+        warnings=tuple(sorted(warnings.items())),
         host=gauges.host,
         pid=gauges.pid,
         requests_queued=gauges.queued,
         memory=gauges.memory,
         cpu_share=state.health_inputs.cpu_share,
         localization=_make_localization_health(state, estimate, now),
+        stability=stability,
     )
 
 

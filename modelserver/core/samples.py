@@ -132,7 +132,9 @@ def update_localizer(
     if invalid and has_estimate and not is_rejected and utime <= now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
         # the estimate is of the host's new time of day
         invalid = messages.VALID
-    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling, invalid, view.joints)
+    view = PlatformView(
+        view.model, view.base_frame, localizer, history, view.rolling, invalid, view.joints, view.dynamics
+    )
     state = CoreState(view, *state[1:])
     if has_estimate:
         # a sample that is rejected in part may still advance the time

@@ -9,6 +9,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 from modelserver import messages
 from modelserver.core.host_clock import HostClock, Instant
+from modelserver.dynamics.settings import DynamicsSettings
 from modelserver.errors import NotConnectedError
 from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
@@ -82,6 +83,7 @@ class CoreSettings:
     may_set_pose: bool = False
     persist_period_ns: int = 0
     sensors: tuple[ExpectedSensor, ...] = ()
+    dynamics: DynamicsSettings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +141,7 @@ class HealthConditions(NamedTuple):
     missing: tuple[str, ...] = ()
     warnings: Mapping[str, str] = MappingProxyType({})
     unusable: tuple[tuple[str, str], ...] = ()
+    is_unstable: bool = False
 
 
 class HealthInputs(NamedTuple):
@@ -211,7 +214,15 @@ AllOutputs: TypeAlias = tuple[messages.Output | DeferredAnswer, ...]
 def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:
     """Make the first state. Raises QueryError if the model lacks the base frame or the rolling frame."""
     history, joints = History(settings.history_s), JointHistory(model.joints.values(), settings.history_s)
-    view = PlatformView(model, settings.base_frame, localizer, history, settings.rolling_frame, joints=joints)
+    view = PlatformView(
+        model,
+        settings.base_frame,
+        localizer,
+        history,
+        settings.rolling_frame,
+        joints=joints,
+        dynamics=settings.dynamics,
+    )
     check_rigid(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
     clock = HostClock().update(now, set_back=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from modelserver.errors import quote, suggest_name
 from modelserver.formats.reading import MAX_POSITION
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode
+from modelserver.geometry.inertia import RigidInertia, Rows
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.parts import Sigma
 from modelserver.transforms import so3
@@ -97,6 +98,38 @@ def _read_matrix(at: YamlMapping) -> Pose | None:
     position = [row[3] for row in rows[:3]]
     turned = at.repair_rotation([row[:3] for row in rows[:3]], "matrix", node.line)
     return None if turned is None or not at.check_position(position, node.line) else Pose(position, turned)
+
+
+def read_inertia(owner: YamlMapping) -> Rows | None:
+    """Read the inertia in a mapping: 6 rows of 6, or mass, center and moments; None, with an error, if it is wrong."""
+    node = owner.fields["inertia"]
+    if node.kind is not NodeKind.MAPPING:
+        rows = owner.read_rows("inertia", (6,), 6)
+        return None if rows is None else tuple(map(tuple, rows))
+    at = owner.enter(node, f"{owner.place}, inertia", ("mass", "center", "moments", "products"))
+    missing = [key for key in ("mass", "moments") if key not in at.fields]
+    if missing:
+        at.error(
+            f"{' and '.join(missing)} missing", "write inertia: {mass: kg, center: [x, y, z], moments: [xx, yy, zz]}"
+        )
+        return None
+    mass = at.read_number(at.fields["mass"], "mass", "write mass: number, in kilograms")
+    center, moments, products = (
+        at.read_numbers(at.fields[key], 3, key, unit) if key in at.fields else [0.0] * 3
+        for key, unit in (("center", "meters"), ("moments", "kg m2"), ("products", "kg m2"))
+    )
+    if mass is None or center is None or moments is None or products is None:
+        return None
+    (xx, yy, zz), (xy, xz, yz) = moments, products
+    found = RigidInertia(mass, so3.to_vector3(center), ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    matrix = found.matrix()
+    problem = found.find_problem() if all(map(math.isfinite, sum(matrix, ()))) else "its numbers are out of reach"
+    if problem:
+        at.error(
+            f"inertia: {problem}", "write mass in kg, center in meters, moments about the center in kg m2", node.line
+        )
+        return None
+    return matrix
 
 
 def read_sigma(owner: YamlMapping) -> SigmaDefaults | None:

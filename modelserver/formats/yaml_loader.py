@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
 from modelserver.formats.reading import label
-from modelserver.formats.yaml_elements import POSE_KEYS, SigmaDefaults, read_joint, read_pose, read_sigma
+from modelserver.formats.yaml_elements import POSE_KEYS, SigmaDefaults, read_inertia, read_joint, read_pose, read_sigma
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode, parse_yaml
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED
@@ -199,11 +199,11 @@ class _GeometryReader:
             self.templates[name] = self.read_parts(templates.enter(value, place, _TEMPLATE_KEYS), key)
 
     def read_parts(self, at: YamlMapping, key: YamlNode) -> _BodyParts:
-        inertia = at.read_rows("inertia", (6,), 6) if "inertia" in at.fields else None
+        inertia = read_inertia(at) if "inertia" in at.fields else None
         frames = at.enter(at.fields["frames"], f"{at.place}, frames").pairs if "frames" in at.fields else []
         return _BodyParts(
             at.read_text("description"),
-            None if inertia is None else tuple(map(tuple, inertia)),
+            inertia,
             [
                 (self.read_frame(name, at.enter(value, f"{at.place}, frame {label(name)}", _FRAME_KEYS)), frame_key)
                 for name, frame_key, value in frames

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import astuple
 from enum import StrEnum
 from functools import partial
+from typing import Any
 
 from modelserver.errors import (
     Location,
@@ -29,6 +30,7 @@ from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicP
 from modelserver.geometry.names import format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, full_name, list_edges
+from modelserver.plugins import load_object
 from modelserver.transforms import chain
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
@@ -141,6 +143,20 @@ class Model:
             raise NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
         several = f"{len(found)} constraints, {format_names(known)}"
         raise MalformedRequestError(f"frame {name} has {several}; name the one to cross")
+
+    def spanning_tree(self, body: str) -> tuple[Crossing, ...]:
+        """Return the constraints that lead from a body to all that is joined to it, breadth-first.
+
+        Raises UnknownBodyError.
+        """
+        return tuple(self._topology.traverse_breadth_first(self.body(body).name))
+
+    def dynamics(self, base: str = "floating", root: str = "", **options: Any) -> Any:
+        """Return the model's `modelserver.dynamics.Dynamics`: mass matrix, bias vector, forward dynamics (eq. 7-10).
+
+        Arguments as there. Needs the extra `dynamics`; nothing of it is loaded before.
+        """
+        return load_object("modelserver.dynamics", "Dynamics")(self, base, root, **options)
 
     def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
         """Return the problems of a frame, none where it is valid (the report's verifyConstraint).

@@ -12,9 +12,11 @@ from modelserver.messages.flags import NAN
 from modelserver.messages.generated import (
     AbsolutePoseSample,
     Acknowledgement,
+    DynamicsReply,
     ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetHistory,
     GetHTransform,
@@ -78,6 +80,7 @@ Request: TypeAlias = (
     | GetTransformations
     | GetMotion
     | GetExplanation
+    | GetDynamics
     | ReloadModel
     | SetStateVector
     | SetHTransform
@@ -93,6 +96,7 @@ CHANNEL_OF: Final[Mapping[type, str]] = {
     GetTransformations: "PLATFORM_GET_TRANSFORMATIONS",
     GetMotion: "PLATFORM_GET_MOTION",
     GetExplanation: "PLATFORM_GET_EXPLANATION",
+    GetDynamics: "PLATFORM_GET_DYNAMICS",
     ReloadModel: "PLATFORM_RELOAD_MODEL",
     SetStateVector: "POSE_SET_STATE_VECTOR",
     SetHTransform: "POSE_SET_H_TRANSFORM",
@@ -122,6 +126,7 @@ Reply: TypeAlias = (
     | PoseBatchReply
     | MotionReply
     | ExplanationReply
+    | DynamicsReply
     | ReloadReply
     | Acknowledgement
 )

@@ -342,6 +342,126 @@ class GetBodyList(NamedTuple):
     header: RequestHeader
 
 
+class DynamicsAnswer(NamedTuple):
+    """Mass, center of mass and inertia of a vehicle, and its equations of motion.
+
+    Attributes
+    ----------
+    utime
+        Instant of the joints and the attitude, microseconds since the Unix epoch (UTC). Meaningful only when
+        header.status is OK, as all below.
+    invalid_reasons
+        Why the answer may not be used, bit by bit as in pose_transform_t; 0 = it may.
+    frame
+        The frame of center of mass and inertia.
+    mass
+        Mass, kg.
+    center
+        Center of mass in the frame, m.
+    inertia
+        Inertia about the frame's origin, row-major 6 x 6: x, y, z, then about x, about y, about z; kg, kg m, kg m2.
+    coordinates
+        Their names: those of the joints, before them those of a floating base.
+    position
+        Position of each, meters or radians.
+    rate
+        Its rate; nan = not known.
+    gravity
+        Gravity vector, N or N m.
+    bias
+        Bias vector (report eq. 9), N or N m; nan where a rate is not known.
+    mass_matrix
+        Mass matrix (report eq. 7): the lower triangle as in navigation_state_t; kg, kg m, kg m2.
+    center_covariance
+        Covariance of the center of mass along the axes of the frame, row-major, m2. nan = not known.
+    """
+
+    utime: int
+    invalid_reasons: Invalid
+    frame: str
+    mass: float
+    center: Vector3
+    inertia: tuple[float, ...]
+    coordinates: tuple[str, ...]
+    position: tuple[float, ...]
+    rate: tuple[float, ...]
+    gravity: tuple[float, ...]
+    bias: tuple[float, ...]
+    mass_matrix: tuple[float, ...]
+    center_covariance: Matrix3 | None = None
+
+
+class DynamicsReply(NamedTuple):
+    """Reply to get_dynamics_request_t.
+
+    Attributes
+    ----------
+    header
+        Status of the request.
+    answer
+        None unless the status is OK.
+    """
+
+    header: ReplyHeader
+    answer: DynamicsAnswer | None = None
+
+
+class Policy(IntEnum):
+    """Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED."""
+
+    INTERPOLATED = 0
+    """Exact, or interpolated between two values of the history; else an error."""
+    LATEST = 1
+    """As at = 0, whatever `at` is."""
+    HELD = 2
+    """The last value at or before `at`."""
+    PREDICTED = 3
+    """As INTERPOLATED, and predicted by the motion model past the last sample."""
+
+
+class TimeQuery(NamedTuple):
+    """Time of a request.
+
+    Attributes
+    ----------
+    at
+        Microseconds since the Unix epoch (UTC); 0 = the latest time for which everything asked for is known.
+    policy
+        Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED.
+    wait_ms
+        How long the server may wait for data that cover `at`, milliseconds, not negative; 0 = answer at once.
+    """
+
+    at: int = 0
+    policy: Policy = Policy.INTERPOLATED
+    wait_ms: int = 0
+
+
+class GetDynamics(NamedTuple):
+    """Platform.getDynamics: mass, center of mass and inertia, and the equations of motion. Answered by
+    get_dynamics_reply_t. Needs the section `dynamics` in the vehicle file.
+
+    Attributes
+    ----------
+    header
+        Id of the request, and the channel of the reply.
+    frame
+        The frame of center of mass and inertia: full name, as in get_transformation_request_t; empty: the base frame.
+    with_equations
+        Whether coordinates, mass matrix, bias vector and gravity vector are wanted.
+    is_floating
+        Whether the base frame moves in World:ENU, with six coordinates of its own; else it is fixed, and level.
+    time
+        Time of the query. The server does not wait for data: wait_ms is not read.
+    """
+
+    header: RequestHeader
+    frame: str = ""
+    with_equations: bool = False
+    is_floating: bool = False
+    time: TimeQuery = TimeQuery()
+
+
 class EdgeReport(NamedTuple):
     """One edge of the path from a frame of reference to a frame of interest.
 
@@ -418,37 +538,6 @@ class ExplanationReply(NamedTuple):
 
     header: ReplyHeader
     answer: Explanation | None = None
-
-
-class Policy(IntEnum):
-    """Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED."""
-
-    INTERPOLATED = 0
-    """Exact, or interpolated between two values of the history; else an error."""
-    LATEST = 1
-    """As at = 0, whatever `at` is."""
-    HELD = 2
-    """The last value at or before `at`."""
-    PREDICTED = 3
-    """As INTERPOLATED, and predicted by the motion model past the last sample."""
-
-
-class TimeQuery(NamedTuple):
-    """Time of a request.
-
-    Attributes
-    ----------
-    at
-        Microseconds since the Unix epoch (UTC); 0 = the latest time for which everything asked for is known.
-    policy
-        Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED.
-    wait_ms
-        How long the server may wait for data that cover `at`, milliseconds, not negative; 0 = answer at once.
-    """
-
-    at: int = 0
-    policy: Policy = Policy.INTERPOLATED
-    wait_ms: int = 0
 
 
 class GetExplanation(NamedTuple):
@@ -843,6 +932,37 @@ class LocalizationHealth:
     sigma_up: float = NAN
 
 
+@dataclass(frozen=True, slots=True)
+class StabilityHealth:
+    """Tip-over stability in short, part of health_t.
+
+    Attributes
+    ----------
+    margin
+        Static tip-over margin: how far the ground may tilt further, radians; nan = not configured, or not known.
+    margin_sigma
+        Its standard deviation, radians; nan = not known.
+    dynamic_margin
+        Tip-over margin with the present acceleration, radians; nan = not known.
+    dynamic_margin_sigma
+        Its standard deviation, radians; nan = not known.
+    limit
+        The margin below which the service warns, radians; nan = none.
+    contacts
+        Frame of each contact.
+    loads
+        Normal load of each with the present acceleration, else at rest, N; nan = not known, or tipping.
+    """
+
+    margin: float = NAN
+    margin_sigma: float = NAN
+    dynamic_margin: float = NAN
+    dynamic_margin_sigma: float = NAN
+    limit: float = NAN
+    contacts: tuple[str, ...] = ()
+    loads: tuple[float, ...] = ()
+
+
 class RejectedCount(NamedTuple):
     """Number of inputs of one channel that were rejected for one reason.
 
@@ -920,6 +1040,8 @@ class Health:
         Share of one processor's time over the last report's interval; nan = not known.
     localization
         The localization in short.
+    stability
+        The tip-over stability in short.
     channels
         Traffic of each.
     rejected
@@ -951,6 +1073,7 @@ class Health:
     memory: int = 0
     cpu_share: float = NAN
     localization: LocalizationHealth = LocalizationHealth()
+    stability: StabilityHealth = StabilityHealth()
     channels: tuple[ChannelHealth, ...] = ()
     rejected: tuple[RejectedCount, ...] = ()
     warnings: tuple[tuple[str, str], ...] = ()

@@ -18,9 +18,11 @@ from modelserver.geometry.parts import Body, BodyFrame
 from modelserver.messages import (
     MAX_REQUEST_INSTANTS,
     Acknowledgement,
+    DynamicsReply,
     ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetHistory,
     GetHTransform,
@@ -46,6 +48,7 @@ from modelserver.messages import (
 )
 from modelserver.query import HISTORY_LIMIT, PlatformView
 from modelserver.query.batch import lookup_batch
+from modelserver.query.dynamics import compute_dynamics
 from modelserver.query.explanation import explain
 from modelserver.query.motion import compute_motion
 from modelserver.query.steps import Steps, complete
@@ -77,6 +80,8 @@ def effort_of(request: Request) -> float:
         poses = (request.end_utime - request.start_utime) * 1e-6 * request.rate_hz
         # more than the limit, or non-finite: the reply is an error
         return 1.0 + POSE_EFFORT * poses if 0.0 < poses <= HISTORY_LIMIT else 1.0
+    if isinstance(request, GetDynamics):
+        return DYNAMICS_EFFORT
     return EXPLANATION_EFFORT if isinstance(request, GetExplanation) else 1.0
 
 
@@ -143,6 +148,10 @@ def _get_history(view: PlatformView, request: GetHistory, header: ReplyHeader) -
     return [HistoryReply(header, (yield from view.vehicle_history(*span)))]
 
 
+def _get_dynamics(view: PlatformView, request: GetDynamics, header: ReplyHeader) -> Steps[list[Reply]]:
+    return [DynamicsReply(header, (yield from compute_dynamics(view, request, header.utime)))]
+
+
 def _get_transformations(view: PlatformView, request: GetTransformations, header: ReplyHeader) -> Steps[list[Reply]]:
     wanted = len(request.pairs) * len(request.at)
     if wanted > MAX_REQUEST_INSTANTS:
@@ -181,7 +190,8 @@ PAIR_EFFORT: Final = 10.0
 INSTANT_EFFORT: Final = 0.06
 POSE_EFFORT: Final = 0.33
 EXPLANATION_EFFORT: Final = 4.0
-"""Effort of a pair of a batch and of each of its instants, of a pose of a history, and of an explanation."""
+DYNAMICS_EFFORT: Final = 20.0
+"""Effort of a pair of a batch and of each of its instants, of a pose of a history, of an explanation, of dynamics."""
 
 DEFERRED_EFFORT: Final = 11.0
 """Effort beyond which an answer is deferred: about a millisecond."""
@@ -189,6 +199,7 @@ DEFERRED_EFFORT: Final = 11.0
 _DEFERRED_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Steps[list[Reply]]]]] = {
     GetHistory: _get_history,
     GetTransformations: _get_transformations,
+    GetDynamics: _get_dynamics,
 }
 
 _REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
@@ -201,6 +212,7 @@ _REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
     GetTransformations: PoseBatchReply,
     GetMotion: MotionReply,
     GetExplanation: ExplanationReply,
+    GetDynamics: DynamicsReply,
     ReloadModel: ReloadReply,
     SetStateVector: Acknowledgement,
     SetHTransform: Acknowledgement,

@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from modelserver.dynamics.settings import DynamicsSettings
 from modelserver.errors import (
     LimitError,
     MalformedRequestError,
@@ -101,7 +102,8 @@ class PlatformView(NamedTuple):
     """The current state for queries: geometry, joints, and the history of the vehicle's estimates.
 
     base_frame: the frame whose pose is queried and published. rolling: the name of the rolling frame; empty for the
-    base frame. invalid: reasons against every pose, besides those of its own estimate.
+    base frame. invalid: reasons against every pose, besides those of its own estimate. dynamics: None where it is not
+    configured.
     """
 
     model: Model
@@ -111,6 +113,7 @@ class PlatformView(NamedTuple):
     rolling: str = ""
     invalid: Invalid = VALID
     joints: JointHistory = NO_JOINTS
+    dynamics: DynamicsSettings | None = None
 
     @property
     def rolling_frame(self) -> str:

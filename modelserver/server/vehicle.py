@@ -102,6 +102,7 @@ class Vehicle:
             may_set_pose=config.commands.set_pose,
             persist_period_ns=round(config.warm_start.period_s * 1e9) if config.warm_start.persist else 0,
             sensors=self.expected_sensors(),
+            dynamics=config.dynamics,
         )
         state = core.start(settings, self.model, localizer, now)
         return state._replace(warnings={START: start_report}) if start_report else state
@@ -292,6 +293,8 @@ def examine_vehicle(
             problems.append(_make_problem(file, "geometry", why))
     if geometry.partial_model is not None:
         problems += find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
+    if geometry.model is not None and not problems:
+        problems += _find_dynamics_problems(config, geometry.model, file)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
         why = "raw mode needs a GPS and an IMU, and the section sensors does not have both"
@@ -405,6 +408,19 @@ def _find_channel_problems(config: VehicleConfig, file: str) -> list[errors.Prob
         fix = "choose a prefix that no other channel has, e.g. REPLY_"
         problems.append(_make_problem(file, "lcm.reply_prefix", why, fix))
     return problems
+
+
+def _find_dynamics_problems(config: VehicleConfig, model: Model, file: str) -> list[errors.Problem]:
+    """Check that the dynamics can be computed, so that Pinocchio is loaded before the service runs."""
+    if config.dynamics is None:
+        return []
+    from modelserver.query.dynamics import check_dynamics
+
+    try:
+        check_dynamics(model, config.base_frame, config.dynamics)
+    except errors.ModelServerError as error:
+        return [_make_problem(file, "dynamics", str(error), "", tuple(getattr(error, "nearest", ())))]
+    return []
 
 
 def list_own_measurements(config: VehicleConfig) -> dict[str, str]:

@@ -46,6 +46,12 @@ MAX_STATES: Final = 64
 MAX_VALUES: Final = 16
 """Numbers of a measurement of an installed package."""
 
+MAX_COORDINATES: Final = 100
+"""Generalized coordinates in one reply: its mass matrix takes 40 kB."""
+
+MAX_CONTACTS: Final = 16
+"""Contacts with the ground in a health report."""
+
 MAX_SNAPSHOT_PARTS: Final = 100_000
 
 MAX_DISTANCE = 1e12

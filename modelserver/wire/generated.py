@@ -15,6 +15,8 @@ from modelserver.messages import (
     Direction,
     DriverHealth,
     DriverPhase,
+    DynamicsAnswer,
+    DynamicsReply,
     EdgeReport,
     Envelope,
     Explanation,
@@ -22,6 +24,7 @@ from modelserver.messages import (
     FixType,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetHistory,
     GetHTransform,
@@ -59,6 +62,7 @@ from modelserver.messages import (
     SetHTransform,
     SetStateVector,
     SnapshotPart,
+    StabilityHealth,
     StateVectorReply,
     SwitchMode,
     TimeQuery,
@@ -74,6 +78,8 @@ from modelserver.messages import (
 from modelserver.transforms.pose import Pose
 from modelserver.wire.batch import pack_get_transformations_reply, unpack_get_transformations_reply
 from modelserver.wire.fields import (
+    MAX_CONTACTS,
+    MAX_COORDINATES,
     MAX_DECISIONS,
     MAX_FRAME_NAME,
     MAX_MESSAGE_INSTANTS,
@@ -139,6 +145,8 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "driver_health_t": bytes.fromhex("0c62286d0ae44df8"),
     "get_body_frame_list_request_t": bytes.fromhex("2497e2c3fc56ff7f"),
     "get_body_list_request_t": bytes.fromhex("02ff54e76e2dd188"),
+    "get_dynamics_reply_t": bytes.fromhex("00861eac3d9f9d3e"),
+    "get_dynamics_request_t": bytes.fromhex("17b1653b9c6c7292"),
     "get_explanation_reply_t": bytes.fromhex("78784d12aacdab49"),
     "get_explanation_request_t": bytes.fromhex("349d6de2b7954177"),
     "get_h_transform_request_t": bytes.fromhex("7e7a9479fd1d6d9b"),
@@ -153,7 +161,7 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "get_transformations_reply_t": bytes.fromhex("5c17dce904d61a93"),
     "get_transformations_request_t": bytes.fromhex("d71f006e179d5a75"),
     "gps_t": bytes.fromhex("661a4b5c1827f64c"),
-    "health_t": bytes.fromhex("c744d7c254a7cdda"),
+    "health_t": bytes.fromhex("9b50996b327d40fb"),
     "imu_t": bytes.fromhex("a488946aa26727f7"),
     "joints_t": bytes.fromhex("2f8bc69e04097f3d"),
     "localization_health_t": bytes.fromhex("bc81b19d57c85f38"),
@@ -176,6 +184,7 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "set_h_transform_request_t": bytes.fromhex("cb1b5b324b0eb2ae"),
     "set_state_vector_request_t": bytes.fromhex("252e6635f5c02440"),
     "signed_t": bytes.fromhex("9e853d013a985096"),
+    "stability_health_t": bytes.fromhex("52cc5abffcacc888"),
     "time_query_t": bytes.fromhex("e0e3ae7a2bde3465"),
     "vehicle_command_t": bytes.fromhex("c0060a5442733d61"),
     "vehicle_status_t": bytes.fromhex("68dabe3bdb8f1c77"),
@@ -192,30 +201,38 @@ _S5 = struct.Struct(">i")
 _S6 = struct.Struct(">dd")
 _S7 = struct.Struct(">qi")
 _S8 = struct.Struct(">iqqdddddqi")
-_S9 = struct.Struct(">qbi")
-_S10 = struct.Struct(">bqbi")
-_S11 = struct.Struct(">qqd")
-_S12 = struct.Struct(">3d3d3d3d36d36d")
-_S13 = struct.Struct(">3d3d3d3d36d")
-_S14 = struct.Struct(">36d")
-_S15 = struct.Struct(">qb")
-_S16 = struct.Struct(">bhdddddddd9d3d9dddddddd")
-_S17 = struct.Struct(">qd")
-_S18 = struct.Struct(">biiqqqiqqdddd")
-_S19 = struct.Struct(">iiqdbbbddddddddddi")
-_S20 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S21 = struct.Struct(">bbbdddddddddd")
-_S22 = struct.Struct(">iii")
-_S23 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
-_S24 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
-_S25 = struct.Struct(">b7dbqd")
-_S26 = struct.Struct(">3d")
-_S27 = struct.Struct(">qq")
-_S28 = struct.Struct(">32s")
-_S29 = struct.Struct(">qdq")
-_S30 = struct.Struct(">bddddiq")
+_S9 = struct.Struct(">d3d36di")
+_S10 = struct.Struct(">9d")
+_S11 = struct.Struct(">d3d36d")
+_S12 = struct.Struct(">bbqbi")
+_S13 = struct.Struct(">qbi")
+_S14 = struct.Struct(">bqbi")
+_S15 = struct.Struct(">qqd")
+_S16 = struct.Struct(">3d3d3d3d36d36d")
+_S17 = struct.Struct(">3d3d3d3d36d")
+_S18 = struct.Struct(">36d")
+_S19 = struct.Struct(">qb")
+_S20 = struct.Struct(">bhdddddddd9d3d9dddddddd")
+_S21 = struct.Struct(">qd")
+_S22 = struct.Struct(">biiqqqiqqdddd")
+_S23 = struct.Struct(">iiqdbbbdddddddddddddddi")
+_S24 = struct.Struct(">3d9d3d9d3dbb4d9dd")
+_S25 = struct.Struct(">bbbdddddddddd")
+_S26 = struct.Struct(">iii")
+_S27 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
+_S28 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
+_S29 = struct.Struct(">b7dbqd")
+_S30 = struct.Struct(">3d")
+_S31 = struct.Struct(">qq")
+_S32 = struct.Struct(">32s")
+_S33 = struct.Struct(">dddddi")
+_S34 = struct.Struct(">qdq")
+_S35 = struct.Struct(">bddddiq")
 
 
+NO_GET_DYNAMICS_REPLY = (
+    bytes(8) + bytes(4) + pack_text("") + bytes(8) + bytes(24) + bytes(288) + bytes(4) + bytes(4) + bytes(72)
+)
 NO_GET_EXPLANATION_REPLY = NO_POSE_TRANSFORM + bytes(4)
 NO_GET_MOTION_REPLY = (
     NO_POSE_TRANSFORM + pack_text("") + bytes(24) + bytes(24) + bytes(24) + bytes(24) + bytes(288) + bytes(288)
@@ -445,6 +462,118 @@ def unpack_get_body_list_request(data: bytes, at: int) -> tuple[GetBodyList, int
     return GetBodyList(RequestHeader(header_request_id, header_reply_channel)), at
 
 
+def pack_get_dynamics_reply(value: DynamicsReply) -> bytes:
+    """Return the bytes of a get_dynamics_reply_t without the fingerprint."""
+    if value.answer is None:
+        return pack_reply_header(value.header) + NO_GET_DYNAMICS_REPLY
+    return b"".join(
+        (
+            pack_reply_header(value.header),
+            _S7.pack(value.answer.utime, value.answer.invalid_reasons),
+            pack_text(value.answer.frame),
+            _S9.pack(value.answer.mass, *value.answer.center, *value.answer.inertia, len(value.answer.coordinates)),
+            *map(pack_text, value.answer.coordinates),
+            pack_numbers("d", value.answer.position, len(value.answer.coordinates)),
+            pack_numbers("d", value.answer.rate, len(value.answer.coordinates)),
+            pack_numbers("d", value.answer.gravity, len(value.answer.coordinates)),
+            pack_numbers("d", value.answer.bias, len(value.answer.coordinates)),
+            _S5.pack(len(value.answer.coordinates) * (len(value.answer.coordinates) + 1) // 2),
+            pack_triangle(value.answer.mass_matrix, len(value.answer.coordinates)),
+            _S10.pack(*(value.answer.center_covariance or NAN9)),
+        )
+    )
+
+
+def unpack_get_dynamics_reply(data: bytes, at: int) -> tuple[DynamicsReply, int]:
+    """Return the get_dynamics_reply_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    header, at = unpack_reply_header(data, at)
+    if header.status is not Status.OK:
+        return DynamicsReply(header), skip_nothing(data, at, NO_GET_DYNAMICS_REPLY)
+    utime, invalid_reasons = _S7.unpack_from(data, at)
+    frame, at = read_text(data, at + 12)
+    mass, center_0, center_1, center_2, *inertia = _S11.unpack_from(data, at)
+    (n,) = _S5.unpack_from(data, at + 320)
+    check_count(n, "n", MAX_COORDINATES)
+    coordinates, at = read_each(read_text, data, at + 324, n)
+    position, at = read_numbers("d", data, at, n)
+    rate, at = read_numbers("d", data, at, n)
+    gravity, at = read_numbers("d", data, at, n)
+    bias, at = read_numbers("d", data, at, n)
+    (num_mass_matrix,) = _S5.unpack_from(data, at)
+    check_count(num_mass_matrix, "num_mass_matrix", n * (n + 1) // 2, n * (n + 1) // 2)
+    mass_matrix, at = read_numbers("d", data, at + 4, num_mass_matrix)
+    (
+        center_covariance_0,
+        center_covariance_1,
+        center_covariance_2,
+        center_covariance_3,
+        center_covariance_4,
+        center_covariance_5,
+        center_covariance_6,
+        center_covariance_7,
+        center_covariance_8,
+    ) = _S10.unpack_from(data, at)
+    return DynamicsReply(
+        header,
+        DynamicsAnswer(
+            check_utime(utime, "utime"),
+            Invalid(invalid_reasons),
+            frame,
+            mass,
+            (center_0, center_1, center_2),
+            tuple(inertia),
+            tuple([check_name(each, "coordinates", MAX_FRAME_NAME) for each in coordinates]),
+            position,
+            rate,
+            gravity,
+            bias,
+            read_triangle(mass_matrix, n),
+            read_matrix3(
+                (
+                    center_covariance_0,
+                    center_covariance_1,
+                    center_covariance_2,
+                    center_covariance_3,
+                    center_covariance_4,
+                    center_covariance_5,
+                    center_covariance_6,
+                    center_covariance_7,
+                    center_covariance_8,
+                )
+            ),
+        ),
+    ), at + 72
+
+
+def pack_get_dynamics_request(value: GetDynamics) -> bytes:
+    """Return the bytes of a get_dynamics_request_t without the fingerprint."""
+    return b"%b%b%b%b" % (
+        _S3.pack(value.header.request_id),
+        pack_text(value.header.reply_channel),
+        pack_text(value.frame),
+        _S12.pack(value.with_equations, value.is_floating, value.time.at, value.time.policy, value.time.wait_ms),
+    )
+
+
+def unpack_get_dynamics_request(data: bytes, at: int) -> tuple[GetDynamics, int]:
+    """Return the get_dynamics_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    (header_request_id,) = _S3.unpack_from(data, at)
+    header_reply_channel, at = read_text(data, at + 8)
+    frame, at = read_text(data, at)
+    with_equations, is_floating, time_at_, time_policy, time_wait_ms = _S12.unpack_from(data, at)
+    return GetDynamics(
+        RequestHeader(header_request_id, header_reply_channel),
+        check_name(frame, "frame", MAX_FRAME_NAME),
+        bool(with_equations),
+        bool(is_floating),
+        TimeQuery(
+            check_utime(time_at_, "at"),
+            read_enum(Policy, time_policy, "policy"),
+            check_not_negative(time_wait_ms, "wait_ms"),
+        ),
+    ), at + 15
+
+
 def pack_get_explanation_reply(value: ExplanationReply) -> bytes:
     """Return the bytes of a get_explanation_reply_t without the fingerprint."""
     if value.answer is None:
@@ -476,7 +605,7 @@ def pack_get_explanation_request(value: GetExplanation) -> bytes:
     return b"%b%b%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S9.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
         pack_text(value.frame_of_interest),
         pack_text(value.frame_of_reference),
     )
@@ -486,7 +615,7 @@ def unpack_get_explanation_request(data: bytes, at: int) -> tuple[GetExplanation
     """Return the get_explanation_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    time_at_, time_policy, time_wait_ms = _S9.unpack_from(data, at)
+    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
     frame_of_interest, at = read_text(data, at + 13)
     frame_of_reference, at = read_text(data, at)
     return GetExplanation(
@@ -506,7 +635,7 @@ def pack_get_h_transform_request(value: GetHTransform) -> bytes:
     return b"%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S10.pack(value.inverse, value.time.at, value.time.policy, value.time.wait_ms),
+        _S14.pack(value.inverse, value.time.at, value.time.policy, value.time.wait_ms),
     )
 
 
@@ -514,7 +643,7 @@ def unpack_get_h_transform_request(data: bytes, at: int) -> tuple[GetHTransform,
     """Return the get_h_transform_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    inverse, time_at_, time_policy, time_wait_ms = _S10.unpack_from(data, at)
+    inverse, time_at_, time_policy, time_wait_ms = _S14.unpack_from(data, at)
     return GetHTransform(
         RequestHeader(header_request_id, header_reply_channel),
         bool(inverse),
@@ -547,7 +676,7 @@ def pack_get_history_request(value: GetHistory) -> bytes:
     return b"%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S11.pack(value.start_utime, value.end_utime, value.rate_hz),
+        _S15.pack(value.start_utime, value.end_utime, value.rate_hz),
     )
 
 
@@ -555,7 +684,7 @@ def unpack_get_history_request(data: bytes, at: int) -> tuple[GetHistory, int]:
     """Return the get_history_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    start_utime, end_utime, rate_hz = _S11.unpack_from(data, at)
+    start_utime, end_utime, rate_hz = _S15.unpack_from(data, at)
     return GetHistory(
         RequestHeader(header_request_id, header_reply_channel),
         check_utime(start_utime, "start_utime"),
@@ -572,7 +701,7 @@ def pack_get_motion_reply(value: MotionReply) -> bytes:
         pack_reply_header(value.header),
         pack_pose_transform(value.answer.pose),
         pack_text(value.answer.expressed_in),
-        _S12.pack(
+        _S16.pack(
             *value.answer.velocity,
             *value.answer.angular_velocity,
             *value.answer.acceleration,
@@ -604,8 +733,8 @@ def unpack_get_motion_reply(data: bytes, at: int) -> tuple[MotionReply, int]:
         angular_acceleration_1,
         angular_acceleration_2,
         *covariance,
-    ) = _S13.unpack_from(data, at)
-    (*acceleration_covariance,) = _S14.unpack_from(data, at + 384)
+    ) = _S17.unpack_from(data, at)
+    (*acceleration_covariance,) = _S18.unpack_from(data, at + 384)
     return MotionReply(
         header,
         MotionAnswer(
@@ -629,7 +758,7 @@ def pack_get_motion_request(value: GetMotion) -> bytes:
         pack_text(value.frame_of_interest),
         pack_text(value.frame_of_reference),
         pack_text(value.expressed_in),
-        _S9.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
     )
 
 
@@ -640,7 +769,7 @@ def unpack_get_motion_request(data: bytes, at: int) -> tuple[GetMotion, int]:
     frame_of_interest, at = read_text(data, at)
     frame_of_reference, at = read_text(data, at)
     expressed_in, at = read_text(data, at)
-    time_at_, time_policy, time_wait_ms = _S9.unpack_from(data, at)
+    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
     return GetMotion(
         RequestHeader(header_request_id, header_reply_channel),
         check_name(frame_of_interest, "frame_of_interest", MAX_FRAME_NAME),
@@ -677,7 +806,7 @@ def pack_get_state_vector_request(value: GetStateVector) -> bytes:
     return b"%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S9.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
     )
 
 
@@ -685,7 +814,7 @@ def unpack_get_state_vector_request(data: bytes, at: int) -> tuple[GetStateVecto
     """Return the get_state_vector_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    time_at_, time_policy, time_wait_ms = _S9.unpack_from(data, at)
+    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
     return GetStateVector(
         RequestHeader(header_request_id, header_reply_channel),
         TimeQuery(
@@ -721,7 +850,7 @@ def pack_get_transformation_request(value: GetTransformation) -> bytes:
         pack_text(value.header.reply_channel),
         pack_text(value.frame_of_interest),
         pack_text(value.frame_of_reference),
-        _S9.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
     )
 
 
@@ -731,7 +860,7 @@ def unpack_get_transformation_request(data: bytes, at: int) -> tuple[GetTransfor
     header_reply_channel, at = read_text(data, at + 8)
     frame_of_interest, at = read_text(data, at)
     frame_of_reference, at = read_text(data, at)
-    time_at_, time_policy, time_wait_ms = _S9.unpack_from(data, at)
+    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
     return GetTransformation(
         RequestHeader(header_request_id, header_reply_channel),
         frame_of_interest,
@@ -756,7 +885,7 @@ def pack_get_transformations_request(value: GetTransformations) -> bytes:
             _S5.pack(len(value.at)),
             pack_numbers("q", value.at),
             pack_text(value.fixed_frame),
-            _S15.pack(value.reference_at, value.with_covariance),
+            _S19.pack(value.reference_at, value.with_covariance),
         )
     )
 
@@ -773,7 +902,7 @@ def unpack_get_transformations_request(data: bytes, at: int) -> tuple[GetTransfo
     check_count(num_instants, "num_instants", MAX_MESSAGE_INSTANTS)
     at_, at = read_numbers("q", data, at + 4, num_instants)
     fixed_frame, at = read_text(data, at)
-    reference_at, with_covariance = _S15.unpack_from(data, at)
+    reference_at, with_covariance = _S19.unpack_from(data, at)
     return GetTransformations(
         RequestHeader(header_request_id, header_reply_channel),
         tuple(
@@ -801,7 +930,7 @@ def pack_gps(value: GpsSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S16.pack(
+        _S20.pack(
             value.fix_type,
             value.satellites,
             value.hdop,
@@ -869,7 +998,7 @@ def unpack_gps(data: bytes, at: int) -> tuple[GpsSample, int]:
         course_sigma,
         baseline_yaw,
         baseline_yaw_sigma,
-    ) = _S16.unpack_from(data, at)
+    ) = _S20.unpack_from(data, at)
     return GpsSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -930,11 +1059,11 @@ def pack_health(value: Health) -> bytes:
     """Return the bytes of a health_t without the fingerprint."""
     return b"".join(
         (
-            _S17.pack(value.utime, value.uptime),
+            _S21.pack(value.utime, value.uptime),
             pack_text(value.version),
             pack_text(value.vehicle),
             pack_text(value.model_revision),
-            _S18.pack(
+            _S22.pack(
                 value.state,
                 value.invalid_reasons,
                 value.pose_epoch,
@@ -951,7 +1080,7 @@ def pack_health(value: Health) -> bytes:
             ),
             pack_text(value.invalid_text),
             pack_text(value.host),
-            _S19.pack(
+            _S23.pack(
                 value.pid,
                 value.requests_queued,
                 value.memory,
@@ -969,8 +1098,16 @@ def pack_health(value: Health) -> bytes:
                 value.localization.heading_deg,
                 value.localization.sigma_horizontal,
                 value.localization.sigma_up,
-                len(value.channels),
+                value.stability.margin,
+                value.stability.margin_sigma,
+                value.stability.dynamic_margin,
+                value.stability.dynamic_margin_sigma,
+                value.stability.limit,
+                len(value.stability.contacts),
             ),
+            *map(pack_text, value.stability.contacts),
+            pack_numbers("d", value.stability.loads, len(value.stability.contacts)),
+            _S5.pack(len(value.channels)),
             *map(pack_channel_health, value.channels),
             _S5.pack(len(value.rejected)),
             *map(pack_rejected_count, value.rejected),
@@ -983,7 +1120,7 @@ def pack_health(value: Health) -> bytes:
 
 def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
     """Return the health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, uptime = _S17.unpack_from(data, at)
+    utime, uptime = _S21.unpack_from(data, at)
     version, at = read_text(data, at + 16)
     vehicle, at = read_text(data, at)
     model_revision, at = read_text(data, at)
@@ -1001,7 +1138,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         tick_latency_p90,
         tick_latency_p99,
         tick_latency_max,
-    ) = _S18.unpack_from(data, at)
+    ) = _S22.unpack_from(data, at)
     invalid_text, at = read_text(data, at + 85)
     host, at = read_text(data, at)
     (
@@ -1022,10 +1159,19 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         localization_heading_deg,
         localization_sigma_horizontal,
         localization_sigma_up,
-        num_channels,
-    ) = _S19.unpack_from(data, at)
+        stability_margin,
+        stability_margin_sigma,
+        stability_dynamic_margin,
+        stability_dynamic_margin_sigma,
+        stability_limit,
+        stability_num_contacts,
+    ) = _S23.unpack_from(data, at)
+    check_count(stability_num_contacts, "num_contacts", MAX_CONTACTS)
+    stability_contacts, at = read_each(read_text, data, at + 151, stability_num_contacts)
+    stability_loads, at = read_numbers("d", data, at, stability_num_contacts)
+    (num_channels,) = _S5.unpack_from(data, at)
     check_count(num_channels, "num_channels")
-    channels, at = read_each(unpack_channel_health, data, at + 111, num_channels)
+    channels, at = read_each(unpack_channel_health, data, at + 4, num_channels)
     (num_rejected,) = _S5.unpack_from(data, at)
     check_count(num_rejected, "num_rejected")
     rejected, at = read_each(unpack_rejected_count, data, at + 4, num_rejected)
@@ -1073,6 +1219,15 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
             localization_sigma_horizontal,
             localization_sigma_up,
         ),
+        StabilityHealth(
+            stability_margin,
+            stability_margin_sigma,
+            stability_dynamic_margin,
+            stability_dynamic_margin_sigma,
+            stability_limit,
+            tuple([check_name(each, "contacts", MAX_FRAME_NAME) for each in stability_contacts]),
+            stability_loads,
+        ),
         channels,
         rejected,
         tuple(zip(warning_subjects, warning_texts, strict=True)),
@@ -1090,7 +1245,7 @@ def pack_imu(value: ImuSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S20.pack(
+        _S24.pack(
             *(value.angular_velocity or NAN3),
             *(value.angular_velocity_covariance or NAN9),
             *(value.specific_force or NAN3),
@@ -1153,7 +1308,7 @@ def unpack_imu(data: bytes, at: int) -> tuple[ImuSample, int]:
         orientation_covariance_7,
         orientation_covariance_8,
         temperature_celsius,
-    ) = _S20.unpack_from(data, at)
+    ) = _S24.unpack_from(data, at)
     return ImuSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -1260,7 +1415,7 @@ def unpack_joints(data: bytes, at: int) -> tuple[JointsSample, int]:
 
 def pack_localization_health(value: LocalizationHealth) -> bytes:
     """Return the bytes of a localization_health_t without the fingerprint."""
-    return _S21.pack(
+    return _S25.pack(
         -1 if value.mode is None else value.mode,
         -1 if value.phase is None else value.phase,
         value.stationary,
@@ -1293,7 +1448,7 @@ def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth
         heading_deg,
         sigma_horizontal,
         sigma_up,
-    ) = _S21.unpack_from(data, at)
+    ) = _S25.unpack_from(data, at)
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
         None if phase == -1 else read_enum(Phase, phase, "phase"),
@@ -1391,7 +1546,7 @@ def pack_model_snapshot(value: SnapshotPart) -> bytes:
     return b"%b%b%b%b" % (
         _S3.pack(value.utime),
         pack_text(value.model_revision),
-        _S22.pack(value.part, value.parts, len(value.data)),
+        _S26.pack(value.part, value.parts, len(value.data)),
         value.data,
     )
 
@@ -1400,7 +1555,7 @@ def unpack_model_snapshot(data: bytes, at: int) -> tuple[SnapshotPart, int]:
     """Return the model_snapshot_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (utime,) = _S3.unpack_from(data, at)
     model_revision, at = read_text(data, at + 8)
-    part, num_parts, size = _S22.unpack_from(data, at)
+    part, num_parts, size = _S26.unpack_from(data, at)
     check_count(size, "size")
     data_, at = read_bytes(data, at + 12, size)
     return verify_model_snapshot(
@@ -1435,7 +1590,7 @@ def pack_navigation_state(value: NavigationState) -> bytes:
     check_outgoing(len(value.names), MAX_STATES, "n")
     return b"".join(
         (
-            _S23.pack(
+            _S27.pack(
                 value.utime,
                 value.mode,
                 value.phase,
@@ -1486,7 +1641,7 @@ def unpack_navigation_state(data: bytes, at: int) -> tuple[NavigationState, int]
         angular_velocity_1,
         angular_velocity_2,
         *twist_covariance,
-    ) = _S24.unpack_from(data, at)
+    ) = _S28.unpack_from(data, at)
     (n,) = _S5.unpack_from(data, at + 435)
     check_count(n, "n", MAX_STATES)
     names, at = read_each(read_text, data, at + 439, n)
@@ -1524,7 +1679,7 @@ def pack_path_edge(value: EdgeReport) -> bytes:
         pack_text(value.name),
         pack_text(value.ends[0]),
         pack_text(value.ends[1]),
-        _S25.pack(
+        _S29.pack(
             value.forward,
             *value.pose.xyz,
             *value.pose.wxyz,
@@ -1547,7 +1702,7 @@ def unpack_path_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
     from_end, at = read_text(data, at)
     to_end, at = read_text(data, at)
     forward, vector_0, vector_1, vector_2, vector_3, vector_4, vector_5, vector_6, provenance, stamp, age = (
-        _S25.unpack_from(data, at)
+        _S29.unpack_from(data, at)
     )
     source, at = read_text(data, at + 74)
     (num_coordinates,) = _S5.unpack_from(data, at)
@@ -1585,7 +1740,7 @@ def pack_range(value: RangeSample) -> bytes:
         pack_text(value.header.source),
         pack_text(value.frame),
         pack_text(value.beacon),
-        _S26.pack(*value.beacon_position),
+        _S30.pack(*value.beacon_position),
         pack_text(value.frame_of_reference),
         _S6.pack(value.distance, value.sigma),
     )
@@ -1597,7 +1752,7 @@ def unpack_range(data: bytes, at: int) -> tuple[RangeSample, int]:
     header_source, at = read_text(data, at + 40)
     frame, at = read_text(data, at)
     beacon, at = read_text(data, at)
-    beacon_position_0, beacon_position_1, beacon_position_2 = _S26.unpack_from(data, at)
+    beacon_position_0, beacon_position_1, beacon_position_2 = _S30.unpack_from(data, at)
     frame_of_reference, at = read_text(data, at + 24)
     distance, sigma = _S6.unpack_from(data, at)
     return RangeSample(
@@ -1788,11 +1943,11 @@ def pack_signed(value: Envelope) -> bytes:
     return b"%b%b%b%b%b%b%b" % (
         pack_text(value.key_name),
         pack_text(value.sender),
-        _S27.pack(value.utime, value.counter),
+        _S31.pack(value.utime, value.counter),
         pack_text(value.channel),
         _S5.pack(len(value.payload)),
         value.payload,
-        _S28.pack(value.mac),
+        _S32.pack(value.mac),
     )
 
 
@@ -1800,12 +1955,12 @@ def unpack_signed(data: bytes, at: int) -> tuple[Envelope, int]:
     """Return the signed_t that begins at `at`, and its end. Raises WireError, struct.error."""
     key_name, at = read_text(data, at)
     sender, at = read_text(data, at)
-    utime, counter = _S27.unpack_from(data, at)
+    utime, counter = _S31.unpack_from(data, at)
     channel, at = read_text(data, at + 16)
     (size,) = _S5.unpack_from(data, at)
     check_count(size, "size", 4096)
     payload, at = read_bytes(data, at + 4, size)
-    (mac,) = _S28.unpack_from(data, at)
+    (mac,) = _S32.unpack_from(data, at)
     return Envelope(
         check_name(key_name, "key_name"),
         check_name(sender, "sender"),
@@ -1817,14 +1972,49 @@ def unpack_signed(data: bytes, at: int) -> tuple[Envelope, int]:
     ), at + 32
 
 
+def pack_stability_health(value: StabilityHealth) -> bytes:
+    """Return the bytes of a stability_health_t without the fingerprint."""
+    return b"".join(
+        (
+            _S33.pack(
+                value.margin,
+                value.margin_sigma,
+                value.dynamic_margin,
+                value.dynamic_margin_sigma,
+                value.limit,
+                len(value.contacts),
+            ),
+            *map(pack_text, value.contacts),
+            pack_numbers("d", value.loads, len(value.contacts)),
+        )
+    )
+
+
+def unpack_stability_health(data: bytes, at: int) -> tuple[StabilityHealth, int]:
+    """Return the stability_health_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    margin, margin_sigma, dynamic_margin, dynamic_margin_sigma, limit, num_contacts = _S33.unpack_from(data, at)
+    check_count(num_contacts, "num_contacts", MAX_CONTACTS)
+    contacts, at = read_each(read_text, data, at + 44, num_contacts)
+    loads, at = read_numbers("d", data, at, num_contacts)
+    return StabilityHealth(
+        margin,
+        margin_sigma,
+        dynamic_margin,
+        dynamic_margin_sigma,
+        limit,
+        tuple([check_name(each, "contacts", MAX_FRAME_NAME) for each in contacts]),
+        loads,
+    ), at
+
+
 def pack_time_query(value: TimeQuery) -> bytes:
     """Return the bytes of a time_query_t without the fingerprint."""
-    return _S9.pack(value.at, value.policy, value.wait_ms)
+    return _S13.pack(value.at, value.policy, value.wait_ms)
 
 
 def unpack_time_query(data: bytes, at: int) -> tuple[TimeQuery, int]:
     """Return the time_query_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    at_, policy, wait_ms = _S9.unpack_from(data, at)
+    at_, policy, wait_ms = _S13.unpack_from(data, at)
     return TimeQuery(
         check_utime(at_, "at"), read_enum(Policy, policy, "policy"), check_not_negative(wait_ms, "wait_ms")
     ), at + 13
@@ -1833,7 +2023,7 @@ def unpack_time_query(data: bytes, at: int) -> tuple[TimeQuery, int]:
 def pack_vehicle_command(value: VehicleCommand) -> bytes:
     """Return the bytes of a vehicle_command_t without the fingerprint."""
     return b"%b%b%b" % (
-        _S29.pack(value.utime, value.valid_for, value.seq),
+        _S34.pack(value.utime, value.valid_for, value.seq),
         pack_text(value.source),
         _S6.pack(value.forward_speed, value.steering_angle),
     )
@@ -1841,7 +2031,7 @@ def pack_vehicle_command(value: VehicleCommand) -> bytes:
 
 def unpack_vehicle_command(data: bytes, at: int) -> tuple[VehicleCommand, int]:
     """Return the vehicle_command_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, valid_for, seq = _S29.unpack_from(data, at)
+    utime, valid_for, seq = _S34.unpack_from(data, at)
     source, at = read_text(data, at + 24)
     forward_speed, steering_angle = _S6.unpack_from(data, at)
     return VehicleCommand(
@@ -1865,7 +2055,7 @@ def pack_vehicle_status(value: VehicleStatusSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S30.pack(
+        _S35.pack(
             value.mode,
             value.forward_speed,
             value.steering_angle,
@@ -1881,7 +2071,7 @@ def unpack_vehicle_status(data: bytes, at: int) -> tuple[VehicleStatusSample, in
     """Return the vehicle_status_t that begins at `at`, and its end. Raises WireError, struct.error."""
     header_utime, header_utime_sigma, header_host_utime, header_device_utime, header_seq = _S0.unpack_from(data, at)
     header_source, at = read_text(data, at + 40)
-    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S30.unpack_from(
+    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S35.unpack_from(
         data, at
     )
     return VehicleStatusSample(
@@ -1990,6 +2180,20 @@ CODECS = (
         GetBodyList,
         pack_get_body_list_request,
         unpack_get_body_list_request,
+    ),
+    Codec(
+        "get_dynamics_reply_t",
+        FINGERPRINTS["get_dynamics_reply_t"],
+        DynamicsReply,
+        pack_get_dynamics_reply,
+        unpack_get_dynamics_reply,
+    ),
+    Codec(
+        "get_dynamics_request_t",
+        FINGERPRINTS["get_dynamics_request_t"],
+        GetDynamics,
+        pack_get_dynamics_request,
+        unpack_get_dynamics_request,
     ),
     Codec(
         "get_explanation_reply_t",

@@ -276,6 +276,28 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         fine,
         st.builds(messages.Explanation, answers(), st.lists(edges, max_size=3).map(tuple)),
     ),
+    "get_dynamics_request_t": st.builds(
+        messages.GetDynamics, request_headers, frames, st.booleans(), st.booleans(), times
+    ),
+    "get_dynamics_reply_t": failed.map(messages.DynamicsReply)
+    | st.builds(
+        messages.DynamicsReply,
+        fine,
+        st.integers(0, 5).flatmap(
+            lambda n: st.builds(
+                messages.DynamicsAnswer,
+                utimes,
+                st.just(messages.Invalid.STALE_JOINT),
+                frames,
+                numbers,
+                places,
+                st.tuples(*[numbers] * 36),
+                st.tuples(*[frames] * n),
+                *[st.tuples(*[numbers] * n)] * 4,
+                numbers.map(lambda number: (number,) * (n * n)),
+            )
+        ),
+    ),
     "reload_model_request_t": st.builds(messages.ReloadModel, request_headers, st.booleans()),
     "reload_model_reply_t": st.builds(
         messages.ReloadReply, fine | failed, texts, st.lists(texts, max_size=3).map(tuple)
@@ -330,6 +352,14 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
             st.none() | st.sampled_from(messages.Phase),
             st.booleans(),
             *[numbers] * 4,
+        ),
+        st.lists(st.tuples(frames, numbers), max_size=4).flatmap(
+            lambda rows: st.builds(
+                messages.StabilityHealth,
+                *[numbers] * 5,
+                st.just(tuple(name for name, _ in rows)),
+                st.just(tuple(load for _, load in rows)),
+            )
         ),
         st.lists(
             st.builds(messages.ChannelHealth, texts, count64, numbers, numbers, numbers, st.booleans()), max_size=3

@@ -46,7 +46,7 @@ REASONS = (
 MOST_NOT_RUN = 16
 
 TUTORIAL = DOCS / "tutorial.md"
-IN_SOURCE = [ROOT / "README.md", DOCS / "quick-start.md", DOCS / "own-device.md"]
+IN_SOURCE = [ROOT / "README.md", DOCS / "quick-start.md", DOCS / "own-device.md", DOCS / "dynamics.md"]
 """Pages whose commands run in the source folder."""
 ON_THE_ROVER = [DOCS / "clients.md", DOCS / "monitoring.md"]
 """Guides whose commands need the rover of the tutorial, driving."""

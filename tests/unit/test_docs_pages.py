@@ -29,8 +29,8 @@ from mstools.cli import COMMANDS
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-WORDS_AT_MOST = 29_500
-"""Over all hand-written pages and README, as `wc -w` counts; they were 52,000, and 28,000 without the viewer."""
+WORDS_AT_MOST = 30_600
+"""Over all hand-written pages and README, as `wc -w` counts; they were 52,000, and 29,300 without dynamics."""
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VALUES = {"errors", "version", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "estimation.history"}
-CORE = GEOMETRY | POSES | {"joints", "estimation", "query"}
+CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
 FILES = {"files.kinds", "files.regular"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
 SIGNING = {"signing.signatures", "signing.key_files"}
@@ -30,7 +30,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "signing": set(),
     "errors": set(),
     "transforms": {"errors"},
-    "geometry": VALUES,
+    "geometry": VALUES | {"plugins"},
+    "dynamics": GEOMETRY,
     "messages": VALUES | {"earth"},
     "signing.signatures": VALUES | {"messages"},
     "signing.key_files": VALUES | {"messages", "signing.signatures", "files.regular"},
@@ -46,8 +47,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
     "core": CORE,
-    "simulation": GEOMETRY | {"messages", "earth"},
-    "config.vehicle_file": GEOMETRY | FILES | {"messages", "estimation", "config.reader"},
+    "simulation": GEOMETRY | {"messages", "dynamics", "earth"},
+    "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
     "config.reader": {"errors"},
     "wire": WIRE,
     "server": SERVER,
@@ -69,6 +70,7 @@ PURE = {
     "files.kinds",
     "transforms",
     "geometry",
+    "dynamics",
     "earth",
     "estimation",
     "messages",

@@ -28,6 +28,7 @@ COMMANDS = {
     "check": "Report every problem of a geometry or vehicle file.",
     "convert": "Convert a geometry file to another format, or Miro's process configuration to a vehicle file.",
     "query": "Where is one frame in another?",
+    "dynamics": "Mass, center of mass, equations of motion, tip-over margin and wheel loads.",
     "bodies": "List the bodies.",
     "frames": "List the frames of a body.",
     "tree": "Draw the kinematic tree: constraints, joints, loops, orphans.",
@@ -74,6 +75,7 @@ _ALIASES = {
     "install": "setup",
     "uninstall": "remove",
     "query": "explain motion",
+    "dynamics": "mass inertia stability tip payload",
     "view": "viewer gui show3d rviz",
 }
 

@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ COMPARED_FACTS: Final = {
     "numpy": "numpy",
     "filterpy": "filterpy",
     "pyproj": "pyproj",
+    "pinocchio": "Pinocchio",
     "libc": "C library",
     "machine": "machine type",
     "processor": "processor",
@@ -41,6 +42,7 @@ def collect_facts() -> Mapping[str, str]:
         # read from the metadata, without importing them
         "filterpy": version("filterpy"),
         "pyproj": version("pyproj"),
+        "pinocchio": _read_version("pin"),
         "libc": " ".join(platform.libc_ver()),
         "machine": platform.machine(),
         "processor": _read_processor(),
@@ -60,6 +62,14 @@ def list_differences(then: Mapping[str, Any]) -> list[str]:
     if not (then.get("processor") and now["processor"]):
         changed = [key for key in changed if key != "processor"]
     return [f"{COMPARED_FACTS[key]} was {then.get(key)}, is {now[key]}" for key in changed]
+
+
+def _read_version(name: str) -> str:
+    """Return the version of an installed package; empty for none."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
 
 
 def _hash_source() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from modelserver.messages import GetHistory, GetTransformations, Request
+from modelserver.messages import GetDynamics, GetHistory, GetTransformations, Request
 from modelserver.query import HISTORY_LIMIT
 from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer
 from modelserver.query.steps import Steps, complete
@@ -19,7 +19,9 @@ MESSAGE_BYTES: Final = 300
 POSE_BYTES: Final = 74
 COVARIANCE_BYTES: Final = 288
 HISTORY_POSE_BYTES: Final = 500
-"""Bytes of a message without poses, of a pose, of its covariance, and of a pose in a history."""
+DYNAMICS_BYTES: Final = 90_000
+"""Bytes of a message without poses, of a pose, of its covariance, of a pose in a history, and of equations of motion
+with as many coordinates as there may be."""
 
 
 def estimate_reply_bytes(request: Request) -> int:
@@ -32,6 +34,8 @@ def estimate_reply_bytes(request: Request) -> int:
     if isinstance(request, GetHistory):
         poses = (request.end_utime - request.start_utime) * 1e-6 * request.rate_hz + 1.0
         return MESSAGE_BYTES + round(HISTORY_POSE_BYTES * poses) if 0.0 < poses <= HISTORY_LIMIT else MESSAGE_BYTES
+    if isinstance(request, GetDynamics):
+        return DYNAMICS_BYTES if request.with_equations else 2 * MESSAGE_BYTES
     return MESSAGE_BYTES
 
 

@@ -8,6 +8,7 @@ from support_formats import YAML, line_of, only_problem, problems_of, read
 
 from modelserver.errors import Severity
 from modelserver.geometry import Sigma
+from modelserver.geometry.inertia import RigidInertia
 from modelserver.transforms import Pose
 
 MAST = "Mast: {xyz: [0.2, 0, 1.1], rpy_deg: [0, -10, 0]}"
@@ -86,6 +87,14 @@ def test_name_description_transform_and_inertia_are_read():
     assert camera.description == "it sees"
     assert camera.pose.xyz == (1.0, 2.0, 3.0)
     assert np.array(camera.inertia).tolist() == rows
+
+
+def test_inertia_of_mass_center_and_moments_is_that_of_the_rigid_body():
+    stated = "{mass: 2, center: [0, 0, 0.5], moments: [1, 2, 2.5], products: [0.1, 0, -0.2]}"
+    camera = read(YAML.replace("  Camera:\n", f"  Camera:\n    inertia: {stated}\n")).body("Camera")
+    assert (camera.mass, camera.center_of_mass) == (2.0, (0.0, 0.0, 0.5))
+    expected = RigidInertia(2.0, (0.0, 0.0, 0.5), ((1.0, 0.1, 0.0), (0.1, 2.0, -0.2), (0.0, -0.2, 2.5)))
+    assert camera.inertia == expected.matrix()
 
 
 # sigmas
@@ -264,6 +273,24 @@ def test_a_bad_frame_is_named_with_its_line_place_and_remedy(text, message, fix)
             "  Camera:\n    inertia: [[1]]\n    frames",
             "inertia has 1 rows, not 6",
             "6 rows of 6",
+        ),
+        (
+            "  Camera:\n    frames",
+            "  Camera:\n    inertia: {mass: 1}\n    frames",
+            "moments missing",
+            "write inertia: {mass: kg",
+        ),
+        (
+            "  Camera:\n    frames",
+            "  Camera:\n    inertia: {mass: 1, moments: [1, 1, 3]}\n    frames",
+            "none can be greater than the sum",
+            "mass in kg",
+        ),
+        (
+            "  Camera:\n    frames",
+            "  Camera:\n    inertia: {mass: -1, moments: [1, 1, 1]}\n    frames",
+            "the mass is -1 kg",
+            "mass in kg",
         ),
         ("  Camera:\n    frames", "  Cart:\n    frames", "body 'Cart' is defined twice (first at file:3", "rename one"),
         (

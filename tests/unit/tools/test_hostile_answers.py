@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,14 +15,18 @@ from support_lcm import reserved_url
 from modelserver.errors import Status
 from modelserver.messages import (
     CHANNEL_OF,
+    DynamicsAnswer,
+    DynamicsReply,
     EdgeReport,
     Explanation,
     ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
+    GetDynamics,
     GetExplanation,
     GetMotion,
     GetTransformation,
+    Invalid,
     MotionAnswer,
     MotionReply,
     NameListReply,
@@ -46,6 +51,23 @@ GOOD: dict[type, Any] = {
     GetTransformation: lambda header: TransformReply(header, ANSWER),
     GetExplanation: lambda header: ExplanationReply(header, Explanation(ANSWER, (EDGE, EDGE))),
     GetMotion: lambda header: MotionReply(header, MotionAnswer(ANSWER, EVIL, THREE, THREE, THREE, THREE)),
+    GetDynamics: lambda header: DynamicsReply(
+        header,
+        DynamicsAnswer(
+            0,
+            Invalid(0),
+            EVIL,
+            math.inf,
+            THREE,
+            (math.nan,) * 36,
+            (EVIL,),
+            (math.inf,),
+            (0.0,),
+            (math.nan,),
+            (0.0,),
+            (0.0,),
+        ),
+    ),
     ReloadModel: lambda header: ReloadReply(header, EVIL, (EVIL, EVIL)),
 }
 
@@ -87,6 +109,7 @@ def false_daemon(status: Status) -> Iterator[str]:
 @pytest.mark.parametrize("arguments", [
     ["bodies"], ["frames", "A"], ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],
     ["query", "A:A", "B:B", "--motion"], ["reload"], ["tree", "--live"],
+    ["dynamics", "--equations"], ["dynamics", "--json"],
     ["bodies", "--json"], ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
 ])  # fmt: skip
 def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(

@@ -8,7 +8,16 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from modelserver.core import DEGRADED, RUNNING, STARTING
-from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health, Invalid, LocalizationHealth, Phase
+from modelserver.messages import (
+    ChannelHealth,
+    DriverHealth,
+    DriverPhase,
+    Health,
+    Invalid,
+    LocalizationHealth,
+    Phase,
+    StabilityHealth,
+)
 from mstools.terminal.output import escape, format_count, format_table, to_json
 
 STATE_NAMES: Final = {STARTING: "STARTING", RUNNING: "RUNNING", DEGRADED: "DEGRADED"}
@@ -79,6 +88,8 @@ def format_body(health: Health) -> str:
     cpu = "CPU load unknown" if math.isnan(health.cpu_share) else f"{health.cpu_share:.0%} of a CPU"
     memory = f"{health.memory / 1e6:.0f} MB" if health.memory else "memory unknown"
     waiting = f"{health.requests_waiting} waiting for data, {health.requests_queued} queued"
+    if not math.isnan(health.stability.margin):
+        rows.append(("stability", _format_stability(health.stability)))
     rows += [
         ("geometry", f"revision {health.model_revision}"),
         ("loop", f"{ticks}; {missed} missed, {errors}"),
@@ -102,6 +113,22 @@ def _format_place(localization: LocalizationHealth) -> list[tuple[str, str]]:
         if sigma > limit:
             lines.append(("", f"WARNING: the {name} is uncertain, sigma {sigma:.1f} m"))
     return lines
+
+
+def _format_stability(stability: StabilityHealth) -> str:
+    """Format the tip-over margins and the loads."""
+    margins = [
+        f"{name} {math.degrees(margin):.1f} deg" + ("" if math.isnan(sigma) else f" +- {math.degrees(sigma):.1f}")
+        for name, margin, sigma in (
+            ("static", stability.margin, stability.margin_sigma),
+            ("dynamic", stability.dynamic_margin, stability.dynamic_margin_sigma),
+        )
+        if not math.isnan(margin)
+    ]
+    loads = ", ".join(
+        f"{name.partition(':')[2]} {load:.0f} N" for name, load in zip(stability.contacts, stability.loads, strict=True)
+    )
+    return f"tip-over margin {', '.join(margins)}; {loads}"
 
 
 def _format_bounds(localization: LocalizationHealth) -> str:

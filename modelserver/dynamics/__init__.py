@@ -1,0 +1,19 @@
+"""Dynamics of a model: mass matrix, bias vector, forward dynamics, center of mass, stability (report eq. 7-10). Pure.
+
+Pinocchio, of the extra `dynamics`, does the algebra; it is imported when a `Dynamics` is made.
+"""
+
+from modelserver.dynamics.mass_covariance import MassUncertainty
+from modelserver.dynamics.multibody import STANDARD_GRAVITY, CenterOfMass, Dynamics
+from modelserver.dynamics.stability import Stability, TipOver, assess_stability, compute_tip_over
+
+__all__ = [
+    "STANDARD_GRAVITY",
+    "CenterOfMass",
+    "Dynamics",
+    "MassUncertainty",
+    "Stability",
+    "TipOver",
+    "assess_stability",
+    "compute_tip_over",
+]

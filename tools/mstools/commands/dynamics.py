@@ -1,0 +1,263 @@
+"""`modelserver dynamics`: mass, center of mass, inertia, equations of motion, tip-over margin and wheel loads."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from modelserver.errors import quote
+from mstools.commands.pose_source import load_given_model
+from mstools.terminal.options import (
+    JsonOption,
+    ModelOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    Variables,
+    argument,
+    option,
+    parse_variables,
+)
+from mstools.terminal.output import escape, to_json
+
+if TYPE_CHECKING:
+    from modelserver.dynamics import CenterOfMass, Dynamics, Stability
+    from modelserver.geometry.model import Model
+
+
+def command(
+    frame: Annotated[str, argument("FRAME", "Frame of center of mass and inertia. Default: the base frame.")] = "",
+    model: ModelOption = None,
+    config: Annotated[
+        Path | None, option("--config -c FILE", "Use geometry, base frame and contacts of this vehicle file.")
+    ] = None,
+    settings: Variables = None,
+    joints: Annotated[
+        list[str] | None, option("--joint NAME=VALUE", "Position of a coordinate, rad or m. May be repeated.")
+    ] = None,
+    payload: Annotated[
+        list[str] | None, option("--payload FRAME=KG", "Point mass at a frame. May be repeated.")
+    ] = None,
+    masses: Annotated[list[str] | None, option("--mass BODY=KG", "Another mass of a body. May be repeated.")] = None,
+    contacts: Annotated[
+        list[str] | None,
+        option("--contact FRAME", "Contact with the ground, or a pattern like Cart:*Wheel. May be repeated."),
+    ] = None,
+    tilt: Annotated[
+        tuple[float, float], typer.Option("--tilt-deg", metavar="ROLL PITCH", help="Attitude of the root frame.")
+    ] = (0.0, 0.0),
+    acceleration: Annotated[
+        tuple[float, float, float],
+        typer.Option("--acceleration", metavar="X Y Z", help="Acceleration of the root frame in the world, m/s2."),
+    ] = (0.0, 0.0, 0.0),
+    floating: Annotated[bool, option("--floating", "Six coordinates for the base, too.")] = False,
+    equations: Annotated[bool, option("--equations", "Print coordinates, gravity and mass matrix.")] = False,
+    npy: Annotated[Path | None, option("--npy FILE", "Write the mass matrix to this file.")] = None,
+    allow_massless: Annotated[bool, option("--allow-massless", "Count bodies without inertia as massless.")] = False,
+    cut_loops: Annotated[bool, option("--cut-loops", "Leave constraints that close loops out.")] = False,
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
+    timeout: TimeoutOption = 1.0,
+) -> None:
+    """Print mass, center of mass, inertia, equations of motion and tip-over margin of a vehicle.
+
+    Queries the running daemon for the vehicle as it is now, or computes with --model or --config. There a payload,
+    another mass or other positions of joints may be given: margin and loads are printed beside those without.
+
+    \\b
+    Example:
+      modelserver dynamics --model config/raptor/geometry.yaml --joint FLEALateral=0.5 --equations
+    """
+    if model is None and config is None:
+        for name, given in (("--joint", joints), ("--payload", payload), ("--mass", masses), ("--contact", contacts)):
+            if given:
+                raise typer.BadParameter("needs --model or --config; the daemon has its own", param_hint=name)
+        from modelserver.client.remote import Platform
+
+        with Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver") as platform:
+            found = platform.get_dynamics(frame, equations=equations or npy is not None, floating=floating)
+        D = np.array(found.mass_matrix).reshape((len(found.coordinates),) * 2)
+        covariance = None if found.center_covariance is None else np.array(found.center_covariance).reshape(3, 3)
+        inertia = np.array(found.inertia).reshape(6, 6)
+        data = _describe_mass(found.mass, found.frame, np.array(found.center), covariance, inertia)
+        data["utime"], data["invalid_reasons"] = found.utime, found.invalid_reasons.explain()
+        if equations:
+            data |= _describe_equations(found.coordinates, found.position, found.gravity, D) | {"bias": found.bias}
+    else:
+        data, D = _compute(
+            model, config, settings, frame, joints, payload, masses, contacts, tilt, acceleration,
+            floating, equations, allow_massless, cut_loops,
+        )  # fmt: skip
+    if npy is not None:
+        np.save(npy, D)
+    typer.echo(json.dumps(to_json(data), indent=2) if as_json else format_dynamics(data))
+
+
+def _compute(
+    model: Path | None,
+    config: Path | None,
+    settings: list[str] | None,
+    frame: str,
+    joints: Sequence[str] | None,
+    payload: Sequence[str] | None,
+    masses: Sequence[str] | None,
+    contacts: Sequence[str] | None,
+    tilt: tuple[float, float],
+    acceleration: tuple[float, float, float],
+    floating: bool,
+    equations: bool,
+    allow_massless: bool,
+    cut_loops: bool,
+) -> tuple[dict[str, Any], Any]:
+    """Return what the files state, and the mass matrix."""
+    from modelserver.dynamics import MassUncertainty, assess_stability
+    from modelserver.dynamics.settings import DynamicsSettings
+    from modelserver.transforms import so3
+
+    root, known, variables = "", DynamicsSettings(), parse_variables(settings)
+    if config is not None:
+        from modelserver.config.vehicle_file import load_config
+
+        vehicle = load_config(config)
+        root, known = vehicle.base_frame, vehicle.dynamics or known
+        model, variables = model or Path(vehicle.geometry), vehicle.variables | variables
+    assert model is not None
+    geometry = load_given_model(model, variables)
+    options: dict[str, Any] = {
+        "allow_massless": allow_massless or known.allow_massless,
+        "cut_loops": cut_loops or known.cut_loops,
+        "uncertainty": MassUncertainty(known.mass_sigma, known.center_sigma, unstated_is_exact=True),
+    }
+    changes = {"masses": _parse_numbers(masses, "--mass"), "payload": _parse_numbers(payload, "--payload")}
+    dynamics: Dynamics = geometry.dynamics("floating", root, **options, **changes)
+    root = dynamics.tree.root
+    attitude = so3.logarithm(so3.from_rpy(math.radians(tilt[0]), math.radians(tilt[1]), 0.0))
+    base = {f"{root}.{name}": value for name, value in zip(("rx", "ry", "rz"), attitude, strict=True)}
+    moved = _parse_numbers(joints, "--joint")
+    a = (
+        {f"{root}.{name}": value for name, value in zip("xyz", acceleration, strict=True)}
+        if any(acceleration)
+        else None
+    )
+    sigma = {
+        name: value
+        for each in geometry.joints.values()
+        if each.joint.mimic is None and each.name in {joint.name for joint in dynamics.tree.joints}
+        # one without a sigma makes that of what it moves unknown
+        for name, value in zip(
+            geometry.drives[each.name].names, each.joint.sigma or (math.nan,) * each.joint.count, strict=True
+        )
+    }
+    q = base | moved
+    center: CenterOfMass = dynamics.center_of_mass(q, frame=frame or root, sigma=sigma)
+    inertia = dynamics.inertia(q, frame or root)
+    data = _describe_mass(center.mass, frame or root, center.position, center.covariance, inertia)
+    data |= {"massless": list(dynamics.massless), "cut": list(dynamics.cut)}
+    names = _match_frames(geometry, contacts) if contacts else list(known.contacts)
+    if names:
+        v = None if a is None else dict[str, float]()
+        found = assess_stability(dynamics, q, names, v, a, sigma=sigma)
+        data["stability"] = _describe_stability(found)
+        if moved or any(changes.values()):
+            plain: Dynamics = geometry.dynamics("floating", root, **options)
+            data["without changes"] = _describe_stability(assess_stability(plain, base, names, v, a, sigma=sigma))
+    # with the base held, the rows and columns of the joints are left
+    shown = slice(0 if floating else 6, None)
+    D = dynamics.mass_matrix(q)[shown, shown]
+    if equations:
+        at = [q.get(name, value) for name, value in dynamics.by_name(dynamics.default_position).items()]
+        gravity = dynamics.gravity(q).tolist()
+        data |= _describe_equations(dynamics.coordinates[shown], at[shown], gravity[shown], D)
+    return data, D
+
+
+def _match_frames(model: Model, patterns: Sequence[str]) -> list[str]:
+    """Return the frames that the patterns name; one without a wildcard is a name, known or not."""
+    frames = [frame.full_name for body in model.bodies for frame in body]
+    found = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in patterns)
+    return list(dict.fromkeys(chain.from_iterable(found)))
+
+
+def _parse_numbers(given: Sequence[str] | None, hint: str) -> dict[str, float]:
+    """Return the numbers of NAME=NUMBER by name. Raises typer.BadParameter."""
+    found = {}
+    for text in given or ():
+        name, _, value = text.rpartition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise typer.BadParameter(f"{quote(text)} is not NAME=NUMBER", param_hint=hint)
+    return found
+
+
+def _describe_mass(mass: float, frame: str, center: Any, covariance: Any, inertia: Any) -> dict[str, Any]:
+    sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    return {"mass": mass, "frame": frame, "center": center.tolist(), "center_sigma": sigma, "inertia": inertia.tolist()}
+
+
+def _describe_equations(
+    coordinates: Sequence[str], position: Sequence[float], gravity: Sequence[float], D: Any
+) -> dict[str, Any]:
+    return {
+        "coordinates": list(coordinates),
+        "position": list(position),
+        "gravity": list(gravity),
+        "mass_matrix": D.tolist(),
+    }
+
+
+def _describe_stability(found: Stability) -> dict[str, Any]:
+    """Return the weaker one of the two margins, as data."""
+    margin = found.dynamic or found.static
+    return {
+        "margin_deg": math.degrees(margin.margin),
+        "sigma_deg": math.degrees(margin.sigma),
+        "measure": margin.measure,
+        "edge": list(margin.edge),
+        "loads": dict(margin.loads),
+    }
+
+
+def format_dynamics(data: Mapping[str, Any]) -> str:
+    """Format the data of a vehicle's dynamics as text."""
+    x, y, z = data["center"]
+    lines = [
+        f"mass            {data['mass']:.3f} kg",
+        f"center of mass  {x + 0.0:.4f}  {y + 0.0:.4f}  {z + 0.0:.4f}  m in {escape(data['frame'])}",
+    ]
+    if data["center_sigma"] is not None:
+        lines.append("sigma           " + "  ".join(f"{value:.4f}" for value in data["center_sigma"]) + "  m")
+    moments = "  ".join(f"{value:.4g}" for value in np.diag(data["inertia"])[3:])
+    lines.append(f"moments there   {moments}  kg m2 about x, y, z")
+    for key, what in (("massless", "massless"), ("cut", "cut loops")):
+        if data.get(key):
+            lines.append(f"{what:<15} {escape(', '.join(data[key]))}")
+    for key, what in (("stability", "tip-over margin"), ("without changes", "without changes")):
+        if key in data:
+            each = data[key]
+            sigma = "" if math.isnan(each["sigma_deg"]) else f" +- {each['sigma_deg']:.2f}"
+            edge = escape(" - ".join(each["edge"]))
+            tips = "  TIPS" if each["margin_deg"] < 0.0 else ""
+            lines.append(f"{what} {each['margin_deg']:.2f}{sigma} deg about {edge}, {each['measure']:.0f} N rad{tips}")
+            lines += [f"  {load:8.0f} N  {escape(name)}" for name, load in each["loads"].items()]
+    if "coordinates" in data:
+        lines.append("coordinates (position, gravity vector, row of the mass matrix)")
+        for name, position, gravity, row in zip(
+            data["coordinates"], data["position"], data["gravity"], data["mass_matrix"], strict=True
+        ):
+            numbers = " ".join(f"{value + 0.0:9.4g}" for value in row)
+            lines.append(f"  {escape(name)}  {position:.4g}  {gravity + 0.0:.4g}  | {numbers}")
+    if data.get("invalid_reasons"):
+        lines.append(f"NOT VALID       {data['invalid_reasons']}")
+    return "\n".join(lines)
