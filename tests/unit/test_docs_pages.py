@@ -29,7 +29,7 @@ from mstools.cli import COMMANDS
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-WORDS_AT_MOST = 30_600
+WORDS_AT_MOST = 30_800
 """Over all hand-written pages and README, as `wc -w` counts; they were 52,000, and 29,300 without dynamics."""
 
 

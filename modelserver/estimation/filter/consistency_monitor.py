@@ -144,6 +144,9 @@ OWN_TURNS: Final = 3.0
 STEADY_SIGMA: Final = 0.03
 """Largest standard deviation of the drift of fixes, m/s, that are trusted again wherever they are."""
 
+EXCLUDING_SIGMAS: Final = 3.0
+"""Standard deviations by which the drift of fixes that are trusted again is less than the one that was found."""
+
 LARGEST_REST: Final = 2.0
 """Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes."""
 
@@ -303,6 +306,7 @@ class ConsistencyMonitor(NamedTuple):
     moved_since: since when no window has exceeded it.
     cause: of an inconsistency that lasts, since `since`; None: fixes and path agree.
     suspect: the last node before it, while fixes are not trusted; `is_jump`: whether they have jumped then.
+    drift_rate: at which they drifted away from the path until then, m/s; 0 for a jump.
     largest: discrepancy of the fixes since then, m.
     agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
     horizontal_allowance, heading_allowance: what is unexplained, m and rad.
@@ -332,6 +336,7 @@ class ConsistencyMonitor(NamedTuple):
     since: int = 0
     suspect: PathNode | None = None
     is_jump: bool = False
+    drift_rate: float = 0.0
     largest: float = 0.0
     agreed_since: int = 0
     horizontal_allowance: float = 0.0
@@ -363,12 +368,14 @@ class ConsistencyMonitor(NamedTuple):
                 path = path._replace(lever_arm=self.lever_arm + found.lever_arm)
             return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
         suspect = found.discrepancy.node
+        drifts = found.cause is Cause.GNSS and not found.is_jump
         return self._replace(
             num_exceeded=0,
             cause=found.cause,
             since=utime,
             suspect=suspect,
             is_jump=found.is_jump,
+            drift_rate=abs(found.discrepancy.error) / ((utime - suspect.utime) * 1e-6) if drifts else 0.0,
             largest=0.0,
             agreed_since=0,
         )
@@ -838,6 +845,11 @@ class DriftFit(NamedTuple):
     def is_steady(self) -> bool:
         """Whether fixes are known to have moved as the path, whatever its heading."""
         return self.drift_sigma <= STEADY_SIGMA * self.seconds and self.drift <= self.largest
+
+    def excludes(self, rate: float) -> bool:
+        """Return whether fixes are known not to drift at a rate any more, m/s; 0 needs no proof."""
+        sigma = math.hypot(self.tolerance, self.drift_sigma)
+        return not rate or rate * self.seconds - self.drift > EXCLUDING_SIGMAS * sigma
 
 
 def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, settings: FilterSettings) -> DriftFit:

@@ -180,7 +180,9 @@ def _realign(
     """Return the state in a new epoch with the heading that fixes and path show; None if they do not show it."""
     nav, held = state.nav, _hold(setup, state)
     fit = fit_drift(alike, state.consistency.rotation, noise, setup.settings)
-    if not fit.is_steady or fit.turn_sigma > setup.settings.align_sigma:
+    if not (fit.is_steady and fit.excludes(state.consistency.drift_rate)):
+        return None
+    if fit.turn_sigma > setup.settings.align_sigma:
         return None
     sigma = math.sqrt(float(nav.covariance[8, 8]))
     if abs(fit.turn) > 2.0 * math.hypot(sigma, fit.turn_sigma):

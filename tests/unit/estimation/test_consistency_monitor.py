@@ -15,6 +15,7 @@ from modelserver.estimation.filter.consistency_monitor import (
     LONGEST_US,
     Cause,
     ConsistencyMonitor,
+    DriftFit,
     Inconsistency,
     PathNode,
     PathNoise,
@@ -247,6 +248,29 @@ def test_given_a_first_path_then_its_heading_is_confirmed_by_the_next_meters() -
     driven = list(drive(60.0, Fault(), start=first))
     assert driven[1].monitor.heading_allowance > 0.9 * first.heading_allowance
     assert driven[-1].monitor.heading_allowance < 0.1
+
+
+@pytest.mark.parametrize("drift", [0.3, 0.5j])
+def test_given_fixes_that_drifted_then_they_are_trusted_where_they_are_only_if_that_drift_is_excluded(
+    drift: complex,
+) -> None:
+    found = find(Fault(200.0, drift=drift))
+    assert found.found is not None
+    rate = found.monitor.resolve(found.found, found.node.utime).drift_rate
+    assert 0.5 * abs(drift) < rate < 2.0 * abs(drift)
+    fit = DriftFit(turn=0.0, turn_sigma=0.01, drift=0.0, drift_sigma=0.01 * 120.0, tolerance=1.0, seconds=120.0)
+    assert fit.excludes(rate)
+    # the same again, or what cannot be separated from it
+    assert not fit._replace(drift=120.0 * rate).excludes(rate)
+    assert not fit._replace(drift_sigma=60.0 * rate).excludes(rate)
+
+
+def test_given_fixes_that_jumped_then_no_drift_has_to_be_excluded() -> None:
+    found = find(Fault(200.0, jump=20.0))
+    assert found.found is not None
+    monitor = found.monitor.resolve(found.found, found.node.utime)
+    assert monitor.is_jump
+    assert monitor.drift_rate == 0.0
 
 
 def test_given_a_gyro_that_has_changed_at_rest_then_fixes_that_contradicted_its_path_are_not_suspect() -> None:
