@@ -16,6 +16,9 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 
 
+_IDENTITY = np.eye(6)
+
+
 def compose(X_AB: Pose, cov_AB: Array, X_BC: Pose, cov_BC: Array) -> Array:
     """Return the covariance (6, 6) of `X_AB @ X_BC`, for independent errors."""
     R = np.array(so3.matrix_rows(X_AB.wxyz))
@@ -47,7 +50,7 @@ def apply_lever_arm(cov: Array, r: Array) -> Array:
     `cov` is that of the pose at the start of the lever arm; both and `r` are along the same axes.
     """
     M, more = large_angle_lever_arm(cov[3:, 3:], r)
-    J = np.eye(6)
+    J = _IDENTITY.copy()
     J[:3, 3:] = -so3.skew(r) @ M
     found = J @ cov @ J.T
     found[:3, :3] += more

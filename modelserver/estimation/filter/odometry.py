@@ -70,7 +70,7 @@ class Odometry(NamedTuple):
         """Return the pose at an instant nearby, extrapolated by the twist within MAX_EXTRAPOLATION."""
         dt = max(-MAX_EXTRAPOLATION, min((utime - self.utime) * 1e-6, MAX_EXTRAPOLATION))
         position, attitude = _integrate(self, self.velocity, self.rate, dt)
-        return Pose(position, attitude)
+        return Pose.of_floats(position, attitude)
 
     def covariance(self) -> tuple[float, ...]:
         """Return the 36 numbers of the covariance of the pose in Odom."""

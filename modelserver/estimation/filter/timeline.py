@@ -93,11 +93,12 @@ class Timeline(NamedTuple):
         # one or two at a time, and never the last one
         cut, settled = 0, NOTHING
         while entries[cut].item.utime < oldest:
-            _, base, decisions = entries[cut]
-            settled += decisions
+            settled += entries[cut].decisions
             cut += 1
         if cut:
-            entries = entries[cut:]
+            before = entries[cut - 1].state
+            assert before is not None
+            base, entries = before, entries[cut:]
         return _new_tuple(Timeline, (base, entries, len(entries))), state, settled
 
     def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
