@@ -15,7 +15,6 @@ from modelserver.transforms.large_angle import large_angle_lever_arm
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 
-
 _IDENTITY = np.eye(6)
 
 

@@ -176,6 +176,9 @@ class Cause(Enum):
 MARGIN: Final = MappingProxyType({Cause.GYRO: 8.0, Cause.WHEELS: 8.0, Cause.LATENCY: 5.0, Cause.LEVER_ARM: 5.0})
 """Evidence by which an error must exceed any other cause to be corrected."""
 
+LARGEST_MARGIN: Final = max(MARGIN.values()) + 1e-6
+"""The largest of them, and what rounding may change of one."""
+
 TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
 """Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
 
@@ -630,7 +633,9 @@ class ConsistencyMonitor(NamedTuple):
             turn = start.heading_variance + start.rate_variance * (node.seconds - start.seconds) ** 2
             if turn > LARGEST_TURN_SIGMA**2:
                 continue
-            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings):
+            # a window that could explain no more than this changes neither the best cause nor its margin
+            least = max(each.explained for each in explained.values()) - LARGEST_MARGIN
+            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings, least):
                 if each.cause not in explained or each.explained > explained[each.cause].explained:
                     explained[each.cause] = each
         best = max(explained.values(), key=lambda each: each.explained)
@@ -664,13 +669,14 @@ def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:
 
 
 def _explain(
-    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
+    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings, least: float = -math.inf
 ) -> list[Inconsistency]:
-    """Return each cause of the discrepancies since a node, with the squares that it explains."""
+    """Return each cause of the discrepancies since a node, with the squares that it explains.
+
+    Nothing where none could explain more than `least`: parameters do not lower the determinant of the information, so
+    a cause explains no more than the squares that remain without one.
+    """
     replayed = replay_path(start, window)
-    end = replayed[-1]
-    last = window[-1]._replace(path=end.path, moment=end.moment, rotation=end.rotation, latency=start.latency)
-    newest = compare_window(start, last, noise, settings)
     # error, displacement and moment of each node as `compare_window` has them; it would compute much more
     turned = cmath.rect(1.0, start.rotation)
     displacements = [turned * (each.path - start.path) for each in replayed]
@@ -693,7 +699,12 @@ def _explain(
         (1j * moments, math.sqrt(start.rate_variance)),
     )
     fit = _WindowFit(whiten, errors, usual)
-    ((_, _, none),) = fit.solve(((),))
+    ((_, squares, none),) = fit.solve(((),))
+    if squares < least:
+        return []
+    end = replayed[-1]
+    last = window[-1]._replace(path=end.path, moment=end.moment, rotation=end.rotation, latency=start.latency)
+    newest = compare_window(start, last, noise, settings)
     yaws = np.array(
         [
             start.rotation + start.own_heading,
