@@ -41,7 +41,6 @@ from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.joints.track import JointTrack
 from modelserver.messages import (
     NAN,
-    NO_FLAGS,
     STALE_SENSORS,
     VALID,
     Estimate,
@@ -364,8 +363,10 @@ class PlatformView(NamedTuple):
         of_estimate = int(estimate.invalid) & _ODOM_INVALID if odom_only else int(estimate.invalid)
         invalid = int(self.invalid) | of_estimate | int(joints.invalid)
         quality = estimate.quality
-        if path is not None:
-            quality |= joints.quality | (Quality.LOOP if path.is_in_loop else NO_FLAGS)
+        if path is not None and path.is_in_loop:
+            quality |= joints.quality | Quality.LOOP
+        elif path is not None and joints.quality:
+            quality |= joints.quality
         of_vehicle = self.base_frame in (interest, reference) and not odom_only
         horizontal, heading = self._protection_levels(estimate) if of_vehicle else (NAN, NAN)
         return PoseAnswer(

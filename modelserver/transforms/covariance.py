@@ -50,7 +50,9 @@ def apply_lever_arm(cov: Array, r: Array) -> Array:
     """
     M, more = large_angle_lever_arm(cov[3:, 3:], r)
     J = _IDENTITY.copy()
-    J[:3, 3:] = -so3.skew(r) @ M
+    x, y, z = r.tolist()
+    # -[r]x
+    J[:3, 3:] = np.array(((-0.0, z, -y), (-z, -0.0, x), (y, -x, -0.0))) @ M
     found = J @ cov @ J.T
     found[:3, :3] += more
     return _symmetric(found)

@@ -51,7 +51,8 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         return Estimate(utime, X_odom, invalid=_to_invalid(invalid), pose_epoch=epoch, origin=origin)
     predicted = propagation.predict(setup, state, utime + _get_sensor_delay_us(setup, state))
     nav = predicted.nav
-    quality = _find_quality(setup, predicted, nav, utime, newest)
+    velocity = nav.body_velocity(setup.rig.base)
+    quality = _find_quality(predicted, velocity[0], utime, newest)
     odom_covariance = odom.covariance()
     if not (isinstance(state, Aligned) and isinstance(predicted, Aligned)):
         return Estimate(
@@ -62,7 +63,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
             quality=quality,
             pose_epoch=epoch,
             origin=origin,
-            motion=compute_motion(setup, predicted, nav),
+            motion=compute_motion(setup, predicted, nav, velocity),
         )
     settings, gnss = setup.settings, state.gnss
     if nav.lag > FIRST_ORDER_LAG:
@@ -103,7 +104,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         horizontal,
         heading,
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
-        compute_motion(setup, predicted, nav),
+        compute_motion(setup, predicted, nav, velocity),
     )
 
 
@@ -285,8 +286,8 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
     return invalid
 
 
-def _find_quality(setup: Setup, state: Navigating, nav: NavState, utime: int, newest: int) -> Quality:
-    forward = nav.body_velocity(setup.rig.base)[0]
+def _find_quality(state: Navigating, forward: float, utime: int, newest: int) -> Quality:
+    """Return the quality of an estimate; `forward`: the speed along the rolling frame's own axis, m/s."""
     quality = 0
     if state.is_stationary or abs(forward) < SLOW:
         quality |= 1  # HEADING_FROM_GYRO
@@ -300,8 +301,11 @@ def _find_quality(setup: Setup, state: Navigating, nav: NavState, utime: int, ne
 # --- motion and navigation state ----------------------------------------------------------------------------
 
 
-def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMotion:
-    """Return the motion: the filter's velocity and angular rate, and the specific force without gravity."""
+def compute_motion(setup: Setup, state: Navigating, nav: NavState, velocity: Vector3) -> VehicleMotion:
+    """Return the motion: the filter's velocity and angular rate, and the specific force without gravity.
+
+    `velocity` is that of the rolling frame along the body axes, m/s.
+    """
     base = setup.rig.base
     lever = (-base[0], -base[1], -base[2])
     covariance = TwistCovariance(setup, nav)
@@ -316,7 +320,7 @@ def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMot
         tilt = g * g * max(P.item(6, 6), P.item(7, 7))
         bias = max(P.item(12, 12), P.item(13, 13), P.item(14, 14))
         sigma = math.sqrt(setup.settings.accelerometer_noise**2 / IMU_AVERAGING + bias + tilt)
-    return VehicleMotion(nav.body_velocity(base), nav.angular_rate, acceleration, lever, covariance, sigma)
+    return VehicleMotion(velocity, nav.angular_rate, acceleration, lever, covariance, sigma)
 
 
 class TwistCovariance(NamedTuple):
