@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from modelserver.named_tuples import new_tuple
+
 MIN_STEP_US: Final = 100_000
 """A smaller fall of the offset between two readings is slewing: chronyd slews by at most 8 %, 2 ms between ticks."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 class Instant(NamedTuple):
@@ -53,5 +52,5 @@ class HostClock(NamedTuple):
         has_stepped_back = (previous if previous < last else last) - offset > MIN_STEP_US or (
             monotonic_ns < before_ns and before - utime > MIN_STEP_US
         )
-        reading = _new_tuple(HostClock, (monotonic_ns, utime, offset, offset if has_stepped_back else last))
+        reading = new_tuple(HostClock, (monotonic_ns, utime, offset, offset if has_stepped_back else last))
         return reading, has_stepped_back

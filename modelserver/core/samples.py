@@ -26,6 +26,7 @@ from modelserver.core.state import (
 )
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
+from modelserver.named_tuples import new_tuple
 from modelserver.query import PlatformView
 
 COMMAND_FUTURE_LIMIT_S: Final = 1.0
@@ -37,9 +38,6 @@ by what the vehicle travels in that time."""
 
 WARM_START: Final = "warm_start"
 """Kind of the decisions on the persisted state of an earlier run."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 def process_sample(state: CoreState, sample: messages.Sample, now: Instant) -> StepResult:
@@ -68,7 +66,7 @@ def check_host_clock(state: CoreState, now: Instant, traffic: Mapping[str, Sourc
     clock, has_stepped_back = clock.update(now)
     if has_stepped_back and view.localizer is not None:
         view = view._replace(invalid=messages.Invalid.CLOCK_STEPPED)
-    return _new_tuple(CoreState, (view, clock, traffic, *others))
+    return new_tuple(CoreState, (view, clock, traffic, *others))
 
 
 def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant) -> StepResult:
@@ -133,8 +131,8 @@ def update_localizer(
     if invalid and has_estimate and not is_rejected and utime <= now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
         # the estimate is of the host's new time of day
         invalid = messages.VALID
-    view = _new_tuple(PlatformView, (model, base_frame, localizer, history, rolling, invalid, joints))
-    state = _new_tuple(CoreState, (view, *state[1:]))
+    view = new_tuple(PlatformView, (model, base_frame, localizer, history, rolling, invalid, joints))
+    state = new_tuple(CoreState, (view, *state[1:]))
     if has_estimate:
         # a sample that is rejected in part may still advance the time
         if state.settings.publish == "event" and (not is_rejected or utime != before.utime):

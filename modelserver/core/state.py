@@ -14,6 +14,7 @@ from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
 from modelserver.joints.history import JointHistory
+from modelserver.named_tuples import new_tuple
 from modelserver.query import PlatformView
 from modelserver.query.answers import DeferredAnswer
 
@@ -40,9 +41,6 @@ UNCOUNTED_KINDS: Final = frozenset(("inertial", "steering", "imu_tilt", "imu_yaw
 
 CHANGE_PERIOD_NS: Final = 100_000_000
 """Nanoseconds between two evaluations of the health conditions: alternating conditions cannot flood the bus."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 TimedRequest: TypeAlias = (
     messages.GetTransformation
@@ -284,7 +282,7 @@ def count_message(
     if host_utime:
         latest = (now.utime - host_utime) * 1e-6
         delay = delay if delay >= latest else latest  # also if it is nan
-    updated = _new_tuple(SourceTraffic, (count + 1, now.monotonic_ns, interval, delay, *others))
+    updated = new_tuple(SourceTraffic, (count + 1, now.monotonic_ns, interval, delay, *others))
     return {**traffic, source: updated}
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
@@ -33,11 +33,9 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 SPEED_SPAN_US = 100_000
 """Microseconds of Odom from which the initial speed of the filter is computed."""
@@ -92,7 +90,7 @@ class ModeLocalizer(NamedTuple):
         active, notes = before.process(sample)
         if active is before:
             return self, notes
-        return _new_tuple(ModeLocalizer, (config, active, X_odom, epochs, drift)), notes
+        return new_tuple(ModeLocalizer, (config, active, X_odom, epochs, drift)), notes
 
     def estimate(self, utime: int) -> Estimate:
         """Return the pose at `utime`, in the Odom published since the start."""

@@ -14,9 +14,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.estimation.filter.settings import FilterSettings
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
+from modelserver.named_tuples import new_tuple
 
 MAX_SOURCES: Final = 256
 """Sources that are tracked: more names than that come from a flood."""
@@ -120,13 +118,13 @@ class ClockMonitor(NamedTuple):
         if source is not NEW_SOURCE or not self._is_full(name):
             recent = (*source.recent[1 - RECENT_STAMPS :], utime)
             clock = (utime, seq, 0, 0, 0, recent, source.replays, source.replays_utime)
-            sources = {**sources, name: _new_tuple(SourceClock, clock)}
+            sources = {**sources, name: new_tuple(SourceClock, clock)}
         if rank >= leading:
             leading = rank
             if utime > lead_utime:
                 lead_utime = utime
         newest = utime if utime > newest else newest
-        return _new_tuple(ClockMonitor, (newest, leading, lead_utime, sources)), StampVerdict.GOOD
+        return new_tuple(ClockMonitor, (newest, leading, lead_utime, sources)), StampVerdict.GOOD
 
     def spend_replays(self, name: SourceKey, items: int) -> ClockMonitor | None:
         """Return the monitor after a source has had so many items fused again; None if that is more than it may."""

@@ -45,6 +45,7 @@ from modelserver.estimation.filter.error_layout import ATTITUDE, STRAPDOWN, Erro
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filterpy_import import import_kalman_filter
 from modelserver.messages import Decision, Verdict
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
 
@@ -55,9 +56,6 @@ ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
 STANDARD_GRAVITY: Final = 9.80665
 EARTH_RADIUS: Final = 6_371_000.0
 """Meters, mean (IUGG): for the direction of the vertical away from N's origin."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 COVARIANCE_STEP: Final = 0.05
 """Seconds between two steps of the covariance, at least."""
@@ -140,7 +138,7 @@ class NavState(NamedTuple):
 
     def with_covariance(self, covariance: Array, extras: tuple[float, ...]) -> NavState:
         """Return the state with its covariance at its instant, and the additional states there."""
-        return _new_tuple(NavState, (*self[:6], extras, covariance, 0.0, ZERO, *self[10:]))
+        return new_tuple(NavState, (*self[:6], extras, covariance, 0.0, ZERO, *self[10:]))
 
     def inject(self, error: Array, covariance: Array) -> NavState:
         """Return the state with an error (n) injected, and the covariance (n, n) after the reset (Sola 7.3)."""
@@ -156,7 +154,7 @@ class NavState(NamedTuple):
         vx, vy, vz = self.velocity
         gx, gy, gz = self.gyro_bias
         ax, ay, az = self.accelerometer_bias
-        return _new_tuple(
+        return new_tuple(
             NavState,
             (
                 self.utime,
@@ -244,7 +242,7 @@ def propagate(nav: NavState, utime: int, rate: Vector3, force: Vector3, earth: E
     bx, by, bz = so3.rotate_back(middle, (mx, my, mz))
     turn = ox, oy, oz = (wx * dt, wy * dt, wz * dt)
     (rx, ry, rz), (tx, ty, tz), (ix, iy, iz), (lx, ly, lz) = travel, rotation, impulse, base
-    return _new_tuple(
+    return new_tuple(
         NavState,
         (
             utime,

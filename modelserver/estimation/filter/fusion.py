@@ -33,6 +33,7 @@ from modelserver.messages import (
     VehicleStatusSample,
     Verdict,
 )
+from modelserver.named_tuples import new_tuple
 
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
@@ -47,9 +48,6 @@ ZUPT_PERIOD: Final = 0.2
 
 IMU_ORIENTATION_PERIOD: Final = 0.5
 """Seconds between two updates by the IMU's own orientation or magnetometer."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 IMU, MODE, STEERING = "inertial", "mode", "steering"
 """Kinds of items that are not measurements of the registry."""
@@ -89,7 +87,7 @@ def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
     utime, source, seq = header.utime, header.source, header.seq
     items: list[Item] = []
     if isinstance(sample, ImuSample):
-        items.append(_new_tuple(Item, (utime, source, seq, 0, IMU, None, sample)))
+        items.append(new_tuple(Item, (utime, source, seq, 0, IMU, None, sample)))
     elif isinstance(sample, SwitchMode):
         items.append(Item(utime, source, seq, 0, MODE, None, sample))
     elif isinstance(sample, VehicleStatusSample):

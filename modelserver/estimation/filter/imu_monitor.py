@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.sensor_rig import YawGyro
 from modelserver.messages import ImuSample
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
@@ -27,10 +28,6 @@ LINE_TOLERANCE: Final = 3e-4
 
 INTERPOLATED_SAMPLES: Final = 3
 """Samples in a row on one line, in all six components, that cannot be chance."""
-
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 class ImuMonitor(NamedTuple):
@@ -77,7 +74,7 @@ class ImuMonitor(NamedTuple):
                     break
             else:
                 count = num_collinear + 1
-        return _new_tuple(ImuMonitor, (utime, rate, force, utime, slope, count, utime, is_interpolated))
+        return new_tuple(ImuMonitor, (utime, rate, force, utime, slope, count, utime, is_interpolated))
 
     @property
     def seems_interpolated(self) -> bool:
@@ -97,12 +94,16 @@ def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | 
     if rate is None or force is None:
         return "nan"
     (a, b, c), (d, e, f) = rate, force
-    if not (math.isfinite(a + b + c) and math.isfinite(d + e + f)):
-        return "nan"
-    if not (-MAX_RATE <= a <= MAX_RATE and -MAX_RATE <= b <= MAX_RATE and -MAX_RATE <= c <= MAX_RATE):
-        return "range"
-    if not (-MAX_FORCE <= d <= MAX_FORCE and -MAX_FORCE <= e <= MAX_FORCE and -MAX_FORCE <= f <= MAX_FORCE):
-        return "range"
+    # a comparison with nan is false
+    if not (
+        -MAX_RATE <= a <= MAX_RATE
+        and -MAX_RATE <= b <= MAX_RATE
+        and -MAX_RATE <= c <= MAX_RATE
+        and -MAX_FORCE <= d <= MAX_FORCE
+        and -MAX_FORCE <= e <= MAX_FORCE
+        and -MAX_FORCE <= f <= MAX_FORCE
+    ):
+        return "range" if math.isfinite(a + b + c) and math.isfinite(d + e + f) else "nan"
     return so3.rotate(mount, rate), so3.rotate(mount, force)
 
 

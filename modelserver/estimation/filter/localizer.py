@@ -38,6 +38,7 @@ from modelserver.messages import (
     SwitchMode,
     WheelsSample,
 )
+from modelserver.named_tuples import new_tuple
 
 ODOM_STEP_US: Final = 15_000
 """Microseconds between two steps of Odom, at least: between them it is extrapolated by its twist."""
@@ -51,10 +52,6 @@ RANKS: Final[Mapping[type, int]] = MappingProxyType({ImuSample: IMU_RANK, Wheels
 
 STEERING_TIMEOUT: Final = 1.0
 """Seconds without a usable steering angle after which that is reported; the wheels are used without it at once."""
-
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 class Deferred(NamedTuple):
@@ -190,7 +187,7 @@ class FilterLocalizer(NamedTuple):
             is_origin_reported = True
             events = (*events, PersistOrigin(geodesy.origin))
         found = (setup, timeline, head, clocks, odom, odoms, is_origin_reported, streams)
-        return _new_tuple(FilterLocalizer, found), events
+        return new_tuple(FilterLocalizer, found), events
 
     def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, tuple[LocalizerEvent, ...]]:
         """Return the timeline with the items that are neither too old nor duplicates, and the decisions on the rest."""
@@ -258,7 +255,7 @@ class FilterLocalizer(NamedTuple):
         if not isinstance(state, Leveling) and utime < state.nav.utime:
             state = self.timeline.get_state_at(utime)
             odom = _get_odom_at(self.odoms, utime, odom)
-        return _new_tuple(Deferred, (self.setup, state, odom, utime, self.utime))
+        return new_tuple(Deferred, (self.setup, state, odom, utime, self.utime))
 
     def navigation(self, utime: int) -> NavigationState | None:
         """Return the whole state as of the newest sample; None before leveling."""

@@ -10,15 +10,13 @@ import math
 from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO, NavState
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
 
 TILT_TIME: Final = 1.0
 """Time constant, seconds, with which the tilt of Odom follows the filter's."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 MAX_EXTRAPOLATION: Final = 0.5
 """Seconds for which a twist is integrated without a new one."""
@@ -60,7 +58,7 @@ class Odometry(NamedTuple):
             speed_sigma = math.sqrt(P.item(3, 3) + P.item(4, 4))
             drift = min(drift + (speed_sigma + yaw_drift * math.hypot(*velocity)) * dt, 1e6)
             yaw_drift = min(yaw_drift + math.sqrt(P.item(11, 11)) * dt, 1e3)
-        return _new_tuple(Odometry, (nav.utime, position, attitude, velocity, rate, drift, yaw_drift, True))
+        return new_tuple(Odometry, (nav.utime, position, attitude, velocity, rate, drift, yaw_drift, True))
 
     def stop(self, utime: int) -> Odometry:
         """Return Odom at its pose from `utime` on, while the motion is unknown."""

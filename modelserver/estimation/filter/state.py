@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final, NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.estimation.filter.consistency_monitor import ConsistencyMonitor
@@ -25,10 +25,8 @@ from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 from modelserver.estimation.origin import OriginCapture
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Vector3
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 class PreviousSample(NamedTuple):
@@ -207,7 +205,7 @@ class Unaligned(NamedTuple):
     def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Unaligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
         alignment = self.alignment.update(self.nav, nav) if nav.utime > self.nav.utime else self.alignment
-        return _new_tuple(Unaligned, (nav, imu, stationary, alignment, *self[4:]))
+        return new_tuple(Unaligned, (nav, imu, stationary, alignment, *self[4:]))
 
     def with_nav(self, nav: NavState) -> Unaligned:
         """Return the state propagated to a later instant."""
@@ -244,11 +242,11 @@ class Aligned(NamedTuple):
 
     def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Aligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
-        return _new_tuple(Aligned, (nav, imu, stationary, *self[3:]))
+        return new_tuple(Aligned, (nav, imu, stationary, *self[3:]))
 
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""
-        return _new_tuple(Aligned, (nav, *self[1:]))
+        return new_tuple(Aligned, (nav, *self[1:]))
 
 
 Navigating: TypeAlias = Unaligned | Aligned

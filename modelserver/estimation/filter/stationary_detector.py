@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Vector3
 
 AVERAGING_TIME: Final = 0.3
@@ -23,9 +24,6 @@ CONFIRMED_RATE: Final = 0.06
 
 WHEELS_TIMEOUT: Final = 1.0
 """Seconds for which a wheel sample counts."""
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
 
 
 class StationaryDetector(NamedTuple):
@@ -98,7 +96,7 @@ class StationaryDetector(NamedTuple):
         if is_quiet:
             sx, sy, sz = self.rate_sum
             rate_sum, sum_time = (sx + rx * dt, sy + ry * dt, sz + rz * dt), self.sum_time + dt
-        return _new_tuple(
+        return new_tuple(
             StationaryDetector,
             (
                 utime,

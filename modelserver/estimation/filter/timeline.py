@@ -16,9 +16,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
 from modelserver.estimation.filter.step import step
 from modelserver.messages import Decision
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor: once or more for every sample."""
+from modelserver.named_tuples import new_tuple
 
 MAX_ITEMS: Final = 8192
 """Items within a horizon: more come from a flood, and are rejected."""
@@ -88,7 +86,7 @@ class Timeline(NamedTuple):
         fused = []
         for item in (*[entry.item for entry in entries[num_fused:]], *items) if waiting else items:
             state, decisions = step(setup, state, item)
-            fused.append(_new_tuple(Entry, (item, state, decisions)))
+            fused.append(new_tuple(Entry, (item, state, decisions)))
         entries = (*entries[:num_fused], *fused) if waiting else (*entries, *fused)
         # one or two at a time, and never the last one
         cut, settled = 0, NOTHING
@@ -99,7 +97,7 @@ class Timeline(NamedTuple):
             before = entries[cut - 1].state
             assert before is not None
             base, entries = before, entries[cut:]
-        return _new_tuple(Timeline, (base, entries, len(entries))), state, settled
+        return new_tuple(Timeline, (base, entries, len(entries))), state, settled
 
     def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
         """Return the timeline with an item more, and the item that it replaces; or in one word why not.
