@@ -141,7 +141,7 @@ def update_localizer(
         if state.waiting:
             state, replies = answer_waiting(state, now)
             outputs.extend(replies)
-    return (state, tuple(outputs)) if outputs else (state, ())
+    return state, tuple(outputs)
 
 
 def report_start(state: CoreState, decision: messages.Decision, now: Instant) -> StepResult:
