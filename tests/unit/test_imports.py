@@ -26,6 +26,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
     "named_tuples": set(),
     "named_tuples": set(),
+    "named_tuples": set(),
+    "named_tuples": set(),
     # folders
     "config": set(),
     "files": set(),
@@ -68,6 +70,8 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 PURE = {
     "errors",
+    "named_tuples",
+    "named_tuples",
     "named_tuples",
     "named_tuples",
     "files.kinds",
