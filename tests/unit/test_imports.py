@@ -25,9 +25,6 @@ SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
     "named_tuples": set(),
-    "named_tuples": set(),
-    "named_tuples": set(),
-    "named_tuples": set(),
     # folders
     "config": set(),
     "files": set(),
@@ -70,9 +67,6 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 PURE = {
     "errors",
-    "named_tuples",
-    "named_tuples",
-    "named_tuples",
     "named_tuples",
     "files.kinds",
     "transforms",
