@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from modelserver.named_tuples import new_tuple
+
 MIN_STEP_US: Final = 100_000
 """A smaller fall of the offset between two readings is slewing: chronyd slews by at most 8 %, 2 ms between ticks."""
 
@@ -32,16 +34,23 @@ class HostClock(NamedTuple):
     offset: int = 0
     previous_offset: int = 0
 
-    def has_stepped_back(self, now: Instant) -> bool:
-        """Return whether the time of day was set back since the last reading.
+    @classmethod
+    def start(cls, now: Instant) -> HostClock:
+        """Return the first reading."""
+        monotonic_ns, utime = now
+        offset = utime - monotonic_ns // 1000
+        return cls(monotonic_ns, utime, offset, offset)
 
-        In a recording both times are those of the log, so both fall.
+    def update(self, now: Instant) -> tuple[HostClock, bool]:
+        """Return the reading at `now`, and whether the time of day was set back since the last one.
+
+        In a recording both times are those of the log, so both fall. After a step earlier offsets do not count.
         """
-        offset = now.utime - now.monotonic_ns // 1000
-        fell = min(self.offset, self.previous_offset) - offset
-        return fell > MIN_STEP_US or (now.monotonic_ns < self.monotonic_ns and self.utime - now.utime > MIN_STEP_US)
-
-    def update(self, now: Instant, set_back: bool) -> HostClock:
-        """Return the reading at `now`; after a step, as for the first reading, earlier offsets do not count."""
-        offset = now.utime - now.monotonic_ns // 1000
-        return HostClock(now.monotonic_ns, now.utime, offset, offset if set_back else self.offset)
+        monotonic_ns, utime = now
+        before_ns, before, last, previous = self
+        offset = utime - monotonic_ns // 1000
+        has_stepped_back = (previous if previous < last else last) - offset > MIN_STEP_US or (
+            monotonic_ns < before_ns and before - utime > MIN_STEP_US
+        )
+        reading = new_tuple(HostClock, (monotonic_ns, utime, offset, offset if has_stepped_back else last))
+        return reading, has_stepped_back

@@ -15,6 +15,7 @@ from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
 from modelserver.joints.history import JointHistory
+from modelserver.named_tuples import new_tuple
 from modelserver.query import PlatformView
 from modelserver.query.answers import DeferredAnswer
 
@@ -225,9 +226,15 @@ def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now
     )
     check_rigid(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
-    clock = HostClock().update(now, set_back=True)
     return CoreState(
-        view, clock, {}, settings, due, health_due_ns=due, snapshot_due_ns=due, missing_sensors=settings.sensors
+        view,
+        HostClock.start(now),
+        {},
+        settings,
+        due,
+        health_due_ns=due,
+        snapshot_due_ns=due,
+        missing_sensors=settings.sensors,
     )
 
 
@@ -277,7 +284,7 @@ def count_message(
         if len(traffic) >= MAX_COUNTERS:
             return traffic
         known = SourceTraffic()
-    count, last_received_ns, interval, delay = known[:4]
+    count, last_received_ns, interval, delay, *others = known
     if count:
         since = (now.monotonic_ns - last_received_ns) * 1e-9
         # limited, so that a pause does not hide the next ones
@@ -286,7 +293,8 @@ def count_message(
     if host_utime:
         latest = (now.utime - host_utime) * 1e-6
         delay = delay if delay >= latest else latest  # also if it is nan
-    return {**traffic, source: SourceTraffic(count + 1, now.monotonic_ns, interval, delay, *known[4:])}
+    updated = new_tuple(SourceTraffic, (count + 1, now.monotonic_ns, interval, delay, *others))
+    return {**traffic, source: updated}
 
 
 def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:

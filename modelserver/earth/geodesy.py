@@ -128,7 +128,7 @@ class LocalFrame:
     def from_ecef(self, ecef: Vector3) -> Vector3:
         """Return an ECEF point as east, north, up in this frame."""
         a, b, c = self.ecef
-        return so3.rotate(so3.conjugate(self.rotation), (ecef[0] - a, ecef[1] - b, ecef[2] - c))
+        return so3.rotate_back(self.rotation, (ecef[0] - a, ecef[1] - b, ecef[2] - c))
 
     def rotation_of(self, other: LocalFrame) -> Quaternion:
         """Return the rotation from the axes of `other` to those of this frame."""

@@ -33,6 +33,7 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
@@ -83,13 +84,13 @@ class ModeLocalizer(NamedTuple):
 
     def process(self, sample: Sample | SwitchMode) -> tuple[ModeLocalizer, tuple[LocalizerEvent, ...]]:
         """Return the state after a sample, and the events."""
-        raw = isinstance(self.active, RawLocalizer)
-        if isinstance(sample, SwitchMode) and (raw or sample.mode is Mode.RAW):
+        config, before, X_odom, epochs, drift = self
+        if isinstance(sample, SwitchMode) and (isinstance(before, RawLocalizer) or sample.mode is Mode.RAW):
             return self._switch_mode(sample)
-        active, notes = self.active.process(sample)
-        if active is self.active:
+        active, notes = before.process(sample)
+        if active is before:
             return self, notes
-        return ModeLocalizer(self.config, active, self.X_odom, self.epochs, self.drift), notes
+        return new_tuple(ModeLocalizer, (config, active, X_odom, epochs, drift)), notes
 
     def estimate(self, utime: int) -> Estimate:
         """Return the pose at `utime`, in the Odom published since the start."""

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from modelserver.errors import TooNewError, TooOldError
 from modelserver.messages import NAN
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Array
 
 MAX_GAP_S: Final = 1.0
@@ -94,7 +95,6 @@ BLOCK_SIZE: Final = 512
 _COLUMNS: Final = 4
 
 _INTERPOLATED: Final = Provenance.INTERPOLATED
-_NEW: Final = tuple.__new__
 """Looked up once: accessing an enumeration member costs more than the arithmetic around it."""
 
 
@@ -327,7 +327,9 @@ class JointTrack:
         sigma = s0 if s0 != s0 or s0 > s1 else s1
         rate_sigma = rs0 if rs0 != rs0 or rs0 > rs1 else rs1
         # as `Reading(...)`, at a third of its cost: every lookup creates one for each joint
-        return _NEW(Reading, (utime, p0 + difference * fraction, sigma, rate, rate_sigma, _INTERPOLATED, t1, span, NAN))
+        return new_tuple(
+            Reading, (utime, p0 + difference * fraction, sigma, rate, rate_sigma, _INTERPOLATED, t1, span, NAN)
+        )
 
     def hold(self, utime: int) -> Reading:
         """Return the newest reading not after a time (hold-last-value). Raises TooOldError."""

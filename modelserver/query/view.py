@@ -42,7 +42,6 @@ from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.joints.track import JointTrack
 from modelserver.messages import (
     NAN,
-    NO_FLAGS,
     STALE_SENSORS,
     VALID,
     Estimate,
@@ -57,7 +56,7 @@ from modelserver.query.steps import Steps
 from modelserver.transforms import covariance as cov
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
-from modelserver.transforms.transformation import Transformation
+from modelserver.transforms.transformation import Numbers, Transformation
 
 PREDICTION_LIMIT_S: Final = 5.0
 """Largest time after the newest sample for which a pose is predicted; by then its protection level is long exceeded."""
@@ -331,7 +330,7 @@ class PlatformView(NamedTuple):
         path: KinematicPath,
         joints: JointReadings,
         inverted: bool = False,
-    ) -> tuple[Pose, Callable[[], Array | None] | None]:
+    ) -> tuple[Pose, Callable[[], Array | Numbers | None] | None]:
         """Return a frame's pose in a world frame and a function for its covariance, None where it is unknown.
 
         `inverted`: the world frame's pose in the frame.
@@ -356,17 +355,21 @@ class PlatformView(NamedTuple):
         interest: str,
         reference: str,
         pose: Pose,
-        covariance: Callable[[], Array | None] | None,
+        covariance: Callable[[], Array | Numbers | None] | None,
         estimate: Estimate,
         joints: JointReadings = NO_READINGS,
         path: KinematicPath | None = None,
     ) -> PoseAnswer:
         odom_only = names.ODOM in (interest, reference) and not (is_absolute(interest) or is_absolute(reference))
         origin = None if odom_only else estimate.origin
-        invalid = self.invalid | (estimate.invalid & ODOM_INVALID if odom_only else estimate.invalid) | joints.invalid
+        # as numbers: combining flags costs more than the pose
+        of_estimate = int(estimate.invalid) & _ODOM_INVALID if odom_only else int(estimate.invalid)
+        invalid = int(self.invalid) | of_estimate | int(joints.invalid)
         quality = estimate.quality
-        if path is not None:
-            quality |= joints.quality | (Quality.LOOP if path.is_in_loop else NO_FLAGS)
+        if path is not None and path.is_in_loop:
+            quality |= joints.quality | Quality.LOOP
+        elif path is not None and joints.quality:
+            quality |= joints.quality
         of_vehicle = self.base_frame in (interest, reference) and not odom_only
         horizontal, heading = self._protection_levels(estimate) if of_vehicle else (NAN, NAN)
         return PoseAnswer(
@@ -376,7 +379,7 @@ class PlatformView(NamedTuple):
                 pose,
                 covariance,
                 estimate.utime,
-                int(invalid),
+                invalid,
                 estimate.pose_epoch,
                 0 if origin is None else origin.origin_id,
                 self.model.revision,
@@ -408,6 +411,8 @@ _CLOCK_STEPPED: Final = Invalid.CLOCK_STEPPED.value
 ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
 """Reasons against a pose in Odom, which needs no fix and no origin."""
 
+_ODOM_INVALID: Final = ODOM_INVALID.value
+
 
 def _covariance(
     numbers: tuple[float, ...],
@@ -417,11 +422,13 @@ def _covariance(
     joints: JointReadings,
     fixed: Transformation | None,
     inverted: bool,
-) -> Array | None:
+) -> Array | Numbers | None:
     """Return the covariance of a frame of the vehicle in a world, `inverted` of the world in the frame.
 
     X_BF: None for the rolling frame. fixed: the frame in the rolling frame, where no joint moves between them.
     """
+    if X_BF is None and not inverted:
+        return numbers
     P = np.array(numbers).reshape(6, 6)
     if inverted:
         # the world's origin is at the end of a long lever arm
@@ -439,4 +446,5 @@ def _covariance(
     if inverted:
         return cov.compose(X_BF.inverse(), cov.invert(X_BF, Q), X_WB.inverse(), P)
     # the heading may be off by tens of degrees before the vehicle has moved
-    return cov.apply_lever_arm(P, X_WB.rotation @ X_BF.position) + cov.rotate(X_WB.rotation, Q)
+    R = X_WB.rotation
+    return cov.apply_lever_arm(P, R @ X_BF.position) + cov.rotate(R, Q)

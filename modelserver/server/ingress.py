@@ -22,6 +22,7 @@ from modelserver.core import Instant
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
 from modelserver.errors import quote
 from modelserver.messages import Event, HealthWarning, Rejected, RelativePoseSample, Sample, SwitchMode
+from modelserver.named_tuples import new_tuple
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog
 from modelserver.wire.codec import decode
@@ -33,9 +34,6 @@ _HEADER: Final = struct.Struct(">8sq24xqi")
 
 Between utime and seq are utime_sigma, host_utime and device_utime (sensor_header_t.lcm).
 """
-
-_new_tuple: Final = tuple.__new__
-"""Makes a NamedTuple at a third of the cost of its constructor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,7 @@ def peek_sample_id(data: bytes, fingerprint: bytes) -> SampleId | None:
     end = _HEADER.size + length
     if found != fingerprint or not 0 < utime < MAX_UTIME or not 0 < length <= MAX_NAME + 1 or end > len(data):
         return None
-    return _new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
+    return new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
 
 
 def subtract_latency(sample: Sample | SwitchMode, microseconds: int) -> Sample | SwitchMode:

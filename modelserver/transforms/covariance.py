@@ -15,6 +15,8 @@ from modelserver.transforms.large_angle import large_angle_lever_arm
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 
+_IDENTITY = np.eye(6)
+
 
 def compose(X_AB: Pose, cov_AB: Array, X_BC: Pose, cov_BC: Array) -> Array:
     """Return the covariance (6, 6) of `X_AB @ X_BC`, for independent errors."""
@@ -47,8 +49,10 @@ def apply_lever_arm(cov: Array, r: Array) -> Array:
     `cov` is that of the pose at the start of the lever arm; both and `r` are along the same axes.
     """
     M, more = large_angle_lever_arm(cov[3:, 3:], r)
-    J = np.eye(6)
-    J[:3, 3:] = -so3.skew(r) @ M
+    J = _IDENTITY.copy()
+    x, y, z = r.tolist()
+    # -[r]x
+    J[:3, 3:] = np.array(((-0.0, z, -y), (-z, -0.0, x), (y, -x, -0.0))) @ M
     found = J @ cov @ J.T
     found[:3, :3] += more
     return _symmetric(found)

@@ -88,6 +88,20 @@ def rotate(q: Quaternion, v: Vector3) -> Vector3:
     )
 
 
+def rotate_back(q: Quaternion, v: Vector3) -> Vector3:
+    """Return R(q)' v: the bits of `rotate` by the conjugate."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (z * vy - y * vz)
+    ty = 2.0 * (x * vz - z * vx)
+    tz = 2.0 * (y * vx - x * vy)
+    return (
+        vx + w * tx - y * tz + z * ty,
+        vy + w * ty - z * tx + x * tz,
+        vz + w * tz - x * ty + y * tx,
+    )
+
+
 def cross(a: Vector3, b: Vector3) -> Vector3:
     """Return a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
@@ -202,6 +216,23 @@ def small_angle_exponential(v: Vector3) -> Quaternion:
         return exponential(v)
     s = 0.5 * (1.0 - square / 6.0 + square * square / 120.0)
     return (1.0 - square / 2.0 + square * square / 24.0, x * s, y * s, z * s)
+
+
+def turn(q: Quaternion, v: Vector3) -> Quaternion:
+    """Return the rotation by a small vector `v` followed by `q`: `multiply(q, small_angle_exponential(v))` in one."""
+    x, y, z = v
+    square = 0.25 * (x * x + y * y + z * z)
+    if not square < 0.01:
+        return multiply(q, exponential(v))
+    s = 0.5 * (1.0 - square / 6.0 + square * square / 120.0)
+    aw, ax, ay, az = q
+    bw, bx, by, bz = 1.0 - square / 2.0 + square * square / 24.0, x * s, y * s, z * s
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
 
 
 def logarithm(q: Quaternion) -> Vector3:

@@ -109,7 +109,9 @@ class Transformation:
         found = self._covariance
         if callable(found):
             found = found()
-            _put_covariance(self, _freeze_covariance(found) if isinstance(found, np.ndarray) else found)
+            if isinstance(found, np.ndarray):
+                found = tuple(found.ravel().tolist())
+            _put_covariance(self, found)
         return tuple(found.ravel().tolist()) if isinstance(found, np.ndarray) else found
 
     @property

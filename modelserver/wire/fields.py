@@ -95,8 +95,9 @@ def read_quaternion(values: Sequence[float]) -> Quaternion | None:
 def read_matrix3(values: Sequence[float]) -> Matrix3 | None:
     """Return nine numbers, or None where one is nan."""
     a, b, c, d, e, f, g, h, i = values
-    total = a + b + c + d + e + f + g + h + i
-    return None if total != total and any(value != value for value in values) else (a, b, c, d, e, f, g, h, i)
+    if a != a or b != b or c != c or d != d or e != e or f != f or g != g or h != h or i != i:
+        return None
+    return (a, b, c, d, e, f, g, h, i)
 
 
 def check_finite(values: Sequence[float], what: str) -> tuple[float, ...]:
@@ -214,12 +215,26 @@ def check_outgoing(count: int, most: int, what: str) -> None:
         raise ValueError(f"{what}: {count} entries in one message; at most {most} can be sent")
 
 
+_MAX_CACHED_COUNT: Final = 256
+"""Numbers; longer arrays are rare, and may come in any length."""
+
+
+@lru_cache(maxsize=1024)
+def _make_struct(code: str, count: int) -> struct.Struct:
+    return struct.Struct(f">{count}{code}")
+
+
 def read_numbers(code: str, data: bytes, at: int, count: int) -> tuple[tuple[Any, ...], int]:
     """Return `count` numbers of a struct code that begin at `at`, and their end. Raises struct.error."""
-    size = count * struct.calcsize(code)
-    if at + size > len(data):
+    if count <= _MAX_CACHED_COUNT:
+        numbers = _make_struct(code, count)
+        end = at + numbers.size
+        if end <= len(data):
+            return numbers.unpack_from(data, at), end
+    end = at + count * struct.calcsize(code)
+    if end > len(data):
         raise WireError("truncated", f"{len(data)} bytes end within {count} numbers")
-    return struct.unpack_from(f">{count}{code}", data, at), at + size
+    return struct.unpack_from(f">{count}{code}", data, at), end
 
 
 def read_bytes(data: bytes, at: int, count: int) -> tuple[bytes, int]:

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-VALUES = {"errors", "version", "transforms"}
+VALUES = {"errors", "version", "named_tuples", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "estimation.history"}
 CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
@@ -24,6 +24,7 @@ SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
+    "named_tuples": set(),
     # folders
     "config": set(),
     "files": set(),
@@ -67,6 +68,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 PURE = {
     "errors",
+    "named_tuples",
     "files.kinds",
     "transforms",
     "geometry",

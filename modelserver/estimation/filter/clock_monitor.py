@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.named_tuples import new_tuple
 
 MAX_SOURCES: Final = 256
 """Sources that are tracked: more names than that come from a flood."""
@@ -89,10 +90,11 @@ class ClockMonitor(NamedTuple):
         self, name: SourceKey, rank: int, utime: int, seq: int, settings: FilterSettings
     ) -> tuple[ClockMonitor, StampVerdict]:
         """Return the monitor after a stamp, and what the stamp means."""
-        source = self.sources.get(name, NEW_SOURCE)
-        horizon = round(settings.horizon * 1e6)
-        ahead = utime - self.newest
-        if self.newest and ahead > settings.clock_jump * 1e6:
+        newest, leading, lead_utime, sources = self
+        source = sources.get(name, NEW_SOURCE)
+        ahead = utime - newest
+        horizon = round(settings.horizon * 1e6) if ahead < 0 else 0
+        if newest and ahead > settings.clock_jump * 1e6:
             source = _count_odd(source, utime, self.lead_utime)
             if source.num_odd < settings.clock_jump_samples:
                 return self._with(name, source), StampVerdict.FUTURE
@@ -103,7 +105,7 @@ class ClockMonitor(NamedTuple):
                 return _set_back(name, rank, utime, seq), StampVerdict.STEPPED_BACK
             # within the horizon it is used while it may be chance: the result must not depend on the order of arrival
             return self._with(name, source), StampVerdict.OUT_OF_SEQUENCE if ahead < -horizon else StampVerdict.GOOD
-        elif self.newest and ahead < -horizon:
+        elif newest and ahead < -horizon:
             if source.newest or rank < self.rank:
                 return self, StampVerdict.TOO_OLD
             # its first stamps: those before may be the wrong ones, and would keep it out forever
@@ -113,15 +115,16 @@ class ClockMonitor(NamedTuple):
             return self._with(name, source), StampVerdict.TOO_OLD
         if utime < source.newest:
             return self, StampVerdict.GOOD
-        recent = (*source.recent[1 - RECENT_STAMPS :], utime)
-        newest, leading, lead_utime, sources = self
-        if not self._is_full(name):
-            sources = {**sources, name: SourceClock(utime, seq, 0, 0, 0, recent, source.replays, source.replays_utime)}
+        if source is not NEW_SOURCE or not self._is_full(name):
+            recent = (*source.recent[1 - RECENT_STAMPS :], utime)
+            clock = (utime, seq, 0, 0, 0, recent, source.replays, source.replays_utime)
+            sources = {**sources, name: new_tuple(SourceClock, clock)}
         if rank >= leading:
             leading = rank
             if utime > lead_utime:
                 lead_utime = utime
-        return ClockMonitor(utime if utime > newest else newest, leading, lead_utime, sources), StampVerdict.GOOD
+        newest = utime if utime > newest else newest
+        return new_tuple(ClockMonitor, (newest, leading, lead_utime, sources)), StampVerdict.GOOD
 
     def spend_replays(self, name: SourceKey, items: int) -> ClockMonitor | None:
         """Return the monitor after a source has had so many items fused again; None if that is more than it may."""

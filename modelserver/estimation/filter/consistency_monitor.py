@@ -38,6 +38,7 @@ from __future__ import annotations
 import cmath
 import itertools
 import math
+from collections.abc import Sequence
 from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -177,6 +178,9 @@ class Cause(Enum):
 
 MARGIN: Final = MappingProxyType({Cause.GYRO: 8.0, Cause.WHEELS: 8.0, Cause.LATENCY: 5.0, Cause.LEVER_ARM: 5.0})
 """Evidence by which an error must exceed any other cause to be corrected."""
+
+LARGEST_MARGIN: Final = max(MARGIN.values()) + 1e-6
+"""The largest of them, and what rounding may change of one."""
 
 TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
 """Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
@@ -636,7 +640,9 @@ class ConsistencyMonitor(NamedTuple):
             turn = start.heading_variance + start.rate_variance * (node.seconds - start.seconds) ** 2
             if turn > LARGEST_TURN_SIGMA**2:
                 continue
-            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings):
+            # a window that could explain no more than this changes neither the best cause nor its margin
+            least = max(each.explained for each in explained.values()) - LARGEST_MARGIN
+            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings, least):
                 if each.cause not in explained or each.explained > explained[each.cause].explained:
                     explained[each.cause] = each
         best = max(explained.values(), key=lambda each: each.explained)
@@ -670,65 +676,115 @@ def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:
 
 
 def _explain(
-    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
+    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings, least: float = -math.inf
 ) -> list[Inconsistency]:
-    """Return each cause of the discrepancies since a node, with the squares that it explains."""
-    path = replay_path(start, window)
-    rows = [compare_window(start, each, noise, settings) for each in path]
-    errors = np.array([each.error for each in rows])
-    whiten = np.linalg.inv(np.linalg.cholesky(_get_window_covariance(start, window, noise, settings)))
-    paths = np.array([each.displacement for each in rows])
+    """Return each cause of the discrepancies since a node, with the squares that it explains.
+
+    Nothing where none could explain more than `least`: parameters do not lower the determinant of the information, so
+    a cause explains no more than the squares that remain without one.
+    """
+    replayed = replay_path(start, window)
+    # error, displacement and moment of each node as `compare_window` has them; it would compute much more
+    turned = cmath.rect(1.0, start.rotation)
+    displacements = [turned * (each.path - start.path) for each in replayed]
+    begin = _shift_fix(start, start.latency)
+    errors = np.array(
+        [_shift_fix(each, start.latency) - begin - d for each, d in zip(window, displacements, strict=True)]
+    )
+    paths = np.array(displacements)
     seconds = np.array([each.seconds - start.seconds for each in window])
-    newest = rows[-1]
     even = np.ones(len(window), dtype=complex)
-    moments = np.array([_get_moment(start, each) for each in path])
+    moments = np.array(
+        [turned * (each.moment - start.moment - start.seconds * (each.path - start.path)) for each in replayed]
+    )
     velocities = np.array([each.velocity for each in window])
+    whiten = np.linalg.inv(np.linalg.cholesky(_get_window_covariance(start, window, noise, settings)))
     # the errors of the path as the state knows them
     usual = (
         (1j * paths, math.sqrt(start.heading_variance)),
         (paths, math.sqrt(start.scale_variance)),
         (1j * moments, math.sqrt(start.rate_variance)),
     )
-
-    def fit(*unusual: tuple[Vector, float]) -> tuple[Vector, float, float]:
-        """Return the factors of columns, with their sigmas, the squares that remain, and -2 log of the evidence."""
-        columns, sigmas = zip(*usual, *unusual, strict=True)
-        A = whiten @ np.column_stack(columns)
-        full = np.vstack((A.real, A.imag, np.diag([1.0 / each for each in sigmas])))
-        e = whiten @ errors
-        b = np.concatenate((e.real, e.imag, np.zeros(len(sigmas))))
-        information = full.T @ full
-        x = np.linalg.solve(information, full.T @ b)
-        rest = b - full @ x
-        left = float(rest @ rest)
-        size = float(np.linalg.slogdet(information)[1]) + 2.0 * sum(map(math.log, sigmas))
-        return x[len(usual) :], left, left + size
-
-    _, _, none = fit()
-    yaws = np.array([each.rotation + each.own_heading for each in (start, *window)])
+    fit = _WindowFit(whiten, errors, usual)
+    ((_, squares, none),) = fit.solve(((),))
+    if squares < least:
+        return []
+    end = replayed[-1]
+    last = window[-1]._replace(path=end.path, moment=end.moment, rotation=end.rotation, latency=start.latency)
+    newest = compare_window(start, last, noise, settings)
+    yaws = np.array(
+        [
+            start.rotation + start.own_heading,
+            *(r.rotation + w.own_heading for r, w in zip(replayed, window, strict=True)),
+        ]
+    )
     turns = np.exp(1j * yaws[1:]) - cmath.rect(1.0, yaws[0])
-    found = []
-    for cause, model, sigma in (
-        (Cause.GNSS, seconds, TYPICAL_DRIFT),
-        (Cause.GNSS, even, TYPICAL_JUMP),
+    planar = [(Cause.GNSS, seconds, TYPICAL_DRIFT), (Cause.GNSS, even, TYPICAL_JUMP)]
+    if start.correlated < LARGEST_FIX_SIGMA:
         # other fixes err by more than any lever arm
-        *(((Cause.LEVER_ARM, turns, TYPICAL_LEVER_ARM),) if start.correlated < LARGEST_FIX_SIGMA else ()),
-    ):
-        (a, b), left, evidence = fit((model, sigma), (1j * model, sigma))
-        if cause is Cause.GNSS or left <= 2.0 * len(window) * LARGEST_REST:
+        planar.append((Cause.LEVER_ARM, turns, TYPICAL_LEVER_ARM))
+    largest = 2.0 * len(window) * LARGEST_REST
+    found = []
+    fits = fit.solve([((model, sigma), (1j * model, sigma)) for _, model, sigma in planar])
+    for (cause, _, _), ((a, b), left, evidence) in zip(planar, fits, strict=True):
+        if cause is Cause.GNSS or left <= largest:
             found.append(Inconsistency(cause, newest, math.hypot(a, b), none - evidence, lever_arm=complex(a, b)))
-    for cause, model in (
+    single = (
         (Cause.GYRO, 1j * moments),
         (Cause.WHEELS, paths),
         # before the window too, and from its start on
         (Cause.LATENCY, start.velocity - velocities),
         (Cause.LATENCY, -velocities),
-    ):
-        (factor,), left, evidence = fit((model, TYPICAL_CHANGE[cause]))
-        if left <= 2.0 * len(window) * LARGEST_REST:
-            turned = path[-1].rotation - start.rotation
-            found.append(Inconsistency(cause, newest, float(factor), none - evidence, turned=turned))
+    )
+    fits = fit.solve([((model, TYPICAL_CHANGE[cause]),) for cause, model in single])
+    for (cause, _), ((factor,), left, evidence) in zip(single, fits, strict=True):
+        if left <= largest:
+            found.append(Inconsistency(cause, newest, factor, none - evidence, turned=end.rotation - start.rotation))
     return found
+
+
+Column: TypeAlias = tuple[Vector, float]
+"""Errors (n) that one unit of a parameter adds along the window, complex, and the parameter's standard deviation."""
+
+
+class _WindowFit:
+    """Least squares of the errors of a window (n) by its usual parameters and one cause, each with its sigma.
+
+    The fits of causes with equally many parameters are solved together: numpy's overhead is most of the work.
+    """
+
+    def __init__(self, whiten: Vector, errors: Vector, usual: Sequence[Column]):
+        e = whiten @ errors
+        self._whiten = whiten.astype(complex)
+        self._measured = np.concatenate((e.real, e.imag))
+        self._usual = usual
+
+    def solve(self, causes: Sequence[Sequence[Column]]) -> list[tuple[list[float], float, float]]:
+        """Return for each cause its factors, the squares that remain, and -2 log of the evidence.
+
+        `causes` are the columns of each, equally many.
+        """
+        fits = [(*self._usual, *columns) for columns in causes]
+        m, k, n = len(fits), len(fits[0]), len(self._whiten)
+        columns = np.array([[vector for vector, _ in fit] for fit in fits], dtype=complex)
+        A = self._whiten @ np.ascontiguousarray(columns.transpose(0, 2, 1))
+        full = np.zeros((m, 2 * n + k, k))
+        full[:, :n], full[:, n : 2 * n] = A.real, A.imag
+        b = np.zeros(2 * n + k)
+        b[: 2 * n] = self._measured
+        for each, fit in zip(full, fits, strict=True):
+            each[2 * n :].flat[:: k + 1] = [1.0 / sigma for _, sigma in fit]
+        transposed = full.transpose(0, 2, 1)
+        information = transposed @ full
+        x = np.linalg.solve(information, (transposed @ b)[..., None])
+        rest = b - (full @ x)[..., 0]
+        sizes = np.linalg.slogdet(information)[1].tolist()
+        solutions = []
+        for fit, factors, row, size in zip(fits, x[:, len(self._usual) :, 0].tolist(), rest, sizes, strict=True):
+            left = float(row @ row)
+            size += 2.0 * sum(math.log(sigma) for _, sigma in fit)
+            solutions.append((factors, left, left + size))
+        return solutions
 
 
 def _get_window_covariance(
@@ -749,10 +805,18 @@ def _get_window_covariance(
     return np.asarray(C + np.diag([each.white**2 + MODEL_ERROR**2 for each in window]))
 
 
-def replay_path(start: PathNode, window: tuple[PathNode, ...]) -> list[PathNode]:
-    """Return the nodes of a window as they are with the gyro's bias, the wheels' scale and the latency of its start.
+class ReplayedNode(NamedTuple):
+    """Path, moment and rotation of a node (see `PathNode`), replayed."""
 
-    A state that follows the fixes changes all three, and so hides what has changed.
+    path: complex
+    moment: complex
+    rotation: float
+
+
+def replay_path(start: PathNode, window: tuple[PathNode, ...]) -> list[ReplayedNode]:
+    """Return the nodes of a window as they are with the gyro's bias and the wheels' scale of its start.
+
+    A state that follows the fixes changes both, and so hides what has changed.
     """
     found, before, turned = [], start, 0.0
     path, moment = start.path, start.moment
@@ -763,8 +827,7 @@ def replay_path(start: PathNode, window: tuple[PathNode, ...]) -> list[PathNode]
         turned += turn
         path += factor * (each.path - before.path)
         moment += factor * (each.moment - before.moment)
-        rotation = each.rotation - turned
-        found.append(each._replace(path=path, moment=moment, rotation=rotation, latency=start.latency))
+        found.append(ReplayedNode(path, moment, each.rotation - turned))
         before = each
     return found
 

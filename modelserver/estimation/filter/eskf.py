@@ -45,6 +45,7 @@ from modelserver.estimation.filter.error_layout import ATTITUDE, STRAPDOWN, Erro
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filterpy_import import import_kalman_filter
 from modelserver.messages import Decision, Verdict
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
 
@@ -119,8 +120,7 @@ class NavState(NamedTuple):
 
     def body_velocity(self, lever: Vector3) -> Vector3:
         """Return the velocity of a point of the body along the body axes."""
-        q = self.attitude
-        x, y, z = so3.rotate((q[0], -q[1], -q[2], -q[3]), self.velocity)
+        x, y, z = so3.rotate_back(self.attitude, self.velocity)
         (a, b, c), (d, e, f), (lx, ly, lz) = self.rate, self.gyro_bias, lever
         wx, wy, wz = a - d, b - e, c - f
         return (x + (wy * lz - wz * ly), y + (wz * lx - wx * lz), z + (wx * ly - wy * lx))
@@ -134,12 +134,11 @@ class NavState(NamedTuple):
     @property
     def up(self) -> Vector3:
         """N's up along the body axes."""
-        q = self.attitude
-        return so3.rotate((q[0], -q[1], -q[2], -q[3]), (0.0, 0.0, 1.0))
+        return so3.rotate_back(self.attitude, (0.0, 0.0, 1.0))
 
     def with_covariance(self, covariance: Array, extras: tuple[float, ...]) -> NavState:
         """Return the state with its covariance at its instant, and the additional states there."""
-        return NavState(*self[:6], extras, covariance, 0.0, ZERO, *self[10:])
+        return new_tuple(NavState, (*self[:6], extras, covariance, 0.0, ZERO, *self[10:]))
 
     def inject(self, error: Array, covariance: Array) -> NavState:
         """Return the state with an error (n) injected, and the covariance (n, n) after the reset (Sola 7.3)."""
@@ -155,16 +154,19 @@ class NavState(NamedTuple):
         vx, vy, vz = self.velocity
         gx, gy, gz = self.gyro_bias
         ax, ay, az = self.accelerometer_bias
-        return NavState(
-            self.utime,
-            (px + e[0], py + e[1], pz + e[2]),
-            (vx + e[3], vy + e[4], vz + e[5]),
-            attitude,
-            (gx + e[9], gy + e[10], gz + e[11]),
-            (ax + e[12], ay + e[13], az + e[14]),
-            tuple([value + delta for value, delta in zip(self.extras, e[15:], strict=True)]),
-            covariance,
-            *self[8:],
+        return new_tuple(
+            NavState,
+            (
+                self.utime,
+                (px + e[0], py + e[1], pz + e[2]),
+                (vx + e[3], vy + e[4], vz + e[5]),
+                attitude,
+                (gx + e[9], gy + e[10], gz + e[11]),
+                (ax + e[12], ay + e[13], az + e[14]),
+                tuple([value + delta for value, delta in zip(self.extras, e[15:], strict=True)]),
+                covariance,
+                *self[8:],
+            ),
         )
 
 
@@ -214,57 +216,54 @@ def propagate(nav: NavState, utime: int, rate: Vector3, force: Vector3, earth: E
     rate, force: IMU sample at `utime`, rad/s and m/s2 along the body axes, with its biases.
     base: from the IMU to the rolling frame's origin, body axes, m.
     """
-    dt = (utime - nav.utime) * 1e-6
-    gx, gy, gz = nav.gyro_bias
-    r, s = nav.rate, nav.force
-    wx, wy, wz = 0.5 * (r[0] + rate[0]) - gx, 0.5 * (r[1] + rate[1]) - gy, 0.5 * (r[2] + rate[2]) - gz
-    q = nav.attitude
-    ex, ey, ez = earth.rotation
+    # unpacked at once, and a call less for each product of rotations: an eighth of the work for every IMU sample
+    since, p, v, q, gyro_bias, accelerometer_bias, extras, P, lag, impulse, r, s, travel, rotation = nav
+    dt = (utime - since) * 1e-6
+    (r1, r2, r3), (r4, r5, r6), (gx, gy, gz) = r, rate, gyro_bias
+    wx, wy, wz = 0.5 * (r1 + r4) - gx, 0.5 * (r2 + r5) - gy, 0.5 * (r3 + r6) - gz
+    g, earth_rotation = earth
+    ex, ey, ez = earth_rotation
     if ez:
-        a, b, c = so3.rotate((q[0], -q[1], -q[2], -q[3]), earth.rotation)
+        a, b, c = so3.rotate_back(q, earth_rotation)
         wx, wy, wz = wx - a, wy - b, wz - c
-    ax, ay, az = nav.accelerometer_bias
-    mean_force = (0.5 * (s[0] + force[0]) - ax, 0.5 * (s[1] + force[1]) - ay, 0.5 * (s[2] + force[2]) - az)
+    (s1, s2, s3), (s4, s5, s6), (ax, ay, az) = s, force, accelerometer_bias
 
     h = 0.5 * dt
-    half = so3.small_angle_exponential((wx * h, wy * h, wz * h))
-    whole = so3.small_angle_exponential((wx * dt, wy * dt, wz * dt))
-    middle = so3.multiply(q, half)
-    fx, fy, fz = so3.rotate(middle, mean_force)
-    px, py, pz = nav.position
-    vx, vy, vz = nav.velocity
-    g = earth.gravity
+    middle = so3.turn(q, (wx * h, wy * h, wz * h))
+    fx, fy, fz = so3.rotate(middle, (0.5 * (s1 + s4) - ax, 0.5 * (s2 + s5) - ay, 0.5 * (s3 + s6) - az))
+    px, py, pz = p
+    vx, vy, vz = v
     # the vertical turns by 1 / radius for each meter from N's origin
     lean = g / EARTH_RADIUS
-    accx = fx - lean * px - 2.0 * (ey * vz - ez * vy)
-    accy = fy - lean * py - 2.0 * (ez * vx - ex * vz)
-    accz = fz - g + 2.0 * lean * pz - 2.0 * (ex * vy - ey * vx)
-    ux, uy, uz = vx + accx * dt, vy + accy * dt, vz + accz * dt
+    ux = vx + (fx - lean * px - 2.0 * (ey * vz - ez * vy)) * dt
+    uy = vy + (fy - lean * py - 2.0 * (ez * vx - ex * vz)) * dt
+    uz = vz + (fz - g + 2.0 * lean * pz - 2.0 * (ex * vy - ey * vx)) * dt
     mx, my, mz = 0.5 * (vx + ux), 0.5 * (vy + uy), 0.5 * (vz + uz)
-    bx, by, bz = so3.rotate((middle[0], -middle[1], -middle[2], -middle[3]), (mx, my, mz))
-    rx, ry, rz = nav.travel
-    ox, oy, oz = nav.rotation
-    ix, iy, iz = nav.impulse
-    lx, ly, lz = base
-    return NavState(
-        utime,
-        (px + mx * dt, py + my * dt, pz + mz * dt),
-        (ux, uy, uz),
-        so3.normalize(so3.multiply(q, whole)),
-        nav.gyro_bias,
-        nav.accelerometer_bias,
-        nav.extras,
-        nav.covariance,
-        nav.lag + dt,
-        (ix + fx * dt, iy + fy * dt, iz + fz * dt),
-        rate,
-        force,
+    bx, by, bz = so3.rotate_back(middle, (mx, my, mz))
+    turn = ox, oy, oz = (wx * dt, wy * dt, wz * dt)
+    (rx, ry, rz), (tx, ty, tz), (ix, iy, iz), (lx, ly, lz) = travel, rotation, impulse, base
+    return new_tuple(
+        NavState,
         (
-            rx + (bx + wy * lz - wz * ly) * dt,
-            ry + (by + wz * lx - wx * lz) * dt,
-            rz + (bz + wx * ly - wy * lx) * dt,
+            utime,
+            (px + mx * dt, py + my * dt, pz + mz * dt),
+            (ux, uy, uz),
+            so3.normalize(so3.turn(q, turn)),
+            gyro_bias,
+            accelerometer_bias,
+            extras,
+            P,
+            lag + dt,
+            (ix + fx * dt, iy + fy * dt, iz + fz * dt),
+            rate,
+            force,
+            (
+                rx + (bx + wy * lz - wz * ly) * dt,
+                ry + (by + wz * lx - wx * lz) * dt,
+                rz + (bz + wx * ly - wy * lx) * dt,
+            ),
+            (tx + ox, ty + oy, tz + oz),
         ),
-        (ox + wx * dt, oy + wy * dt, oz + wz * dt),
     )
 
 

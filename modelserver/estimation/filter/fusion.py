@@ -33,6 +33,7 @@ from modelserver.messages import (
     VehicleStatusSample,
     Verdict,
 )
+from modelserver.named_tuples import new_tuple
 
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
@@ -86,7 +87,7 @@ def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
     utime, source, seq = header.utime, header.source, header.seq
     items: list[Item] = []
     if isinstance(sample, ImuSample):
-        items.append(Item(utime, source, seq, 0, IMU, None, sample))
+        items.append(new_tuple(Item, (utime, source, seq, 0, IMU, None, sample)))
     elif isinstance(sample, SwitchMode):
         items.append(Item(utime, source, seq, 0, MODE, None, sample))
     elif isinstance(sample, VehicleStatusSample):

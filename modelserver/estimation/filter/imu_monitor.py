@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.sensor_rig import YawGyro
 from modelserver.messages import ImuSample
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
@@ -54,25 +55,26 @@ class ImuMonitor(NamedTuple):
 
     def update(self, utime: int, rate: Vector3, force: Vector3) -> ImuMonitor:
         """Return the monitor after a used sample; the caller sets `used_utime` back if it rejects the sample."""
-        if not self.utime:
-            return ImuMonitor(utime, rate, force, utime, (), 0, utime, self.is_interpolated)
-        dt = (utime - self.utime) * 1e-6
+        before, last_rate, last_force, _, last_slope, num_collinear, _, is_interpolated = self
+        if not before:
+            return ImuMonitor(utime, rate, force, utime, (), 0, utime, is_interpolated)
+        dt = (utime - before) * 1e-6
         if dt <= 0.0:
             return self._replace(used_utime=utime)
-        if rate == self.rate and force == self.force:
-            count = self.num_collinear + 1 if not self.slope else 1
+        if rate == last_rate and force == last_force:
+            count = num_collinear + 1 if not last_slope else 1
             return self._replace(utime=utime, slope=(), num_collinear=count, used_utime=utime)
-        (a, b, c), (d, e, f) = self.rate, self.force
+        (a, b, c), (d, e, f) = last_rate, last_force
         (g, h, i), (j, k, m) = rate, force
         slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
-        is_collinear = bool(self.slope)
-        if is_collinear:
-            for x, y in zip(slope, self.slope, strict=True):
+        count = 0
+        if last_slope:
+            for x, y in zip(slope, last_slope, strict=True):
                 if abs(x - y) > LINE_TOLERANCE * (0.3 + abs(x) + abs(y)):
-                    is_collinear = False
                     break
-        count = self.num_collinear + 1 if is_collinear else 0
-        return ImuMonitor(utime, rate, force, utime, slope, count, utime, self.is_interpolated)
+            else:
+                count = num_collinear + 1
+        return new_tuple(ImuMonitor, (utime, rate, force, utime, slope, count, utime, is_interpolated))
 
     @property
     def seems_interpolated(self) -> bool:
@@ -92,12 +94,16 @@ def read_imu(sample: ImuSample, mount: Quaternion) -> tuple[Vector3, Vector3] | 
     if rate is None or force is None:
         return "nan"
     (a, b, c), (d, e, f) = rate, force
-    if not (math.isfinite(a + b + c) and math.isfinite(d + e + f)):
-        return "nan"
-    if not (-MAX_RATE <= a <= MAX_RATE and -MAX_RATE <= b <= MAX_RATE and -MAX_RATE <= c <= MAX_RATE):
-        return "range"
-    if not (-MAX_FORCE <= d <= MAX_FORCE and -MAX_FORCE <= e <= MAX_FORCE and -MAX_FORCE <= f <= MAX_FORCE):
-        return "range"
+    # a comparison with nan is false
+    if not (
+        -MAX_RATE <= a <= MAX_RATE
+        and -MAX_RATE <= b <= MAX_RATE
+        and -MAX_RATE <= c <= MAX_RATE
+        and -MAX_FORCE <= d <= MAX_FORCE
+        and -MAX_FORCE <= e <= MAX_FORCE
+        and -MAX_FORCE <= f <= MAX_FORCE
+    ):
+        return "range" if math.isfinite(a + b + c) and math.isfinite(d + e + f) else "nan"
     return so3.rotate(mount, rate), so3.rotate(mount, force)
 
 

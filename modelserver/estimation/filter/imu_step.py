@@ -75,11 +75,12 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
     rate, force = values
     utime, settings = item.utime, setup.settings
     imu = state.imu.update(utime, rate, force)
-    if imu.get_frozen_time(utime) > settings.frozen_time:
+    # a sample that is like the one before it changed before
+    if imu.changed_utime != utime and imu.get_frozen_time(utime) > settings.frozen_time:
         imu = imu._replace(used_utime=state.imu.used_utime)
         return state._replace(imu=imu), (reject(item, "frozen"),)
     decisions = NOTHING
-    if imu.seems_interpolated != imu.is_interpolated:
+    if (imu.num_collinear or imu.is_interpolated) and imu.seems_interpolated != imu.is_interpolated:
         imu = imu._replace(is_interpolated=imu.seems_interpolated)
         if not isinstance(state, Leveling):
             # the process noise changes from here on
@@ -93,12 +94,11 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         if isinstance(leveled, Leveling) and leveled.tilt and not leveled.num_samples:
             return leveled, (reject(item, "gravity" if math.isinf(leveled.tilt) else "mount"),)
         return leveled, NOTHING
-    nav = state.nav
-    P = nav.covariance
-    bias_sigma = math.sqrt(max(P.item(9, 9), P.item(10, 10), P.item(11, 11)))
+    nav, used_utime = state.nav, state.imu.used_utime
+    variance_of = nav.covariance.item
+    bias_sigma = math.sqrt(max(variance_of(9, 9), variance_of(10, 10), variance_of(11, 11)))
     detector = state.stationary.update(utime, rate, force, nav.gyro_bias, bias_sigma, settings)
-    is_gap = (utime - state.imu.used_utime) * 1e-6 > settings.rate_hold and state.imu.used_utime > 0
-    if is_gap:
+    if (utime - used_utime) * 1e-6 > settings.rate_hold and used_utime > 0:
         state = propagation.advance(setup, state, utime)
         if max(np.diagonal(state.nav.covariance)[6:9]) > LOST_ATTITUDE_SIGMA**2:
             restarted = Leveling(state.common.restart())

@@ -6,6 +6,8 @@ Read top-down: `FilterLocalizer.process` -> `ClockMonitor.update` -> `Timeline.i
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from modelserver.earth.geodesy import Geodesy
@@ -14,7 +16,7 @@ from modelserver.estimation.filter.clock_monitor import IMU_RANK, ClockMonitor, 
 from modelserver.estimation.filter.fusion import IMU, Item, reject, split_sample
 from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Unaligned
+from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Navigating, Unaligned
 from modelserver.estimation.filter.step import start
 from modelserver.estimation.filter.stream_correlation import StreamCorrelation
 from modelserver.estimation.filter.timeline import Timeline
@@ -36,6 +38,7 @@ from modelserver.messages import (
     SwitchMode,
     WheelsSample,
 )
+from modelserver.named_tuples import new_tuple
 
 ODOM_STEP_US: Final = 15_000
 """Microseconds between two steps of Odom, at least: between them it is extrapolated by its twist."""
@@ -43,6 +46,9 @@ ODOM_STEP_US: Final = 15_000
 ODOM_HORIZON_US: Final = 2_000_000
 ODOM_SPACING_US: Final = 20_000
 """How far back poses in Odom are stored, and how close together, microseconds."""
+
+RANKS: Final[Mapping[type, int]] = MappingProxyType({ImuSample: IMU_RANK, WheelsSample: 1})
+"""Rank of the clock of each type of sample, see `ClockMonitor`; 0 of all others."""
 
 STEERING_TIMEOUT: Final = 1.0
 """Seconds without a usable steering angle after which that is reported; the wheels are used without it at once."""
@@ -119,8 +125,9 @@ class FilterLocalizer(NamedTuple):
         head = self.head
         if isinstance(head, Leveling):
             return 0
+        utime, newest = head.nav.utime, self.clocks.newest
         # a measurement that waits for IMU samples counts as processed
-        return max(head.nav.utime, self.clocks.newest) if self.setup.uses_imu(self.mode) else head.nav.utime
+        return newest if newest > utime and self.setup.uses_imu(head.common.mode) else utime
 
     @property
     def mode(self) -> Mode:
@@ -133,30 +140,31 @@ class FilterLocalizer(NamedTuple):
         Events are `PersistOrigin`, and a `Decision` for each measurement: at once for a rejected stamp, otherwise when
         the horizon has passed and no delayed measurement can change it any more.
         """
-        setup, header = self.setup, sample.header
-        items = split_sample(setup, sample)
+        setup, timeline, head, clocks, odom, odoms, is_origin_reported, streams = self
+        items, header = split_sample(setup, sample), sample.header
         if not items:
             return self, ()
-        streams = self.streams.update(setup, self.mode, sample)
-        if streams is not self.streams:
-            self = self._replace(streams=streams)
-        settings = setup.settings
-        name, rank = (type(sample).__name__, header.source), _get_rank(sample)
-        clocks, verdict = self.clocks.update(name, rank, items[0].utime, header.seq, settings)
-        if verdict is StampVerdict.STEPPED_BACK:
-            self = self._restart(items[0].utime)
-        elif verdict is not StampVerdict.GOOD:
-            return self._replace(clocks=clocks), (reject(items[0], verdict.value),)
-        oldest = clocks.newest - round(settings.horizon * 1e6)
+        if not streams.is_settled:
+            streams = streams.update(setup, head.common.mode, sample)
+            if streams is not self.streams:
+                self = self._replace(streams=streams)
+        first, kind = items[0], type(sample)
+        name, rank = (kind.__name__, header.source), RANKS.get(kind, 0)
+        clocks, verdict = clocks.update(name, rank, first.utime, header.seq, setup.settings)
+        if verdict is not StampVerdict.GOOD:
+            if verdict is not StampVerdict.STEPPED_BACK:
+                return self._replace(clocks=clocks), (reject(first, verdict.value),)
+            self = self._restart(first.utime)
+            timeline, head, odom, odoms, streams = self.timeline, self.head, self.odom, self.odoms, self.streams
+        oldest = clocks.newest - setup.horizon_us
         # a command takes effect at once; a measurement waits only for IMU samples that will be used
-        waits = setup.uses_imu(self.head.common.mode) and not isinstance(sample, SwitchMode)
+        waits = setup.uses_imu(head.common.mode) and kind is not SwitchMode
         limit = clocks.get_complete_utime() if waits else clocks.newest
+        budget = setup.settings.replay_budget
         events: tuple[LocalizerEvent, ...] = ()
-        timeline = None
-        if len(items) == 1:
-            timeline = self.timeline.append(setup, items[0], settings.replay_budget, limit, oldest)
-        if timeline is not None:
-            head = timeline.newest
+        appended = timeline.append(setup, items, budget, limit, oldest)
+        if appended is not None:
+            timeline, head, events = appended
         else:
             timeline, events = self._insert(items, oldest)
             if timeline is self.timeline:
@@ -165,19 +173,21 @@ class FilterLocalizer(NamedTuple):
             if again > 0 and rank < IMU_RANK:
                 afforded = clocks.spend_replays(name, again)
                 if afforded is None:
-                    return self._replace(clocks=clocks), (reject(items[0], "overload"),)
+                    return self._replace(clocks=clocks), (reject(first, "overload"),)
                 clocks = afforded
-            timeline = timeline.fuse(setup, settings.replay_budget, limit)
-            head = timeline.newest if timeline.is_fused(limit) else self._propagate_head(sample, items[0])
-        timeline, decisions = timeline.settle(oldest)
-        events += decisions
-        odom, odoms = self._advance_odom(head)
-        is_origin_reported, geodesy = self.is_origin_reported, head.common.geodesy
-        if not is_origin_reported and geodesy is not None:
+            timeline = timeline.fuse(setup, budget, limit)
+            head = timeline.newest if timeline.is_fused(limit) else self._propagate_head(sample, first)
+            timeline, decisions = timeline.settle(oldest)
+            events += decisions
+        if isinstance(head, Leveling):
+            odom = odom.stop(odom.utime)
+        elif head.nav.utime >= odom.utime + ODOM_STEP_US:
+            odom, odoms = self._advance_odom(head)
+        if not is_origin_reported and (geodesy := head.common.geodesy) is not None:
             is_origin_reported = True
             events = (*events, PersistOrigin(geodesy.origin))
-        found = FilterLocalizer(setup, timeline, head, clocks, odom, odoms, is_origin_reported, self.streams)
-        return found, events
+        found = (setup, timeline, head, clocks, odom, odoms, is_origin_reported, streams)
+        return new_tuple(FilterLocalizer, found), events
 
     def _insert(self, items: list[Item], oldest: int) -> tuple[Timeline, tuple[LocalizerEvent, ...]]:
         """Return the timeline with the items that are neither too old nor duplicates, and the decisions on the rest."""
@@ -208,12 +218,9 @@ class FilterLocalizer(NamedTuple):
                 return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, imu)
         return head
 
-    def _advance_odom(self, head: FilterState) -> tuple[Odometry, tuple[Odometry, ...]]:
+    def _advance_odom(self, head: Navigating) -> tuple[Odometry, tuple[Odometry, ...]]:
+        """Return Odom at a newer state, and the stored ones."""
         odom, odoms = self.odom, self.odoms
-        if isinstance(head, Leveling):
-            return odom.stop(odom.utime), odoms
-        if head.nav.utime < odom.utime + ODOM_STEP_US:
-            return odom, odoms
         odom = odom.advance(head.nav, self.setup.rig.base, head.constraints.is_stationary)
         if not odoms or odom.utime - odoms[-1].utime >= ODOM_SPACING_US:
             first = 1 if odoms and odom.utime - odoms[0].utime > ODOM_HORIZON_US else 0
@@ -248,7 +255,7 @@ class FilterLocalizer(NamedTuple):
         if not isinstance(state, Leveling) and utime < state.nav.utime:
             state = self.timeline.get_state_at(utime)
             odom = _get_odom_at(self.odoms, utime, odom)
-        return Deferred(self.setup, state, odom, utime, self.utime)
+        return new_tuple(Deferred, (self.setup, state, odom, utime, self.utime))
 
     def navigation(self, utime: int) -> NavigationState | None:
         """Return the whole state as of the newest sample; None before leveling."""
@@ -307,10 +314,6 @@ class FilterLocalizer(NamedTuple):
             )
             findings += (SensorFinding("gps", "direction", "sensors.gps", text),)
         return findings
-
-
-def _get_rank(sample: Sample | SwitchMode) -> int:
-    return IMU_RANK if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
 
 
 def _get_odom_at(odoms: tuple[Odometry, ...], utime: int, newest: Odometry) -> Odometry:

@@ -10,6 +10,7 @@ import math
 from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO, NavState
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
@@ -57,7 +58,7 @@ class Odometry(NamedTuple):
             speed_sigma = math.sqrt(P.item(3, 3) + P.item(4, 4))
             drift = min(drift + (speed_sigma + yaw_drift * math.hypot(*velocity)) * dt, 1e6)
             yaw_drift = min(yaw_drift + math.sqrt(P.item(11, 11)) * dt, 1e3)
-        return Odometry(nav.utime, position, attitude, velocity, rate, drift, yaw_drift, True)
+        return new_tuple(Odometry, (nav.utime, position, attitude, velocity, rate, drift, yaw_drift, True))
 
     def stop(self, utime: int) -> Odometry:
         """Return Odom at its pose from `utime` on, while the motion is unknown."""
@@ -67,7 +68,7 @@ class Odometry(NamedTuple):
         """Return the pose at an instant nearby, extrapolated by the twist within MAX_EXTRAPOLATION."""
         dt = max(-MAX_EXTRAPOLATION, min((utime - self.utime) * 1e-6, MAX_EXTRAPOLATION))
         position, attitude = _integrate(self, self.velocity, self.rate, dt)
-        return Pose(position, attitude)
+        return Pose.of_floats(position, attitude)
 
     def covariance(self) -> tuple[float, ...]:
         """Return the 36 numbers of the covariance of the pose in Odom."""
@@ -83,12 +84,11 @@ def _integrate(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> t
     (ax, ay, az), (bx, by, bz) = odom.rate, rate
     h, q = 0.5 * dt, odom.attitude
     tx, ty, tz = turn = ((ax + bx) * h, (ay + by) * h, (az + bz) * h)
-    middle = so3.multiply(q, so3.small_angle_exponential((0.5 * tx, 0.5 * ty, 0.5 * tz)))
+    middle = so3.turn(q, (0.5 * tx, 0.5 * ty, 0.5 * tz))
     (ux, uy, uz), (vx, vy, vz) = odom.velocity, velocity
     x, y, z = so3.rotate(middle, ((ux + vx) * h, (uy + vy) * h, (uz + vz) * h))
     px, py, pz = odom.position
-    attitude = so3.normalize(so3.multiply(q, so3.small_angle_exponential(turn)))
-    return (px + x, py + y, pz + z), attitude
+    return (px + x, py + y, pz + z), so3.normalize(so3.turn(q, turn))
 
 
 def _follow_tilt(attitude: Quaternion, up: Vector3, share: float) -> Quaternion:

@@ -45,24 +45,25 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     geodesy = state.common.geodesy
     origin = None if geodesy is None else geodesy.origin
     epoch = state.common.epoch
-    invalid = find_invalid(setup, state, utime)
+    invalid = _find_invalid_bits(setup, state, utime)
     X_odom = odom.pose(utime)
     if isinstance(state, Leveling):
-        return Estimate(utime, X_odom, invalid=invalid, pose_epoch=epoch, origin=origin)
+        return Estimate(utime, X_odom, invalid=_to_invalid(invalid), pose_epoch=epoch, origin=origin)
     predicted = propagation.predict(setup, state, utime + _get_sensor_delay_us(setup, state))
     nav = predicted.nav
-    quality = _find_quality(setup, predicted, nav, utime, newest)
+    velocity = nav.body_velocity(setup.rig.base)
+    quality = _find_quality(predicted, velocity[0], utime, newest)
     odom_covariance = odom.covariance()
     if not (isinstance(state, Aligned) and isinstance(predicted, Aligned)):
         return Estimate(
             utime,
             X_odom,
             odom_covariance=odom_covariance,
-            invalid=invalid,
+            invalid=_to_invalid(invalid),
             quality=quality,
             pose_epoch=epoch,
             origin=origin,
-            motion=compute_motion(setup, predicted, nav),
+            motion=compute_motion(setup, predicted, nav, velocity),
         )
     settings, gnss = setup.settings, state.gnss
     if nav.lag > FIRST_ORDER_LAG:
@@ -78,13 +79,13 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
     heading = monitor.bound_heading(heading, utime)
     if heading > settings.heading_limit:
-        invalid |= Invalid.STATIONARY_HEADING if state.is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
+        invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, PROTECTION_LEVEL_EXCEEDED
     if horizontal > _get_horizontal_limit(setup, state):
-        invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
+        invalid |= 256  # PROTECTION_LEVEL_EXCEEDED
         if gnss.num_rejected:
-            invalid |= Invalid.GPS_REJECTED
-    if invalid & Invalid.PROTECTION_LEVEL_EXCEEDED and monitor.cause is not None:
-        invalid |= Invalid.GNSS_INCONSISTENT
+            invalid |= 128  # GPS_REJECTED
+    if invalid & 256 and monitor.cause is not None:
+        invalid |= 8192  # GNSS_INCONSISTENT
     enu = utm = None
     if geodesy is not None:
         x, y, z = nav.point(setup.rig.base)
@@ -97,14 +98,14 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         utm,
         tuple(P.ravel().tolist()),
         odom_covariance,
-        invalid,
+        _to_invalid(invalid),
         quality,
         epoch,
         origin,
         horizontal,
         heading,
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
-        compute_motion(setup, predicted, nav),
+        compute_motion(setup, predicted, nav, velocity),
     )
 
 
@@ -179,18 +180,18 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
         limit -= monitor.horizontal_allowance
     C = nav.covariance
     p = protection_levels.compute_longest_variance(C) + settings.lever_arm_sigma**2
-    v, c = float(max(C[3, 3], C[4, 4])), float(max(C[0, 3], C[1, 4], 0.0))
+    v, c = max(C.item(3, 3), C.item(4, 4)), 2.0 * max(C.item(0, 3), C.item(1, 4), 0.0)
     q = setup.coasting.accelerometer
-
-    def level(t: float) -> float:
-        return k * math.sqrt(p + 2.0 * c * t + v * t * t + q * t**3 / 3.0)
-
-    if level(left) <= limit:
-        return left
-    low, high = 0.0, left
-    for _ in range(20):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if level(middle) <= limit else (low, middle)
+    low, high, t = 0.0, left, left
+    # at the end first, and then by bisection; written out, since it is a fifth of a pose's work
+    for _ in range(21):
+        if k * math.sqrt(p + c * t + v * t * t + q * t**3 / 3.0) <= limit:
+            if t == left:
+                return left
+            low = t
+        else:
+            high = t
+        t = 0.5 * (low + high)
     return low
 
 
@@ -224,17 +225,26 @@ def _compute_world_poses(
     except GeodesyError:
         return None, None
     return (
-        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(_enu_from_site(geodesy, site), attitude)),
-        Pose(utm, so3.multiply(grid, attitude)),
+        Pose.of_floats(geodesy.tangent.from_ecef(ecef), so3.multiply(_enu_from_site(geodesy, site), attitude)),
+        Pose.of_floats(utm, so3.multiply(grid, attitude)),
     )
 
 
 # --- validity -----------------------------------------------------------------------------------------------
 
 
+_to_invalid = lru_cache(maxsize=256)(Invalid)
+_to_quality = lru_cache(maxsize=256)(Quality)
+"""The flags of a number, at a fraction of the cost of calling the enumeration."""
+
+
 def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
     """Return the reasons against an estimate at `utime`, except for its protection levels."""
-    # numbers, not members: combining flags costs more than all else here
+    return _to_invalid(_find_invalid_bits(setup, state, utime))
+
+
+def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
+    """Return `find_invalid` as a number, for `estimate` to add to: combining flags costs more than all else here."""
     settings, common = setup.settings, state.common
     invalid = 0
     if isinstance(state, Aligned):
@@ -274,11 +284,11 @@ def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
     tilt = state.tilt if isinstance(state, Leveling) else compute_tilt(state.nav.up) > settings.maximum_tilt
     if tilt:
         invalid |= 1024  # TILTED
-    return Invalid(invalid)
+    return invalid
 
 
-def _find_quality(setup: Setup, state: Navigating, nav: NavState, utime: int, newest: int) -> Quality:
-    forward = nav.body_velocity(setup.rig.base)[0]
+def _find_quality(state: Navigating, forward: float, utime: int, newest: int) -> Quality:
+    """Return the quality of an estimate; `forward`: the speed along the rolling frame's own axis, m/s."""
     quality = 0
     if state.is_stationary or abs(forward) < SLOW:
         quality |= 1  # HEADING_FROM_GYRO
@@ -286,14 +296,17 @@ def _find_quality(setup: Setup, state: Navigating, nav: NavState, utime: int, ne
         quality |= 2  # PREDICTED
     if forward < -0.1 and not state.is_stationary:
         quality |= 32  # REVERSING
-    return Quality(quality)
+    return _to_quality(quality)
 
 
 # --- motion and navigation state ----------------------------------------------------------------------------
 
 
-def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMotion:
-    """Return the motion: the filter's velocity and angular rate, and the specific force without gravity."""
+def compute_motion(setup: Setup, state: Navigating, nav: NavState, velocity: Vector3) -> VehicleMotion:
+    """Return the motion: the filter's velocity and angular rate, and the specific force without gravity.
+
+    `velocity` is that of the rolling frame along the body axes, m/s.
+    """
     base = setup.rig.base
     lever = (-base[0], -base[1], -base[2])
     covariance = TwistCovariance(setup, nav)
@@ -308,7 +321,7 @@ def compute_motion(setup: Setup, state: Navigating, nav: NavState) -> VehicleMot
         tilt = g * g * max(P.item(6, 6), P.item(7, 7))
         bias = max(P.item(12, 12), P.item(13, 13), P.item(14, 14))
         sigma = math.sqrt(setup.settings.accelerometer_noise**2 / IMU_AVERAGING + bias + tilt)
-    return VehicleMotion(nav.body_velocity(base), nav.angular_rate, acceleration, lever, covariance, sigma)
+    return VehicleMotion(velocity, nav.angular_rate, acceleration, lever, covariance, sigma)
 
 
 class TwistCovariance(NamedTuple):

@@ -138,5 +138,5 @@ def _get_stationary_rate(state: Navigating, nav: NavState) -> Vector3:
     a, b, c = nav.gyro_bias
     if state.earth.rotation == ZERO:
         return nav.gyro_bias
-    x, y, z = so3.rotate(so3.conjugate(nav.attitude), state.earth.rotation)
+    x, y, z = so3.rotate_back(nav.attitude, state.earth.rotation)
     return (a + x, b + y, c + z)

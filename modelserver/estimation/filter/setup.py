@@ -30,8 +30,9 @@ class Setup:
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
     layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
     the configured sensors that cannot be used. `own` has the sources of measurements of installed packages with their
-    types. The process noises: `driving` on the IMU, `stationary`, `coasting` without any measurement of the motion,
-    `interpolated` on made-up IMU samples, `rolling` on wheels alone, `turning` on a gyro of the turn rate alone.
+    types. `horizon_us` is the horizon in microseconds. The process noises: `driving` on the IMU, `stationary`,
+    `coasting` without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone,
+    `turning` on a gyro of the turn rate alone.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Setup:
         self.kinds = tuple(kinds) or tuple(REGISTRY.values())
         created = [kind.create(rig, settings) for kind in self.kinds]
         present = [each for each in created if each is not None]
+        self.horizon_us = round(settings.horizon * 1e6)
         self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
         extras = [*gnss_states(settings)] if rig.gps_frame else [gnss_states(settings)[0]]
         if self.wheels is not None:

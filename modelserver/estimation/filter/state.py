@@ -25,6 +25,7 @@ from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 from modelserver.estimation.origin import OriginCapture
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Vector3
 
 
@@ -204,7 +205,7 @@ class Unaligned(NamedTuple):
     def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Unaligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
         alignment = self.alignment.update(self.nav, nav) if nav.utime > self.nav.utime else self.alignment
-        return Unaligned(nav, imu, stationary, alignment, *self[4:])
+        return new_tuple(Unaligned, (nav, imu, stationary, alignment, *self[4:]))
 
     def with_nav(self, nav: NavState) -> Unaligned:
         """Return the state propagated to a later instant."""
@@ -241,11 +242,11 @@ class Aligned(NamedTuple):
 
     def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Aligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
-        return Aligned(nav, imu, stationary, *self[3:])
+        return new_tuple(Aligned, (nav, imu, stationary, *self[3:]))
 
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""
-        return Aligned(nav, *self[1:])
+        return new_tuple(Aligned, (nav, *self[1:]))
 
 
 Navigating: TypeAlias = Unaligned | Aligned

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Vector3
 
 AVERAGING_TIME: Final = 0.3
@@ -67,42 +68,48 @@ class StationaryDetector(NamedTuple):
                 self.wheels_stationary,
                 self.wheels_utime,
             )
+        _, last_mean_rate, last_mean_force, rate_variance, force_variance, since, are_stationary, wheels_utime, _, _ = (
+            self
+        )
         gain = dt / (AVERAGING_TIME + dt)
         keep = 1.0 - gain
-        (mx, my, mz), (rx, ry, rz) = self.mean_rate, rate
+        (mx, my, mz), (rx, ry, rz) = last_mean_rate, rate
         dx, dy, dz = rx - mx, ry - my, rz - mz
-        rate_variance = keep * (self.rate_variance + gain * (dx * dx + dy * dy + dz * dz))
-        mean_rate = (mx + gain * dx, my + gain * dy, mz + gain * dz)
-        (fx, fy, fz), (gx, gy, gz) = self.mean_force, force
+        rate_variance = keep * (rate_variance + gain * (dx * dx + dy * dy + dz * dz))
+        mean_rate = ux, uy, uz = (mx + gain * dx, my + gain * dy, mz + gain * dz)
+        (fx, fy, fz), (gx, gy, gz) = last_mean_force, force
         ex, ey, ez = gx - fx, gy - fy, gz - fz
-        force_variance = keep * (self.force_variance + gain * (ex * ex + ey * ey + ez * ez))
+        force_variance = keep * (force_variance + gain * (ex * ex + ey * ey + ez * ez))
         mean_force = (fx + gain * ex, fy + gain * ey, fz + gain * ez)
-        a, b, c = mean_rate[0] - bias[0], mean_rate[1] - bias[1], mean_rate[2] - bias[2]
-        most = settings.stationary_rate + 4.0 * bias_sigma
-        if self.is_confirmed_by_wheels(utime):
-            most = max(most, CONFIRMED_RATE)
         is_quiet = (
-            rate_variance < 3.0 * settings.stationary_rate**2
-            and force_variance < 3.0 * settings.stationary_force**2
-            and a * a + b * b + c * c < most * most
+            rate_variance < 3.0 * settings.stationary_rate**2 and force_variance < 3.0 * settings.stationary_force**2
         )
-        are_rolling = self.wheels_stationary is False and (utime - self.wheels_utime) * 1e-6 < WHEELS_TIMEOUT
-        since, rate_sum, sum_time = 0, ZERO, 0.0
-        if is_quiet and not are_rolling:
+        if is_quiet:
+            bx, by, bz = bias
+            a, b, c = ux - bx, uy - by, uz - bz
+            most = settings.stationary_rate + 4.0 * bias_sigma
+            if self.is_confirmed_by_wheels(utime):
+                most = max(most, CONFIRMED_RATE)
+            are_rolling = are_stationary is False and (utime - wheels_utime) * 1e-6 < WHEELS_TIMEOUT
+            is_quiet = a * a + b * b + c * c < most * most and not are_rolling
+        rate_sum, sum_time = ZERO, 0.0
+        if is_quiet:
             sx, sy, sz = self.rate_sum
-            since = self.since or utime
             rate_sum, sum_time = (sx + rx * dt, sy + ry * dt, sz + rz * dt), self.sum_time + dt
-        return StationaryDetector(
-            utime,
-            mean_rate,
-            mean_force,
-            rate_variance,
-            force_variance,
-            since,
-            self.wheels_stationary,
-            self.wheels_utime,
-            rate_sum,
-            sum_time,
+        return new_tuple(
+            StationaryDetector,
+            (
+                utime,
+                mean_rate,
+                mean_force,
+                rate_variance,
+                force_variance,
+                (since or utime) if is_quiet else 0,
+                are_stationary,
+                wheels_utime,
+                rate_sum,
+                sum_time,
+            ),
         )
 
     def update_wheels(self, utime: int, are_stationary: bool | None) -> StationaryDetector:

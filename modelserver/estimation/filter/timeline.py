@@ -8,13 +8,15 @@ Items older than the horizon are settled: their decisions are final, and the sta
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from typing import Final, NamedTuple, TypeAlias
 
-from modelserver.estimation.filter.fusion import Item
+from modelserver.estimation.filter.fusion import NOTHING, Item
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
 from modelserver.estimation.filter.step import step
 from modelserver.messages import Decision
+from modelserver.named_tuples import new_tuple
 
 MAX_ITEMS: Final = 8192
 """Items within a horizon: more come from a flood, and are rejected."""
@@ -58,25 +60,44 @@ class Timeline(NamedTuple):
         """Return whether everything up to the instant `limit` is fused."""
         return self.num_fused == len(self.entries) or self.entries[self.num_fused].item.utime > limit
 
-    def append(self, setup: Setup, item: Item, budget: int, limit: int, oldest: int) -> Timeline | None:
-        """Return the timeline with an item more, all of it fused; None if the item does not follow all others.
+    def append(
+        self, setup: Setup, items: Sequence[Item], budget: int, limit: int, oldest: int
+    ) -> tuple[Timeline, FilterState, tuple[Decision, ...]] | None:
+        """Return the timeline with the items of a sample more, all fused and settled, and what follows from it.
 
-        The usual case of `insert` and `fuse`, at a fraction of their cost; `oldest` is the beginning of the horizon.
+        That is its newest state, and the settled decisions. None if the items do not follow all others. The usual case
+        of `insert`, `fuse` and `settle`, at a fraction of their cost; `oldest` is the beginning of the horizon.
         """
-        entries, num_fused = self.entries, self.num_fused
-        if not entries or not oldest <= item.utime <= limit or item.utime <= entries[-1].item.utime:
+        base, entries, num_fused = self.base, self.entries, self.num_fused
+        first = items[0]
+        utime = first.utime
+        if not entries or not oldest <= utime <= limit:
             return None
-        if num_fused == len(entries):
-            state, decisions = step(setup, self.newest, item)
-            return Timeline(self.base, (*entries, Entry(item, state, decisions)), num_fused + 1)
-        waiting = [each.item for each in entries[num_fused:]]
-        if len(waiting) >= budget:
+        if len(items) > 1 and any(each.utime != utime for each in items):
             return None
-        state, fused = self.newest, []
-        for each in (*waiting, item):
-            state, decisions = step(setup, state, each)
-            fused.append(Entry(each, state, decisions))
-        return Timeline(self.base, (*entries[:num_fused], *fused), len(entries) + 1)
+        newest = entries[-1].item
+        # one of the same source and instant may be a duplicate
+        if utime < newest.utime or (utime == newest.utime and first.source <= newest.source):
+            return None
+        waiting = len(entries) - num_fused
+        if waiting + len(items) > budget:
+            return None
+        state = self.newest
+        fused = []
+        for item in (*[entry.item for entry in entries[num_fused:]], *items) if waiting else items:
+            state, decisions = step(setup, state, item)
+            fused.append(new_tuple(Entry, (item, state, decisions)))
+        entries = (*entries[:num_fused], *fused) if waiting else (*entries, *fused)
+        # one or two at a time, and never the last one
+        cut, settled = 0, NOTHING
+        while entries[cut].item.utime < oldest:
+            settled += entries[cut].decisions
+            cut += 1
+        if cut:
+            before = entries[cut - 1].state
+            assert before is not None
+            base, entries = before, entries[cut:]
+        return new_tuple(Timeline, (base, entries, len(entries))), state, settled
 
     def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
         """Return the timeline with an item more, and the item that it replaces; or in one word why not.

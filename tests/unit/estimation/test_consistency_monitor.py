@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
+from modelserver.estimation.filter import consistency_monitor
 from modelserver.estimation.filter.consistency_monitor import (
     AGREEMENT_TIME,
     LONGEST_US,
@@ -384,3 +385,13 @@ def test_given_fixes_that_hardly_move_then_their_direction_shows_no_heading() ->
         start._replace(latency=0.0), end.node._replace(fix=start.fix + 0.01j, latency=0.0), NOISE, SETTINGS
     )
     assert abs(unmoved.turn) < 0.01
+
+
+@pytest.mark.parametrize("fault", [Fault(200.0, drift=0.5j), Fault(200.0, rate=0.02), Fault(200.0, scale=0.2)])
+def test_given_windows_that_are_left_out_then_the_causes_are_those_of_all_windows(
+    fault: Fault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [(each.t, each.found.cause) for each in drive(320.0, fault) if each.found is not None]
+    monkeypatch.setattr(consistency_monitor, "LARGEST_MARGIN", math.inf)
+    assert found
+    assert found == [(each.t, each.found.cause) for each in drive(320.0, fault) if each.found is not None]

@@ -150,3 +150,17 @@ def test_many_products_keep_a_unit_quaternion():
     for _ in range(20_000):
         pose = pose @ step
     assert abs(sum(value * value for value in pose.wxyz) - 1) < 1e-14
+
+
+@pytest.mark.parametrize("q", [(1.0, 0.0, 0.0, 0.0), (-0.3, 0.5, -0.0, 0.7), (2.0, -0.0, 0.0, 0.0)])
+def test_given_plain_floats_then_of_floats_has_the_bits_of_the_constructor(q):
+    p = (-0.0, 1.5, -2.0)
+    assert repr(Pose.of_floats(p, q)) == repr(Pose(p, q))
+    assert str((Pose.of_floats(p, q).xyz, Pose.of_floats(p, q).wxyz)) == str((Pose(p, q).xyz, Pose(p, q).wxyz))
+
+
+def test_given_numbers_that_are_not_finite_then_of_floats_raises_what_the_constructor_raises():
+    with pytest.raises(ValueError, match="3 finite numbers in meters"):
+        Pose.of_floats((1.0, NAN, 0.0), (1.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="finite and not zero"):
+        Pose.of_floats((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))

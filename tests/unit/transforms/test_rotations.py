@@ -111,3 +111,15 @@ def test_a_matrix_that_means_no_rotation_is_rejected(M, why):
 def test_skew_is_the_cross_product():
     v, u = (1.0, -2.0, 3.0), (0.5, 4.0, -1.0)
     np.testing.assert_allclose(so3.skew(v) @ u, np.cross(v, u))
+
+
+@pytest.mark.parametrize("v", [(0.0, 0.0, 0.0), (1e-9, -0.0, 2e-3), (0.05, -0.11, 0.02), (0.5, -1.0, 2.0)])
+def test_given_a_rotation_vector_then_turn_has_the_bits_of_the_product_with_its_exponential(v):
+    q = so3.normalize((0.3, -0.5, 0.7, 0.2))
+    assert repr(so3.turn(q, v)) == repr(so3.multiply(q, so3.small_angle_exponential(v)))
+
+
+@pytest.mark.parametrize("v", [(0.0, 0.0, 1.0), (-0.0, 3.0, -0.0), (1e-9, -7.0, 2e3), (-0.0, -0.0, -0.0)])
+@pytest.mark.parametrize("q", [so3.IDENTITY, (0.5, 0.5, -0.5, 0.5), so3.normalize((0.3, -0.5, 0.7, 0.2))])
+def test_given_a_vector_then_rotate_back_has_the_bits_of_the_rotation_by_the_conjugate(q, v):
+    assert repr(so3.rotate_back(q, v)) == repr(so3.rotate(so3.conjugate(q), v))
