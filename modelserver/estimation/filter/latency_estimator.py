@@ -42,9 +42,6 @@ CHANGE_SIGMA: Final = 0.1
 SEPARATE_CORRELATION: Final = 0.1
 """Correlation of heading and latency up to which fixes separate the two; on a steady circle it becomes 0.5."""
 
-TURN_SIGMA: Final = 0.15
-"""Standard deviation of a latency that may have changed while fixes cannot show it, seconds: the same, at most."""
-
 DRIFT_INFLATION: Final = 4.0
 """Inflation of the GNSS noise, in variance, from which the latency is inflated too."""
 
@@ -130,7 +127,7 @@ def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:
     if _is_separate(nav.covariance, at):
         return 0.0
     turn_rate = nav.rate[2] - nav.gyro_bias[2]
-    return max(TURN_SIGMA**2 - float(nav.covariance[at, at]), 0.0) * turn_rate * turn_rate
+    return max(CHANGE_SIGMA**2 - float(nav.covariance[at, at]), 0.0) * turn_rate * turn_rate
 
 
 def _is_separate(P: Array, at: int) -> bool:

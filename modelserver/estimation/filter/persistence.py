@@ -9,7 +9,7 @@ from typing import Final
 
 from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.errors import quote
-from modelserver.estimation.filter import propagation
+from modelserver.estimation.filter import propagation, protection_levels
 from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, Leveling
@@ -37,7 +37,14 @@ def get_persisted_state(setup: Setup, state: FilterState, invalid: int) -> Persi
         return None
     state = propagation.propagate_covariance(setup, state)
     nav = state.nav
-    numbers = tuple(nav.covariance.ravel().tolist())
+    P = nav.covariance
+    if isinstance(state, Aligned):
+        # the monitor is not stored: its bound of the heading is
+        level = protection_levels.compute_heading(float(P[8, 8]), setup.settings)
+        bound = state.consistency.bound_heading(level, nav.utime)
+        P = P.copy()
+        P[8, 8] = max(float(P[8, 8]), protection_levels.invert_heading(bound, setup.settings))
+    numbers = tuple(P.ravel().tolist())
     if not all(map(math.isfinite, (*numbers, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras))):
         return None
     pose = None

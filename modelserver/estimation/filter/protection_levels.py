@@ -54,3 +54,9 @@ def compute_heading(variance: float, settings: FilterSettings) -> float:
     """Return the heading protection level, rad, at most pi."""
     _, k = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     return min(k * math.sqrt(variance + HEADING_FLOOR**2), math.pi)
+
+
+def invert_heading(level: float, settings: FilterSettings) -> float:
+    """Return the variance of the heading that has a protection level, rad2: the reverse of `compute_heading`."""
+    _, k = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+    return max((level / k) ** 2 - HEADING_FLOOR**2, 0.0)

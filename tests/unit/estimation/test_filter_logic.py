@@ -686,4 +686,4 @@ def test_given_a_heading_that_goes_with_the_latency_then_it_is_not_inflated_but_
     variance = 0.05**2 + 0.5 * latency_estimator.CHANGE_SIGMA**2 if is_inflated else 0.05**2
     assert after.covariance[at, at] == pytest.approx(variance)
     of_heading = latency_estimator.compute_heading_variance(nav, SETUP.layout)
-    assert of_heading == pytest.approx(0.0 if is_inflated else 0.4**2 * (latency_estimator.TURN_SIGMA**2 - 0.05**2))
+    assert of_heading == pytest.approx(0.0 if is_inflated else 0.4**2 * (latency_estimator.CHANGE_SIGMA**2 - 0.05**2))
