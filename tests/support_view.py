@@ -1,12 +1,18 @@
-"""Logs of the Raptor's service for tests of the viewer: the real core and simulated sensors on a fake bus."""
+"""What tests of the viewer show: a log of the Raptor's service on a fake bus, and the demo."""
 
 from __future__ import annotations
 
 import math
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import lcm
 from support_daemon import write_raptor
+from support_lcm import MODELSERVER, run_process
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, ImuSample, JointSample, JointsSample, SensorHeader, WheelsSample
@@ -16,6 +22,9 @@ from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import encode
 from mstools.launch.drive import make_simulation
+
+if TYPE_CHECKING:
+    from mstools.view.sources import Source
 
 START = 1_750_000_000_000_000
 JOINTS_PERIOD_US = 20_000
@@ -68,6 +77,18 @@ def record_drive(folder: Path, seconds: float) -> Path:
         bus.publish(channels[type(event)], encode(event))
     bus.log.close()
     return path
+
+
+@contextmanager
+def follow_demo() -> Iterator[Source]:
+    """Run the demo, and yield its service as a source of the viewer."""
+    from mstools.view.sources import open_live
+
+    with run_process([*MODELSERVER, "demo", "--seconds", "300"], "", stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        with process.stdout:
+            found = next(match for line in process.stdout if (match := re.search(r"--url '?(udpm:[^\s']+)", line)))
+            yield open_live(found[1], "", 2.0)
 
 
 def make_joints(utime: int) -> JointsSample:

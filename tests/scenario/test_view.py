@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support_browser import choose, find_fields, needs_browser, show
-from support_lcm import MODELSERVER, run_process
-from support_view import record_drive
+from support_view import follow_demo, record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
@@ -21,7 +19,7 @@ from PIL import Image
 
 from mstools.commands.demo import find_vehicle_file
 from mstools.view.scene import PATH_COLOR, TRAIL_COLOR
-from mstools.view.sources import open_geometry, open_live, open_log
+from mstools.view.sources import open_geometry, open_log
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -127,16 +125,11 @@ def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow
 
 
 def test_given_the_demo_then_the_laser_nods_in_the_page_while_it_drives() -> None:
-    with run_process([*MODELSERVER, "demo", "--seconds", "300"], "", stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        with process.stdout:
-            found = next(match for line in process.stdout if (match := re.search(r"--url '?(udpm:[^\s']+)", line)))
-            source = open_live(found[1], "", 2.0)
-            with show(source) as page:
-                choose(page, "Frame", "FrontSICKLaser:Scan")
-                choose(page, "in", "Raptor:CG")
-                wait_until(page, lambda: page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0)
-                pitches: list[float] = []
-                wait_until(page, lambda: pitches.append(read_value(page, "pitch")) or np.ptp(pitches) > 10.0)
-                page.get_by_role("tab", name="State").click()
-                page.get_by_text(re.compile("^The pose is valid")).wait_for()
+    with follow_demo() as source, show(source) as page:
+        choose(page, "Frame", "FrontSICKLaser:Scan")
+        choose(page, "in", "Raptor:CG")
+        wait_until(page, lambda: page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0)
+        pitches: list[float] = []
+        wait_until(page, lambda: pitches.append(read_value(page, "pitch")) or np.ptp(pitches) > 10.0)
+        page.get_by_role("tab", name="State").click()
+        page.get_by_text(re.compile("^The pose is valid")).wait_for()
