@@ -175,8 +175,9 @@ class UdpReceiver:
             magic = packet[:4]
             if magic == _SHORT:
                 end = packet.find(0, _CHANNEL_AT)
-                if end > 0:
-                    return packet[_CHANNEL_AT:end], packet[end + 1 :]
+                channel = packet[_CHANNEL_AT:end]
+                if end > 0 and channel in self._assembler.channels:
+                    return channel, packet[end + 1 :]
             elif magic == _FRAGMENT:
                 message = self._assembler.add(sender, packet)
                 if message is not None:

@@ -90,6 +90,22 @@ def test_given_a_flood_of_packets_without_a_message_then_receive_returns_and_the
             assert wait_for(receiver) == (b"A", b"data")
 
 
+def test_given_a_kernel_without_the_filter_then_messages_of_other_channels_are_not_received(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "set_channel_filter", lambda receiving, channels: None)
+    with reserved_url() as url:
+        address = parse_udp_address(url)
+        assert address is not None
+        receiver = UdpReceiver(address)
+        receiver.subscribe("A")
+        publisher = lcm.LCM(url)
+        with closing(receiver):
+            for channel in ("OTHER", "AB", "A"):
+                publisher.publish(channel, b"data")
+            assert wait_for(receiver) == (b"A", b"data")
+
+
 # --- fragments ------------------------------------------------------------------------------------------------
 
 
