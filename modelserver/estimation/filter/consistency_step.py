@@ -159,7 +159,7 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
     if monitor.excludes_fixes:
         after = state._replace(consistency=monitor.trust(), gnss=state.gnss.restart(newest.utime))
         return after, (report_event(after, KIND, Verdict.USED, text),)
-    after = state._replace(consistency=_hold(setup, state).trust())
+    after = state._replace(consistency=hold_heading(setup, state, state.nav).trust())
     # the fixes have turned the state since
     P = state.nav.covariance.copy()
     P[8, 8] += (monitor.rotation - monitor.suspect.rotation) ** 2
@@ -167,18 +167,18 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tupl
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 
-def _hold(setup: Setup, state: Aligned) -> ConsistencyMonitor:
-    """Return the monitor with the bound of the heading before a correction."""
-    variance = float(state.nav.covariance[8, 8]) + compute_heading_variance(state.nav, setup.layout)
+def hold_heading(setup: Setup, state: Aligned, nav: NavState) -> ConsistencyMonitor:
+    """Return the monitor with the bound of the heading of `nav`, the state before a correction, as `held`."""
+    variance = float(nav.covariance[8, 8]) + compute_heading_variance(nav, setup.layout)
     level = protection_levels.compute_heading(variance, setup.settings)
-    return state.consistency.hold_heading(level, state.nav.utime)
+    return state.consistency.hold_heading(level, nav.utime)
 
 
 def _realign(
     setup: Setup, state: Aligned, newest: PathFix, alike: tuple[PathNode, ...], noise: PathNoise
 ) -> Aligned | None:
     """Return the state in a new epoch with the heading that fixes and path show; None if they do not show it."""
-    nav, held = state.nav, _hold(setup, state)
+    nav, held = state.nav, hold_heading(setup, state, state.nav)
     fit = fit_drift(alike, state.consistency.rotation, noise, setup.settings)
     if not (fit.is_steady and fit.excludes(state.consistency.drift_rate)):
         return None

@@ -22,7 +22,6 @@ from modelserver.estimation.filter import (
     latency_estimator,
     leveling,
     propagation,
-    protection_levels,
 )
 from modelserver.estimation.filter.eskf import Earth, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
@@ -206,9 +205,7 @@ def _fuse_aligned(
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
         state = correct_path(setup, state, uncorrected)
-        variance = float(nav.covariance[8, 8]) + latency_estimator.compute_heading_variance(nav, layout)
-        level = protection_levels.compute_heading(variance, settings)
-        state = state._replace(consistency=state.consistency.hold_heading(level, nav.utime))
+        state = state._replace(consistency=consistency_step.hold_heading(setup, state, nav))
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)
         nav = latency_estimator.inflate_latency(

@@ -283,7 +283,7 @@ def test_given_a_line_then_what_stands_on_it_is_found() -> None:
         (lambda d: d.delete(frame("on:13")), "no frame 'on:13'"),
         (lambda d: d.set_yaml(frame("on:12"), "13: {}"), "begins with 12:"),
         (lambda d: d.set_yaml(frame("on:12"), "12: {"), "line"),
-        (lambda d: d.set_yaml(frame("on:12"), "[" * 100_000), "nest"),
+        (lambda d: d.set_yaml(frame("on:12"), "[" * 100_000), "nests deeper"),
         (lambda d: d.set_yaml(frame("on:12"), "12: {description: \ud800}"), "no character"),
         (lambda d: d.set_pose(frame("on:12"), (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0)), "nan is no number"),
         (lambda d: d.set_pose(frame("on:12"), (0.0, 0.0, 0.0), (0.0, -math.inf, 0.0)), "-inf is no number"),
