@@ -73,7 +73,7 @@ def command(
     Queries the running daemon for the vehicle as it is now, or computes with --model or --config. There a payload,
     another mass or other positions of joints may be given: margin and loads are printed beside those without.
 
-    \\b
+    \b
     Example:
       modelserver dynamics --model config/raptor/geometry.yaml --joint FLEALateral=0.5 --equations
     """
