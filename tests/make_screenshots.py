@@ -109,7 +109,7 @@ def take_charts(name: str) -> None:
 
 def take(name: str, source: Source, tab: str = "", button: str = "", seconds: float = 3.0) -> None:
     """Write one screenshot, after a tab and a button were clicked and some seconds have passed."""
-    with show(source) as page:
+    with show(source, sharpness=1.0) as page:
         close_warning(page)
         if tab:
             page.get_by_role("tab", name=tab).click()
@@ -126,7 +126,7 @@ def take_editor(name: str) -> None:
     """Write the screenshot of the editor with a constraint selected."""
     file = find_vehicle_file()
     session = EditSession(EditedFile.open(file))
-    with show(open_geometry(file, {}), Editing(session)) as page:
+    with show(open_geometry(file, {}), Editing(session), sharpness=1.0) as page:
         close_warning(page)
         page.get_by_role("tab", name="Edit").click()
         select_item(page, "constraint", "FrontNoddingSICKFixed")
@@ -138,7 +138,7 @@ def take_editor(name: str) -> None:
 def write_picture(png: bytes, path: Path) -> None:
     """Write a picture with 128 colors, which halves its size."""
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    picture.quantize(128, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+    picture.quantize(128, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def close_warning(page: Page) -> None:

@@ -40,8 +40,11 @@ FEWER_PICTURES = """{
 
 
 @contextmanager
-def open_browser(link: str) -> Iterator[Page]:
-    """Open a link in a headless browser; errors of its console fail the test."""
+def open_browser(link: str, sharpness: float = 0.5) -> Iterator[Page]:
+    """Open a link in a headless browser; errors of its console fail the test.
+
+    `sharpness`: pixels along each side of the viewer's scene, not of its panels, relative to those of the page.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright, TemporaryDirectory() as folder:
@@ -57,6 +60,8 @@ def open_browser(link: str) -> Iterator[Page]:
         page.on("pageerror", lambda error: errors.append(str(error)))
         # nothing is loaded from the internet
         page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
+        if link.startswith("http"):
+            link += f"{'&' if '?' in link else '?'}fixedDpr={sharpness}"
         page.goto(link)
         yield page
         browser.close()
@@ -64,8 +69,8 @@ def open_browser(link: str) -> Iterator[Page]:
 
 
 @contextmanager
-def show(source: Source, editing: Editing | None = None) -> Iterator[Page]:
-    """Show a source of the viewer in a browser, with the viewer in a thread."""
+def show(source: Source, editing: Editing | None = None, sharpness: float = 0.5) -> Iterator[Page]:
+    """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_browser`."""
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
@@ -75,7 +80,7 @@ def show(source: Source, editing: Editing | None = None) -> Iterator[Page]:
     thread = threading.Thread(target=viewer.run, args=(stop.is_set,))
     thread.start()
     try:
-        with open_browser(served.link) as page:
+        with open_browser(served.link, sharpness) as page:
             page.get_by_role("tab", name="Query").wait_for()
             yield page
     finally:

@@ -67,6 +67,9 @@ CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
 GRID_LABELS: Final = 1
 """Labeled grid crossings on each side of the vehicle, at `LABEL_SPACING`."""
 
+AMBIENT_LIGHT: Final = 1.5
+"""Intensity of the light on sides that no lamp reaches; the lamp above has 3."""
+
 GIZMO_SCALE: Final = 0.2
 """Length of the gizmo's arrows, as a part of the size of the model."""
 
@@ -118,6 +121,11 @@ class VehicleScene:
         self.follow = True
         self.is_edited = False
         """Whether it has a gizmo: bodies are not clicked then, frames are."""
+        # without reflections and shadows, which show nothing of a geometry: where no graphics card draws them, the
+        # first picture would come seconds later
+        self._scene.configure_default_lights(cast_shadow=False)
+        self._scene.configure_environment_map(hdri=None)
+        self._scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
         self._world = self._scene.add_frame("/world", show_axes=False)
         self._vehicle = self._scene.add_frame("/world/vehicle", show_axes=False)
         self._scene.add_grid(
