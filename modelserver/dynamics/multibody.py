@@ -41,7 +41,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.dynamics.mass_covariance import MassUncertainty, iterate_center_covariance
-from modelserver.dynamics.rates import compute_turn_bias, compute_turn_rate
+from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.dynamics.tree import GROUND, Tree, TreeJoint, TreeLink, build_tree
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.geometry.inertia import RigidInertia
@@ -178,8 +178,7 @@ class Dynamics:
         self._vectors = [(slice(row, row + 3), slice(row + n, row + n + 4)) for n, row in enumerate(vectors)]
         # their rows and columns in the upper triangle
         self._blocks = [((rows, slice(rows.start, nv)), (slice(rows.stop), rows)) for rows, _ in self._vectors]
-        # dS q': each `_move` writes the rows of the rotation vectors, all others stay 0
-        self._bias = np.zeros(nv)
+        self._still = np.zeros(nv)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -446,15 +445,10 @@ class Dynamics:
         return values[self._order] if self._is_permutation else self._C.dot(values)
 
     def _move(self, v: Array, a: Array | None, turns: list[_Turn]) -> tuple[Array, Array]:
-        """Return Pinocchio's velocity S q' and its derivative S q'' + dS q' (None: q'' = 0), until the next call."""
-        w, bias = self._arrange(v), self._bias
-        dw = bias if a is None else self._arrange(a)
-        for rows, J, phi in turns:
-            rate = w[rows]
-            bias[rows] = compute_turn_bias(phi, rate.tolist(), -1.0)
-            w[rows] = J.dot(rate)
-            if a is not None:
-                dw[rows] = J.dot(dw[rows]) + bias[rows]
+        """Return Pinocchio's velocity S q' and its derivative S q'' + dS q' (None: q'' = 0)."""
+        w, dw = self._arrange(v), self._still.copy() if a is None else self._arrange(a)
+        for rows, _, phi in turns:
+            w[rows], dw[rows] = compute_turn_motion(phi, w[rows].tolist(), dw[rows].tolist(), -1.0)
         return w, dw
 
     def _pull_back(self, values: Any, turns: list[_Turn]) -> Array:

@@ -17,23 +17,33 @@ SMALL_ANGLE = 0.1
 """Radians below which the functions of the angle are taken from their series: the quotients lose digits there."""
 
 
-def compute_turn_bias(v: Vector3, rate: Vector3, sign: float = 1.0) -> Vector3:
-    """Return the angular acceleration of a rotation vector that changes at a constant rate: the derivative of J_l v'.
+def compute_turn_motion(
+    v: Vector3, rate: Vector3, change: Vector3 = (0.0, 0.0, 0.0), sign: float = 1.0
+) -> tuple[Vector3, Vector3]:
+    """Return angular velocity J_l v' and acceleration of a rotation vector, with v' and v''. `sign` -1: of J_r.
 
-    It is (v.v') (da v x v' + db v x (v x v')) + b v' x (v x v'). With `sign` -1 it is that of J_r v'.
+    The acceleration is J_l v'' + (v.v') (da v x v' + db v x (v x v')) + b v' x (v x v').
     """
     x, y, z = v
     dx, dy, dz = rate
+    ddx, ddy, ddz = change
     square = x * x + y * y + z * z
     along = x * dx + y * dy + z * dz
-    b, da, db = _get_coefficients(square)
+    a, b, da, db = _get_coefficients(square)
+    # sums of multiples: of crosses, of v, of v' and v''
+    c, n = sign * a, 1.0 - b * square
+    m = b * along
+    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
     k = sign * along * da
-    m = along * along * db + b * (dx * dx + dy * dy + dz * dz)
-    n = -along * (square * db + b)
+    dm = along * along * db + b * (dx * dx + dy * dy + dz * dz + x * ddx + y * ddy + z * ddz)
+    dn = -along * (square * db + b)
     return (
-        k * (y * dz - z * dy) + m * x + n * dx,
-        k * (z * dx - x * dz) + m * y + n * dy,
-        k * (x * dy - y * dx) + m * z + n * dz,
+        (c * cx + m * x + n * dx, c * cy + m * y + n * dy, c * cz + m * z + n * dz),
+        (
+            k * cx + c * (y * ddz - z * ddy) + dm * x + dn * dx + n * ddx,
+            k * cy + c * (z * ddx - x * ddz) + dm * y + dn * dy + n * ddy,
+            k * cz + c * (x * ddy - y * ddx) + dm * z + dn * dz + n * ddz,
+        ),
     )
 
 
@@ -46,7 +56,7 @@ def compute_turn_rate(v: Vector3, velocity: Vector3, sign: float = 1.0) -> Vecto
     dx, dy, dz = velocity
     square = x * x + y * y + z * z
     if square < SMALL_ANGLE * SMALL_ANGLE:
-        c = 1.0 / 12.0 + square / 720.0 + square * square / 30240.0 + square * square * square / 1209600.0
+        c = 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0 + square / 1209600.0))
     elif square < math.inf:
         half = 0.5 * math.sqrt(square)
         c = (1.0 - half / math.tan(half)) / square
@@ -62,19 +72,21 @@ def compute_turn_rate(v: Vector3, velocity: Vector3, sign: float = 1.0) -> Vecto
     )
 
 
-def _get_coefficients(square: float) -> tuple[float, float, float]:
-    """Return b, da and db of the squared angle."""
+def _get_coefficients(square: float) -> tuple[float, float, float, float]:
+    """Return a, b, da and db of the squared angle."""
     if square < SMALL_ANGLE * SMALL_ANGLE:
         return (
-            1.0 / 6.0 - square / 120.0 + square * square / 5040.0,
-            -1.0 / 12.0 + square / 180.0 - square * square / 6720.0,
-            -1.0 / 60.0 + square / 1260.0 - square * square / 60480.0,
+            1.0 / 2.0 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)),
+            1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)),
+            -1.0 / 12.0 + square * (1.0 / 180.0 - square * (1.0 / 6720.0 - square / 453600.0)),
+            -1.0 / 60.0 + square * (1.0 / 1260.0 - square * (1.0 / 60480.0 - square / 4989600.0)),
         )
     if not square < math.inf:
-        return (math.nan,) * 3
+        return (math.nan,) * 4
     angle = math.sqrt(square)
     sine, versine = math.sin(angle), 2.0 * math.sin(angle / 2.0) ** 2
     return (
+        versine / square,
         (angle - sine) / (square * angle),
         (angle * sine - 2.0 * versine) / (square * square),
         (angle * versine - 3.0 * (angle - sine)) / (square * square * angle),

@@ -12,7 +12,7 @@ from support_dynamics import MOVING, MujocoTwin, is_close, random_inertia, rando
 
 from modelserver import load_model
 from modelserver.dynamics import CenterOfMass, Dynamics, MassUncertainty
-from modelserver.dynamics.rates import compute_turn_bias, compute_turn_rate
+from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.errors import LimitError, MalformedRequestError, UnknownFrameError
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
 from modelserver.geometry.inertia import RigidInertia
@@ -138,14 +138,15 @@ def test_given_force_on_surroundings_then_it_enters_the_bias_with_its_jacobian()
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("size", [1e-6, 0.05, 0.099, 0.101, 1.0, 3.5])
-def test_given_rate_of_rotation_vector_then_bias_and_inverse_are_those_of_its_jacobian(sign, size):
+def test_given_rate_of_rotation_vector_then_motion_and_inverse_are_those_of_its_jacobian(sign, size):
     rng = np.random.default_rng(5)
-    phi, rate = size * rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3)
+    phi, (rate, change) = size * rng.uniform(-1, 1, 3), rng.uniform(-1, 1, (2, 3))
     h = 1e-4
     ahead, at, behind = (so3.left_jacobian(sign * (phi + step * rate)) for step in (h, 0.0, -h))
-    bias = compute_turn_bias(tuple(phi), tuple(rate), sign)
-    assert bias == pytest.approx((ahead - behind) @ rate / (2 * h), abs=1e-7)
-    assert compute_turn_rate(tuple(phi), tuple(at @ rate), sign) == pytest.approx(rate, abs=1e-11)
+    velocity, acceleration = compute_turn_motion(tuple(phi), tuple(rate), tuple(change), sign)
+    assert velocity == pytest.approx(at @ rate, abs=1e-11)
+    assert acceleration == pytest.approx(at @ change + (ahead - behind) @ rate / (2 * h), abs=1e-7)
+    assert compute_turn_rate(tuple(phi), velocity, sign) == pytest.approx(rate, abs=1e-14)
 
 
 @pytest.mark.parametrize("seed", [7, 12, 4], ids=["permutation", "backward vectors", "mimics"])
