@@ -10,16 +10,22 @@ With generalized coordinates q, the mass matrix D, joint forces tau, and forces 
 The coordinates are those of the geometry's joints, in the order of the file and with their names; mimic joints have
 none of their own. A floating base adds six before them, as of a joint of type `floating` from the world to the root
 frame: position x y z, then rotation vector rx ry rz, in a world whose z axis points up. tau of a rotation vector is
-the force that does work on it: with the map S below, S' times the torque along the axes of the far frame.
+the force that does work on it: with the map S below, S^T times the torque along the axes of the far frame.
 
-Pinocchio computes in its own velocities w = S(q) q' (`rates`), where a mimic joint adds a row with its multiplier. The
-equations above follow by the principle of virtual work:
+Pinocchio computes in its own velocities w = S(q) q'. A joint is there a row of prismatic, revolute and spherical ones
+without mass between them, so that S = T(q) C. Each row of the constant C has one coordinate: C is a permutation, with
+signs where a rotation vector is passed backward, and further rows, with multipliers, for mimic joints. T is the
+identity but for a block J_r(v) on the rows of each rotation vector v (`rates`). The equations above follow by the
+principle of virtual work, with dS the derivative of S by time and ^T the transpose:
 
-    D = S' D_w S,   tau = S' RNEA(q, S q', S q'' + S' q'),   S q'' = ABA(q, S q', S^-T tau) - S' q'
+    D = S^T D_w S,   tau = S^T RNEA(q, S q', S q'' + dS q'),   S q'' = ABA(q, S q', S^-T tau) - dS q'
 
-Forward dynamics uses ABA where S is square, else (mimic joints) solves (8) with D, which is positive definite
-unless a coordinate moves no mass. Algorithms: Featherstone (2008), ch. 5 to 7 (RNEA, CRBA, ABA); centroidal
-momentum: Orin, Goswami, Lee (2013).
+Forward dynamics uses ABA where C has an inverse, its transpose; else (mimic joints) it solves (8) with D, which is
+positive definite unless a coordinate moves no mass. Algorithms: Featherstone (2008), ch. 5 to 7 (RNEA, CRBA, ABA);
+centroidal momentum: Orin, Goswami, Lee (2013).
+
+A call of Pinocchio takes 1 to 8 us, as long as a few of numpy. So S is never formed: a permutation is an index, and the
+blocks are multiplied in place.
 
 Limits: rigid bodies, no friction, damping or springs (they enter as tau); a rotation vector is singular at 2 pi; loops
 as in `tree`. Numbers that are not finite give results that are not.
@@ -35,7 +41,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.dynamics.mass_covariance import MassUncertainty, iterate_center_covariance
-from modelserver.dynamics.rates import compute_configuration, compute_rate_bias, compute_rate_map
+from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.dynamics.tree import GROUND, Tree, TreeJoint, TreeLink, build_tree
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.geometry.inertia import RigidInertia
@@ -58,6 +64,11 @@ Values: TypeAlias = npt.ArrayLike | Mapping[str, float]
 Forces: TypeAlias = Mapping[str, npt.ArrayLike]
 """By the name of a frame the force and moment (6,) of the vehicle on its surroundings at the frame's origin, along the
 axes of the world: N, N m."""
+
+_FLOAT: Final = np.dtype(float)
+
+_Turn: TypeAlias = tuple[slice, Array, so3.Vector3]
+"""The rows of a rotation vector in Pinocchio's velocity, its block J_r (3, 3) of the map S, and the vector."""
 
 
 class CenterOfMass(NamedTuple):
@@ -141,7 +152,8 @@ class Dynamics:
         self.uncertainty = uncertainty
         self.gravitational_acceleration = gravity
         self.mass = math.fsum(link.inertia.mass for link in self.tree.links.values() if link.inertia is not None)
-        self._pin, self._model, self._turns = _build_pinocchio(self.tree, gravity)
+        # Pinocchio's number of the last joint of each in the tree
+        self._pin, self._model, self._last, C, offset, vectors = _build_pinocchio(tree, gravity)
         self._data = self._model.createData()
         # what stands on a fixed base: Pinocchio leaves it out of its sums
         fixed = [each for each in self.tree.links.values() if each.joint == GROUND and each.inertia is not None]
@@ -150,27 +162,23 @@ class Dynamics:
         self._ground_share = np.array(self._ground.center) * (self._ground.mass / (self.mass or 1.0))
         self._columns = {name: number for number, name in enumerate(tree.coordinates)}
         self._default = np.array(tree.defaults)
-        self._configured: tuple[bytes, Array, Array] = (b"none", self._default, self._default)
-        # rows of Pinocchio's velocity, and numbers of its configuration, of each joint
-        self._rows = [slice(each.idx_v, each.idx_v + each.nv) for each in self._model.joints[1:]]
-        self._numbers = [slice(each.idx_q, each.idx_q + each.nq) for each in self._model.joints[1:]]
-        self._several = [n for n, each in enumerate(tree.joints) if each.joint.count > 1]
-        self._S = np.zeros((self._model.nv, len(tree.coordinates)))
-        self._q_offset = np.zeros(self._model.nq)
-        self._Q = np.zeros((self._model.nq, len(tree.coordinates)))
-        for each, rows, numbers in zip(tree.joints, self._rows, self._numbers, strict=True):
-            if each.joint.count == 1:
-                self._S[rows, each.columns[0]] = self._Q[numbers, each.columns[0]] = each.multiplier
-                self._q_offset[numbers] = each.offset
-        n = len(tree.coordinates)
-        self._is_square = self._model.nv == n
-        # where Pinocchio's coordinates are ours, maybe in another order
-        self._is_direct = (
-            self._is_square and not self._several and not self._q_offset.any() and _is_permutation(self._S)
-        )
-        self._order = self._inverse_order = None
-        if self._is_direct and not np.array_equal(self._S, np.eye(n)):
-            self._order, self._inverse_order = self._S.argmax(axis=1), self._S.argmax(axis=0)
+        self._shape = self._default.shape
+        self._configured: tuple[bytes, Array, list[_Turn]] = (b"none", self._default, [])
+        nv = self._model.nv
+        self._C, self._offset = C, offset if offset.any() else None
+        self._is_invertible = np.array_equal(C @ C.T, np.eye(nv))
+        self._is_permutation = self._is_invertible and bool((C >= 0.0).all())
+        # the coordinate of each row of Pinocchio's, and the row of each coordinate
+        self._order, self._rows = np.nonzero(C)[1], np.nonzero(C.T)[1]
+        rows = self._rows if self._is_permutation else np.arange(nv)
+        # the entries of D in the upper triangle of D_w: so D is symmetric to the last bit
+        self._entries = np.minimum.outer(rows, rows) * nv + np.maximum.outer(rows, rows)
+        # a quaternion has one number more than a rotation vector
+        self._numbers = np.insert(np.arange(nv), [row + 3 for row in vectors], 0)
+        self._vectors = [(slice(row, row + 3), slice(row + n, row + n + 4)) for n, row in enumerate(vectors)]
+        # their rows and columns in the upper triangle
+        self._blocks = [((rows, slice(rows.start, nv)), (slice(rows.stop), rows)) for rows, _ in self._vectors]
+        self._still = np.zeros(nv)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -198,70 +206,66 @@ class Dynamics:
 
     def mass_matrix(self, q: Values) -> Array:
         """Return the mass matrix D(q) (n, n), symmetric (eq. 7)."""
-        q, q_pin, S = self._configure(q)
-        D = self._pin.crba(self._model, self._data, q_pin).reshape((self._model.nv,) * 2)
-        if self._is_direct:
-            return np.array(D) if self._inverse_order is None else D[self._inverse_order][:, self._inverse_order]
-        D = S.T @ D @ S
-        return np.asarray((D + D.T) / 2.0)
+        _, q_pin, turns = self._configure(q)
+        D = self._pin.crba(self._model, self._data, q_pin)
+        # S^T D S, in the upper triangle
+        for (right, above), (_, J, _) in zip(self._blocks, turns, strict=True):
+            D[right] = J.T.dot(D[right])
+            D[above] = D[above].dot(J)
+        found: Array = D.take(self._entries)
+        if not self._is_permutation:
+            found = self._C.T @ found @ self._C
+            found = (found + found.T) / 2.0
+        return found
 
     def bias(self, q: Values, v: Values, forces: Forces | None = None) -> Array:
         """Return the bias vector b(q, q') (n,) with the forces `forces` on the surroundings (eq. 9)."""
-        q, q_pin, S = self._configure(q)
-        v = self._read(v, "v")
-        if self._is_direct:
-            tau = self._restore(self._pin.nonLinearEffects(self._model, self._data, q_pin, self._arrange(v)))
-        else:
-            tau = S.T @ self._pin.rnea(self._model, self._data, q_pin, S @ v, self._rate_bias(q, v))
-        return tau if forces is None else tau + self._project(q, forces)
+        return self._compute_forces(q, v, None, forces)
 
     def gravity(self, q: Values) -> Array:
         """Return the gravity vector G(q) (n,): the joint forces that hold the vehicle still."""
-        _, q_pin, S = self._configure(q)
-        tau = self._pin.computeGeneralizedGravity(self._model, self._data, q_pin)
-        return self._restore(tau) if self._is_direct else np.asarray(S.T @ tau)
+        _, q_pin, turns = self._configure(q)
+        return self._pull_back(self._pin.computeGeneralizedGravity(self._model, self._data, q_pin), turns)
 
     def inverse(self, q: Values, v: Values, a: Values, forces: Forces | None = None) -> Array:
         """Return the joint forces tau (n,) that cause the accelerations a = q'' (eq. 7)."""
-        q, q_pin, S = self._configure(q)
-        v, a = self._read(v, "v"), self._read(a, "a")
-        if self._is_direct:
-            v, a = self._arrange(v), self._arrange(a)
-            tau = self._restore(self._pin.rnea(self._model, self._data, q_pin, v, a))
-        else:
-            tau = S.T @ self._pin.rnea(self._model, self._data, q_pin, S @ v, S @ a + self._rate_bias(q, v))
-        return tau if forces is None else tau + self._project(q, forces)
+        return self._compute_forces(q, v, self._read(a, "a"), forces)
 
     def forward(self, q: Values, v: Values, tau: Values, forces: Forces | None = None) -> Array:
         """Return the accelerations q'' (n,) that joint forces cause (eq. 10).
 
         Raises MalformedRequestError, naming the coordinate, where one moves no mass.
         """
-        q, q_pin, S = self._configure(q)
+        q, q_pin, turns = self._configure(q)
         v, tau = self._read(v, "v"), self._read(tau, "tau")
         if forces is not None:
             tau = tau - self._project(q, forces)
-        try:
-            if self._is_direct:
-                a_pin = self._pin.aba(self._model, self._data, q_pin, self._arrange(v), self._arrange(tau))
-                a = self._restore(a_pin)
-            elif self._is_square:
-                a_pin = self._pin.aba(self._model, self._data, q_pin, S @ v, np.linalg.solve(S.T, tau))
-                a = np.asarray(np.linalg.solve(S, a_pin - self._rate_bias(q, v)))
-            else:
-                D = self.mass_matrix(q)
+        if self._is_invertible:
+            w, dw = self._move(v, None, turns)
+            tau_pin = self._arrange(tau)
+            for rows, _, phi in turns:
+                tau_pin[rows] = compute_turn_rate(phi, tau_pin[rows].tolist())
+            a_pin = self._pin.aba(self._model, self._data, q_pin, w, tau_pin)
+            for rows, _, phi in turns:
+                a_pin[rows] = compute_turn_rate(phi, (a_pin[rows] - dw[rows]).tolist(), -1.0)
+            a = self._pull_back(a_pin, [])
+        else:
+            D = self.mass_matrix(q)
+            try:
                 np.linalg.cholesky(D)  # raises where D is not positive definite
                 a = np.asarray(np.linalg.solve(D, tau - self.bias(q, v)))
-        except np.linalg.LinAlgError:
-            a = np.full(len(q), math.nan)
-        if not np.isfinite(a).all() and np.isfinite(q).all() and np.isfinite(v).all() and np.isfinite(tau).all():
+            except np.linalg.LinAlgError:
+                a = np.full(len(q), math.nan)
+        # plain floats: a sum that overflows is no warning
+        if not math.isfinite(sum(a.tolist())) and np.isfinite((q, v, tau)).all() and not np.isfinite(a).all():
             raise self._singular_error(q)
         return a
 
     def kinetic_energy(self, q: Values, v: Values) -> float:
         """Return the kinetic energy, J."""
-        _, q_pin, S = self._configure(q)
-        return float(self._pin.computeKineticEnergy(self._model, self._data, q_pin, S @ self._read(v, "v")))
+        _, q_pin, turns = self._configure(q)
+        w, _ = self._move(self._read(v, "v"), None, turns)
+        return float(self._pin.computeKineticEnergy(self._model, self._data, q_pin, w))
 
     def potential_energy(self, q: Values) -> float:
         """Return the potential energy, J; 0 with all mass at the height of the world's origin."""
@@ -273,13 +277,12 @@ class Dynamics:
 
         The rate is nan without accelerations `a`.
         """
-        q, q_pin, S = self._configure(q)
-        v = self._read(v, "v")
+        _, q_pin, turns = self._configure(q)
+        w, dw = self._move(self._read(v, "v"), None if a is None else self._read(a, "a"), turns)
         if a is None:
-            h = self._pin.computeCentroidalMomentum(self._model, self._data, q_pin, S @ v)
+            h = self._pin.computeCentroidalMomentum(self._model, self._data, q_pin, w)
             return np.array(h.vector), np.full(6, math.nan)
-        a_pin = S @ self._read(a, "a") + self._rate_bias(q, v)
-        self._pin.computeCentroidalMomentumTimeVariation(self._model, self._data, q_pin, S @ v, a_pin)
+        self._pin.computeCentroidalMomentumTimeVariation(self._model, self._data, q_pin, w, dw)
         return np.array(self._data.hg.vector), np.array(self._data.dhg.vector)
 
     def center_of_mass(
@@ -295,7 +298,7 @@ class Dynamics:
             raise MalformedRequestError(
                 "there is no center of mass: no body has a mass; state one in the geometry file"
             )
-        q, q_pin, S = self._configure(q)
+        q, q_pin, turns = self._configure(q)
         velocity, share = None, self._moving_mass / self.mass
         c = self._ground_share
         if share:  # else Pinocchio divides by no mass
@@ -303,7 +306,7 @@ class Dynamics:
         if v is not None:
             v, velocity = self._read(v, "v"), np.zeros(3)
             if share:
-                self._pin.centerOfMass(self._model, self._data, q_pin, S @ v)
+                self._pin.centerOfMass(self._model, self._data, q_pin, self._move(v, None, turns)[0])
                 velocity = share * self._data.vcom[0]
         if frame:
             X = self.frame_pose(q, frame)
@@ -364,7 +367,7 @@ class Dynamics:
         found = []
         for link, X_FP in located:
             if link.joint != GROUND:
-                M = self._data.oMi[link.joint + 1]
+                M = self._data.oMi[self._last[link.joint]]
                 X_FP = Pose(M.translation.tolist(), so3.from_matrix(M.rotation)) @ X_FP
             found.append(X_FP)
         return found
@@ -372,30 +375,31 @@ class Dynamics:
     def jacobian(self, q: Values, frame: str) -> Array:
         """Return the Jacobian (6, n) of a frame: J q' is its velocity and angular velocity along the world's axes."""
         link, X_FP = self._locate(frame)
-        q, q_pin, S = self._configure(q)
+        q, q_pin, turns = self._configure(q)
         if link.joint == GROUND:
             return np.zeros((6, len(q)))
-        pin = self._pin
+        pin, number = self._pin, self._last[link.joint]
         pin.computeJointJacobians(self._model, self._data, q_pin)
-        J = pin.getJointJacobian(self._model, self._data, link.joint + 1, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        J = pin.getJointJacobian(self._model, self._data, number, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         J = np.array(J).reshape(6, self._model.nv)  # one column comes as a vector
-        arm = self._data.oMi[link.joint + 1].rotation @ X_FP.position
+        arm = self._data.oMi[number].rotation @ X_FP.position
         J[:3] -= so3.skew(arm) @ J[3:]
-        return np.asarray(J @ S)
+        return self._pull_back(J.T, turns).T
 
     def _locate(self, frame: str) -> tuple[TreeLink, Pose]:
-        """Return the link of a frame's body, and the frame's pose in Pinocchio's frame of the link's joint."""
+        """Return the link of a frame's body, and the frame's pose in the far frame of the link's joint."""
         found = self.model.frame(frame)
         link = self.tree.links.get(found.body)
         if link is None:
             raise MalformedRequestError(
                 f"frame {frame} is not joined to {self.tree.root}; its dynamics is not computed"
             )
-        X_FP = link.X_FB @ found.pose
-        return link, X_FP if link.joint == GROUND else self._turns[link.joint].inverse() @ X_FP
+        return link, link.X_FB @ found.pose
 
     def _read(self, values: Values, what: str) -> Array:
         """Return the number of each coordinate (n,). Raises MalformedRequestError."""
+        if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == self._shape:
+            return values
         if isinstance(values, Mapping):
             found = self._default.copy() if what == "q" else np.zeros(len(self._default))
             for name, value in values.items():
@@ -405,9 +409,9 @@ class Dynamics:
                 found[self._columns[name]] = value
             return found
         found = np.asarray(values, dtype=float)
-        if found.shape != self._default.shape:
+        if found.shape != self._shape:
             raise MalformedRequestError(
-                f"{what} has shape {found.shape}; expected {self._default.shape}, a number for each coordinate: "
+                f"{what} has shape {found.shape}; expected {self._shape}, a number for each coordinate: "
                 f"{format_names(self.coordinates)}"
             )
         return found
@@ -416,43 +420,50 @@ class Dynamics:
         values = q[list(joint.columns)].tolist()
         return tuple([joint.multiplier * value + joint.offset for value in values])
 
-    def _configure(self, values: Values) -> tuple[Array, Array, Array]:
-        """Return the coordinates (n,), Pinocchio's configuration, and the map S of rates (see the module)."""
+    def _configure(self, values: Values) -> tuple[Array, Array, list[_Turn]]:
+        """Return the coordinates (n,), Pinocchio's configuration, and the blocks of S."""
         q = self._read(values, "q")
-        if self._is_direct:
-            return q, self._arrange(q), self._S
+        u = self._arrange(q)
+        if self._offset is not None:
+            u += self._offset
+        if not self._vectors:
+            return q, u, []
         # several quantities are usually wanted of one state
-        key = q.tobytes()
-        if key == self._configured[0]:
-            return q, *self._configured[1:]
-        q_pin = self._Q @ q + self._q_offset
-        S = self._S.copy() if self._several else self._S
-        for n in self._several:
-            each = self.tree.joints[n]
-            position = q[each.columns[0] : each.columns[-1] + 1].tolist()
-            q_pin[self._numbers[n]] = compute_configuration(each.joint, each.forward, position)
-            S[self._rows[n], each.columns[0] : each.columns[-1] + 1] = compute_rate_map(
-                each.joint, each.forward, position
-            )
-        self._configured = (key, q_pin, S)
-        return q, q_pin, S
+        key = u.tobytes()
+        if key != self._configured[0]:
+            q_pin, turns = u[self._numbers], []
+            for rows, numbers in self._vectors:
+                phi = u[rows]
+                q_pin[numbers] = self._pin.exp3_quat(phi)
+                turns.append((rows, self._pin.Jexp3(phi), phi.tolist()))
+            self._configured = (key, q_pin, turns)
+        _, q_pin, turns = self._configured
+        return q, q_pin, turns
 
     def _arrange(self, values: Array) -> Array:
-        """Return numbers of the coordinates in Pinocchio's order, where they are the same."""
-        return values if self._order is None else values[self._order]
+        """Return C times numbers of the coordinates (n,): a new array in the order of Pinocchio."""
+        return values[self._order] if self._is_permutation else self._C.dot(values)
 
-    def _restore(self, values: Any) -> Array:
-        """Return a copy of numbers in Pinocchio's order in that of the coordinates."""
-        return np.array(values) if self._inverse_order is None else np.asarray(values[self._inverse_order])
+    def _move(self, v: Array, a: Array | None, turns: list[_Turn]) -> tuple[Array, Array]:
+        """Return Pinocchio's velocity S q' and its derivative S q'' + dS q' (None: q'' = 0)."""
+        w, dw = self._arrange(v), self._still.copy() if a is None else self._arrange(a)
+        for rows, _, phi in turns:
+            w[rows], dw[rows] = compute_turn_motion(phi, w[rows].tolist(), dw[rows].tolist(), -1.0)
+        return w, dw
 
-    def _rate_bias(self, q: Array, v: Array) -> Array:
-        """Return S' q', the acceleration of Pinocchio's velocities at q'' = 0."""
-        found = np.zeros(self._model.nv)
-        for n in self._several:
-            each = self.tree.joints[n]
-            columns = slice(each.columns[0], each.columns[-1] + 1)
-            found[self._rows[n]] = compute_rate_bias(each.joint, each.forward, q[columns].tolist(), v[columns].tolist())
+    def _pull_back(self, values: Any, turns: list[_Turn]) -> Array:
+        """Return S^T values (nv, ...): from one for each velocity to one for each coordinate. Changes them."""
+        for rows, J, _ in turns:
+            values[rows] = J.T.dot(values[rows])
+        found: Array = values[self._rows] if self._is_permutation else self._C.T.dot(values)
         return found
+
+    def _compute_forces(self, q: Values, v: Values, a: Array | None, forces: Forces | None) -> Array:
+        """Return the joint forces of eq. 7; None: q'' = 0."""
+        q, q_pin, turns = self._configure(q)
+        w, dw = self._move(self._read(v, "v"), a, turns)
+        tau = self._pull_back(self._pin.rnea(self._model, self._data, q_pin, w, dw), turns)
+        return tau if forces is None else tau + self._project(q, forces)
 
     def _project(self, q: Array, forces: Forces) -> Array:
         """Return J' f_e (n,)."""
@@ -473,10 +484,6 @@ class Dynamics:
         return MalformedRequestError(
             f"the mass matrix is singular: {what}; state the inertia of what moves, or a rotation vector short of 2 pi"
         )
-
-
-def _is_permutation(S: Array) -> bool:
-    return bool(((S == 0.0) | (S == 1.0)).all() and (S.sum(axis=0) == 1.0).all() and (S.sum(axis=1) == 1.0).all())
 
 
 def _with_masses(model: Model, tree: Tree, masses: Mapping[str, float], payload: Mapping[str, float]) -> Tree:
@@ -525,10 +532,12 @@ def _to_rows(M: Array) -> Any:
     return tuple([so3.to_vector3(row) for row in M])
 
 
-def _build_pinocchio(tree: Tree, gravity: float) -> tuple[Any, Any, list[Pose]]:
-    """Return the module pinocchio, its model of a tree, and the pose of each of its joints in ours (see `_make_joint`).
+def _build_pinocchio(tree: Tree, gravity: float) -> tuple[Any, Any, list[int], Array, Array, list[int]]:
+    """Return the module pinocchio and its model of a tree, with how the model's joints belong to those of the tree.
 
-    Raises ModelServerError if it is not installed."""
+    These are: the number of the last one for each joint of the tree; the map C and the offsets of the coordinates; the
+    first row of each rotation vector. Raises ModelServerError if it is not installed.
+    """
     try:
         import pinocchio as pin
     except ImportError as error:
@@ -537,38 +546,50 @@ def _build_pinocchio(tree: Tree, gravity: float) -> tuple[Any, Any, list[Pose]]:
         ) from None
     model = pin.Model()
     model.gravity.linear = np.array([0.0, 0.0, -gravity])
-    turns: list[Pose] = []
+    last: list[int] = []
+    vectors: list[int] = []
+    nv = sum(each.joint.count for each in tree.joints)
+    C, offset = np.zeros((nv, len(tree.coordinates))), np.zeros(nv)
     for each in tree.joints:
-        joint, turn = _make_joint(pin, each)
-        before = Pose.identity() if each.parent == GROUND else turns[each.parent].inverse()
-        model.addJoint(each.parent + 1, joint, _to_se3(pin, before @ each.X_PN @ turn), each.name)
-        turns.append(turn)
+        number, X = 0 if each.parent == GROUND else last[each.parent], each.X_PN
+        for joint, columns, factor in _make_joints(pin, each):
+            if joint.nq > joint.nv:
+                vectors.append(model.nv)
+            rows = range(model.nv, model.nv + joint.nv)
+            C[rows, columns], offset[rows] = factor, each.offset
+            number, X = model.addJoint(number, joint, _to_se3(pin, X), f"{each.name} {rows[0]}"), Pose.identity()
+        last.append(number)
     for link in tree.links.values():
         if link.inertia is not None:
             mass, center, about = link.inertia
-            X = link.X_FB if link.joint == GROUND else turns[link.joint].inverse() @ link.X_FB
+            number = 0 if link.joint == GROUND else last[link.joint]
             inertia = pin.Inertia(mass, np.array(center), np.array(about))
-            model.appendBodyToJoint(link.joint + 1, inertia, _to_se3(pin, X))
-    return pin, model, turns
+            model.appendBodyToJoint(number, inertia, _to_se3(pin, link.X_FB))
+    return pin, model, last, C, offset, vectors
 
 
-def _make_joint(pin: Any, each: TreeJoint) -> tuple[Any, Pose]:
-    """Return Pinocchio's joint, and the pose of its axes in the joint's frames: a planar one moves in x and y."""
-    kind, none = each.joint.type, Pose.identity()
-    axis = np.array(each.joint.axis) * (1.0 if each.forward else -1.0)
-    if kind in (JointType.REVOLUTE, JointType.PRISMATIC):
-        letter = "R" if kind is JointType.REVOLUTE else "P"
-        for name, unit in zip("XYZ", np.eye(3), strict=True):
-            if np.array_equal(axis, unit):
-                return getattr(pin, f"JointModel{letter}{name}")(), none
-        make = pin.JointModelRevoluteUnaligned if letter == "R" else pin.JointModelPrismaticUnaligned
-        return make(axis), none
-    if kind is JointType.PLANAR:
-        J = each.joint.jacobian((0.0, 0.0, 0.0))
-        return pin.JointModelPlanar(), Pose(
-            (0.0, 0.0, 0.0), so3.from_matrix(np.column_stack((J[:3, 0], J[:3, 1], J[3:, 2])))
-        )
-    return pin.JointModelSpherical() if kind is JointType.SPHERICAL else pin.JointModelFreeFlyer(), none
+def _make_joints(pin: Any, each: TreeJoint) -> list[tuple[Any, tuple[int, ...], float]]:
+    """Return Pinocchio's joints that in a row move as one of the tree does, with their coordinates and a factor."""
+    kind, columns, sign = each.joint.type, each.columns, 1.0 if each.forward else -1.0
+    joints: list[tuple[Any, tuple[int, ...], float]] = []
+    if kind is JointType.FLOATING:
+        joints.append((pin.JointModelTranslation(), columns[:3], sign))
+    if kind in (JointType.FLOATING, JointType.SPHERICAL):
+        joints.append((pin.JointModelSpherical(), columns[-3:], sign))
+    else:
+        for column, twist in zip(columns, sign * each.joint.jacobian((0.0,) * each.joint.count).T, strict=True):
+            joints.append((_make_axis_joint(pin, twist), (column,), each.multiplier))
+    return joints if each.forward else joints[::-1]
+
+
+def _make_axis_joint(pin: Any, twist: Array) -> Any:
+    """Return Pinocchio's joint with one coordinate, of the velocity and angular velocity (6,) at its rate 1."""
+    letter, name = ("P", "Prismatic") if twist[:3].any() else ("R", "Revolute")
+    axis = twist[:3] if letter == "P" else twist[3:]
+    for along, unit in zip("XYZ", np.eye(3), strict=True):
+        if np.array_equal(axis, unit):
+            return getattr(pin, f"JointModel{letter}{along}")()
+    return getattr(pin, f"JointModel{name}Unaligned")(axis)
 
 
 def _to_se3(pin: Any, X: Pose) -> Any:

@@ -1,141 +1,89 @@
-"""From rates of the geometry's coordinates to the velocities of Pinocchio's joints.
+"""From rates of a rotation vector to angular velocity and back, in plain floats.
 
-Pinocchio's velocity w of a joint with several degrees of freedom is along the axes of its far frame: angular velocity
-(spherical), twist in the plane (planar), twist (floating). The coordinates here are lengths and rotation vectors, with
-plain derivatives. So for each joint
-
-    w = S(q) q',    w' = S(q) q'' + S'(q, q') q'
-
-S is the joint's Jacobian, turned into the far frame. For a joint passed backward the far frame is the constraint's
-`from` frame, which moves by the inverse displacement; with the position p, angular velocity o and left Jacobian J_l of
-the rotation vector, along the axes of the near frame at 0:
-
-    forward    linear R' p',         angular J_r phi' = J_l(-phi) phi'
-    backward   linear -p' + o x p,   angular -o = -J_l(phi) phi'
-
-J_l is that of Sola (2017), eq. 183; its derivative follows from its two scalar functions of the angle. A rotation
-vector is singular at a length of 2 pi, as every three numbers of a rotation are somewhere.
+With the left Jacobian J_l(v) = 1 + a [v]x + b [v]x [v]x of SO(3) (Sola 2017, eq. 183), a rotation vector that changes
+at the rate v' has the angular velocity J_l(v) v' along the axes of the near frame, J_r(v) v' = J_l(-v) v' along those
+of the far one. a and b are functions of v.v, so the derivative of J_l needs only theirs, da and db by v.v / 2. All are
+taken from series at small angles, where their quotients lose digits. A rotation vector is singular at a length of 2 pi,
+as every three numbers of a rotation are somewhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-import numpy as np
-
-from modelserver.geometry.joint import Joint, JointType
-from modelserver.transforms import so3
-from modelserver.transforms.so3 import Array, Vector3
-
-Vector = tuple[float, ...]
+from modelserver.transforms.so3 import Vector3
 
 SMALL_ANGLE = 0.1
 """Radians below which the functions of the angle are taken from their series: the quotients lose digits there."""
 
 
-def compute_configuration(joint: Joint, forward: bool, position: Sequence[float]) -> tuple[float, ...]:
-    """Return Pinocchio's configuration of a joint: x y z w of a quaternion, x y cos sin, or x y z and a quaternion."""
-    if joint.type is JointType.PLANAR:
-        u, v, turn = position
-        c, s = math.cos(turn), math.sin(turn)
-        return (u, v, c, s) if forward else (-c * u - s * v, s * u - c * v, c, -s)
-    X = joint.compute_pose(position)
-    if not forward:
-        X = X.inverse()
-    w, x, y, z = X._q
-    return (x, y, z, w) if joint.type is JointType.SPHERICAL else (*X._p, x, y, z, w)
+def compute_turn_motion(
+    v: Vector3, rate: Vector3, change: Vector3 = (0.0, 0.0, 0.0), sign: float = 1.0
+) -> tuple[Vector3, Vector3]:
+    """Return angular velocity J_l v' and acceleration of a rotation vector, with v' and v''. `sign` -1: of J_r.
 
-
-def compute_rate_map(joint: Joint, forward: bool, position: Sequence[float]) -> Array:
-    """Return S (k, n) of a joint with several coordinates."""
-    if joint.type is JointType.PLANAR:
-        u, v, turn = position
-        c, s = math.cos(turn), math.sin(turn)
-        rows = [(c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)] if forward else [(-1, 0, -v), (0, -1, u), (0, 0, -1)]
-        return np.array(rows, dtype=float)
-    x, y, z = position[-3:]
-    phi = (-x, -y, -z) if forward else (x, y, z)
-    turning = _compute_left_jacobian(phi, 1.0 if forward else -1.0)
-    if joint.type is JointType.SPHERICAL:
-        return np.array(turning)
-    S = np.zeros((6, 6))
-    S[3:, 3:] = turning
-    if forward:
-        S[:3, :3] = so3.matrix_rows(so3.exponential(phi))
-    else:
-        S[0, 0] = S[1, 1] = S[2, 2] = -1.0
-        S[:3, 3:] = so3.skew(position[:3]) @ S[3:, 3:]
-    return S
-
-
-def _compute_left_jacobian(v: Vector3, factor: float) -> tuple[Vector3, Vector3, Vector3]:
-    """Return the rows of J_l(v) times a factor; `so3.left_jacobian` in plain floats."""
-    a, b, _, _ = _get_coefficients(v)
+    The acceleration is J_l v'' + (v.v') (da v x v' + db v x (v x v')) + b v' x (v x v').
+    """
     x, y, z = v
-    a, b = factor * a, factor * b
-    xx, yy, zz, xy, xz, yz = b * x * x, b * y * y, b * z * z, b * x * y, b * x * z, b * y * z
+    dx, dy, dz = rate
+    ddx, ddy, ddz = change
+    square = x * x + y * y + z * z
+    along = x * dx + y * dy + z * dz
+    a, b, da, db = _get_coefficients(square)
+    # sums of multiples: of crosses, of v, of v' and v''
+    c, n = sign * a, 1.0 - b * square
+    m = b * along
+    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    k = sign * along * da
+    dm = along * along * db + b * (dx * dx + dy * dy + dz * dz + x * ddx + y * ddy + z * ddz)
+    dn = -along * (square * db + b)
     return (
-        (factor - yy - zz, xy - a * z, xz + a * y),
-        (xy + a * z, factor - xx - zz, yz - a * x),
-        (xz - a * y, yz + a * x, factor - xx - yy),
+        (c * cx + m * x + n * dx, c * cy + m * y + n * dy, c * cz + m * z + n * dz),
+        (
+            k * cx + c * (y * ddz - z * ddy) + dm * x + dn * dx + n * ddx,
+            k * cy + c * (z * ddx - x * ddz) + dm * y + dn * dy + n * ddy,
+            k * cz + c * (x * ddy - y * ddx) + dm * z + dn * dz + n * ddz,
+        ),
     )
 
 
-def compute_rate_bias(joint: Joint, forward: bool, position: Sequence[float], rates: Sequence[float]) -> Vector:
-    """Return S' q' (k) of a joint with several coordinates."""
-    if joint.type is JointType.PLANAR:
-        du, dv, turning = rates
-        c, s = math.cos(position[2]), math.sin(position[2])
-        if forward:
-            return (turning * (-s * du + c * dv), -turning * (c * du + s * dv), 0.0)
-        return (-turning * dv, turning * du, 0.0)
-    # forward: J_l(-phi) phi'; backward: -J_l(phi) phi'
-    sign = -1.0 if forward else 1.0
-    phi = so3.scale(sign, so3.to_vector3(position[-3:]))
-    change = so3.scale(sign, so3.to_vector3(rates[-3:]))
-    angular = so3.scale(-1.0, compute_turn_bias(phi, change))
-    if joint.type is JointType.SPHERICAL:
-        return angular
-    p, dp = so3.to_vector3(position[:3]), so3.to_vector3(rates[:3])
-    turning_rate = so3.scale(sign, compute_turn_rate(phi, change))
-    if forward:
-        w, x, y, z = so3.exponential(phi)
-        linear = so3.cross(so3.rotate((w, x, y, z), dp), turning_rate)
-    else:
-        linear = so3.add(so3.cross(p, angular), so3.cross(turning_rate, dp))
-    return (*linear, *angular)
+def compute_turn_rate(v: Vector3, velocity: Vector3, sign: float = 1.0) -> Vector3:
+    """Return the rate at which a rotation vector changes with an angular velocity: the inverse of J_l, times that.
 
-
-def compute_turn_rate(v: Vector3, rate: Vector3) -> Vector3:
-    """Return J_l(v) v', the angular velocity of a rotation vector that changes at a rate."""
-    a, b, _, _ = _get_coefficients(v)
-    turned = so3.cross(v, rate)
-    return so3.add(rate, so3.scale(a, turned), so3.scale(b, so3.cross(v, turned)))
-
-
-def compute_turn_bias(v: Vector3, rate: Vector3) -> Vector3:
-    """Return J_l' v', the angular acceleration of a rotation vector that changes at a constant rate.
-
-    With J_l = 1 + a [v]x + b [v]x [v]x, and da, db the derivatives of a, b by v.v / 2.
+    It is 1 - [v]x / 2 + c [v]x [v]x, c = (1 - h cot h) / v.v with half the angle h. With `sign` -1 it is that of J_r.
     """
-    _, b, da, db = _get_coefficients(v)
-    along = v[0] * rate[0] + v[1] * rate[1] + v[2] * rate[2]
-    turned = so3.cross(v, rate)
-    twice = so3.cross(v, turned)
-    return so3.add(so3.scale(along * da, turned), so3.scale(along * db, twice), so3.scale(b, so3.cross(rate, turned)))
+    x, y, z = v
+    dx, dy, dz = velocity
+    square = x * x + y * y + z * z
+    if square < SMALL_ANGLE * SMALL_ANGLE:
+        c = 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0 + square / 1209600.0))
+    elif square < math.inf:
+        half = 0.5 * math.sqrt(square)
+        c = (1.0 - half / math.tan(half)) / square
+    else:
+        c = math.nan
+    m = c * (x * dx + y * dy + z * dz)
+    n = 1.0 - c * square
+    k = -0.5 * sign
+    return (
+        k * (y * dz - z * dy) + m * x + n * dx,
+        k * (z * dx - x * dz) + m * y + n * dy,
+        k * (x * dy - y * dx) + m * z + n * dz,
+    )
 
 
-def _get_coefficients(v: Vector3) -> tuple[float, float, float, float]:
-    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    angle = math.sqrt(square)
-    if angle < SMALL_ANGLE:
+def _get_coefficients(square: float) -> tuple[float, float, float, float]:
+    """Return a, b, da and db of the squared angle."""
+    if square < SMALL_ANGLE * SMALL_ANGLE:
         return (
-            0.5 - square / 24.0 + square * square / 720.0,
-            1.0 / 6.0 - square / 120.0 + square * square / 5040.0,
-            -1.0 / 12.0 + square / 180.0 - square * square / 6720.0,
-            -1.0 / 60.0 + square / 1260.0 - square * square / 60480.0,
+            1.0 / 2.0 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)),
+            1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)),
+            -1.0 / 12.0 + square * (1.0 / 180.0 - square * (1.0 / 6720.0 - square / 453600.0)),
+            -1.0 / 60.0 + square * (1.0 / 1260.0 - square * (1.0 / 60480.0 - square / 4989600.0)),
         )
+    if not square < math.inf:
+        return (math.nan,) * 4
+    angle = math.sqrt(square)
     sine, versine = math.sin(angle), 2.0 * math.sin(angle / 2.0) ** 2
     return (
         versine / square,

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
-from modelserver.dynamics.rates import compute_turn_bias
+from modelserver.dynamics.rates import compute_turn_motion
 from modelserver.dynamics.settings import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
@@ -226,7 +226,7 @@ def _lookup_floating(
     phi = so3.logarithm(X.wxyz)
     J = so3.left_jacobian(phi)
     rate = np.linalg.solve(J, np.array(motion.angular_velocity))
-    change = compute_turn_bias(phi, so3.to_vector3(rate.tolist()))
+    _, change = compute_turn_motion(phi, so3.to_vector3(rate.tolist()))
     state.q[:6] = (*X.xyz, *phi)
     state.v[:6] = (*motion.velocity, *rate)
     state.a[:6] = (*motion.acceleration, *np.linalg.solve(J, np.array(motion.angular_acceleration) - change))

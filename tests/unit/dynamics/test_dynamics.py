@@ -12,11 +12,11 @@ from support_dynamics import MOVING, MujocoTwin, is_close, random_inertia, rando
 
 from modelserver import load_model
 from modelserver.dynamics import CenterOfMass, Dynamics, MassUncertainty
-from modelserver.dynamics.rates import compute_rate_bias, compute_rate_map
+from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.errors import LimitError, MalformedRequestError, UnknownFrameError
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
 from modelserver.geometry.inertia import RigidInertia
-from modelserver.transforms import Pose
+from modelserver.transforms import Pose, so3
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
 
@@ -136,17 +136,50 @@ def test_given_force_on_surroundings_then_it_enters_the_bias_with_its_jacobian()
         dynamics.bias([0.3], [0.0], {"Arm:Pivot": [1.0]})
 
 
-@pytest.mark.parametrize("forward", [True, False])
-@pytest.mark.parametrize("kind", [JointType.SPHERICAL, JointType.PLANAR, JointType.FLOATING])
-@pytest.mark.parametrize("size", [1e-6, 0.05, 0.099, 0.101, 1.0])
-def test_given_rates_then_their_map_changes_as_its_bias_states(kind, forward, size):
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("size", [1e-6, 0.05, 0.099, 0.101, 1.0, 3.5])
+def test_given_rate_of_rotation_vector_then_motion_and_inverse_are_those_of_its_jacobian(sign, size):
     rng = np.random.default_rng(5)
-    joint = Joint(kind, (0.2, -0.4, 0.7))
-    q, v = size * rng.uniform(-1, 1, joint.count), rng.uniform(-1, 1, joint.count)
+    phi, (rate, change) = size * rng.uniform(-1, 1, 3), rng.uniform(-1, 1, (2, 3))
     h = 1e-4
-    ahead, behind = (compute_rate_map(joint, forward, q + sign * h * v) for sign in (1, -1))
-    numeric = (ahead - behind) @ v / (2 * h)
-    assert compute_rate_bias(joint, forward, q, v) == pytest.approx(numeric, abs=1e-7)
+    ahead, at, behind = (so3.left_jacobian(sign * (phi + step * rate)) for step in (h, 0.0, -h))
+    velocity, acceleration = compute_turn_motion(tuple(phi), tuple(rate), tuple(change), sign)
+    assert velocity == pytest.approx(at @ rate, abs=1e-11)
+    assert acceleration == pytest.approx(at @ change + (ahead - behind) @ rate / (2 * h), abs=1e-7)
+    assert compute_turn_rate(tuple(phi), velocity, sign) == pytest.approx(rate, abs=1e-14)
+
+
+@pytest.mark.parametrize("seed", [7, 12, 4], ids=["permutation", "backward vectors", "mimics"])
+def test_given_other_states_between_then_results_stay_and_repeat(seed):
+    dynamics = random_model(random.Random(seed), 3 + seed % 6).dynamics()
+    states = np.random.default_rng(seed)
+    (q, v, tau), other = (random_state(states, len(dynamics.coordinates)) for _ in range(2))
+
+    def compute(q, v, tau):
+        frame = f"{list(dynamics.tree.links)[-1]}:Base"
+        results = dynamics.mass_matrix(q), dynamics.gravity(q), dynamics.bias(q, v), dynamics.forward(q, v, tau)
+        return *results, dynamics.inverse(q, v, tau), *dynamics.momentum(q, v, tau), dynamics.jacobian(q, frame)
+
+    given = q.copy(), v.copy(), tau.copy()
+    first = compute(q, v, tau)
+    stored = [each.copy() for each in first]
+    compute(*other)
+    assert all(np.array_equal(a, b) for a, b in zip(first, stored, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(compute(q, v, tau), stored, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip((q, v, tau), given, strict=True))
+    # a state that is changed in place is another one
+    q[:] = other[0]
+    assert np.array_equal(dynamics.mass_matrix(q), dynamics.mass_matrix(other[0]))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e200])
+def test_given_rotation_vector_that_is_not_finite_then_neither_are_the_results(value):
+    dynamics = pendulum().build().dynamics()
+    q = np.zeros(7)
+    q[4] = value
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(dynamics.mass_matrix(q)).all()
+        assert not np.isfinite(dynamics.bias(q, np.ones(7))).all()
 
 
 def test_given_jacobian_then_it_is_the_derivative_of_the_pose():

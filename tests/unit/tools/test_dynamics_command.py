@@ -88,7 +88,6 @@ def test_given_vehicle_file_then_its_contacts_and_base_frame_are_used(capsys, ge
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--joint", "Slide=1"], "needs --model or --config"),
         (["--model", "{}", "--joint", "Slide"], "'Slide' is not NAME=NUMBER"),
         (["--model", "{}", "--joint", "Slid=1"], "Nearest: Slide"),
         (["--model", "{}", "--contact", "Cart:?Z"], "has no frame '?Z'"),
@@ -100,3 +99,26 @@ def test_given_wrong_words_then_the_error_names_them(capsys, geometry, words, me
         main(["dynamics", *(word.format(geometry) for word in words)])
     assert end.value.code in (1, 2)
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--set", "MRN=K11"],
+        ["--joint", "Slide=1"],
+        ["--payload", "Arm:Foot=1"],
+        ["--mass", "Cart=90"],
+        ["--contact", "Cart:FL"],
+        ["--tilt-deg", "0", "5"],
+        ["--acceleration", "0", "0", "1"],
+        ["--allow-massless"],
+        ["--cut-loops"],
+    ],
+)
+def test_given_option_of_a_file_without_one_then_the_error_says_what_to_add(capsys, words) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["dynamics", *words])
+    assert end.value.code == 2
+    text = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert words[0] in text
+    assert "has no effect on the running daemon, which has its own; add --model FILE or --config FILE" in text

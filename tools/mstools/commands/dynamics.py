@@ -78,9 +78,22 @@ def command(
       modelserver dynamics --model config/raptor/geometry.yaml --joint FLEALateral=0.5 --equations
     """
     if model is None and config is None:
-        for name, given in (("--joint", joints), ("--payload", payload), ("--mass", masses), ("--contact", contacts)):
+        for name, given in (
+            ("--set", settings),
+            ("--joint", joints),
+            ("--payload", payload),
+            ("--mass", masses),
+            ("--contact", contacts),
+            ("--tilt-deg", any(tilt)),
+            ("--acceleration", any(acceleration)),
+            ("--allow-massless", allow_massless),
+            ("--cut-loops", cut_loops),
+        ):
             if given:
-                raise typer.BadParameter("needs --model or --config; the daemon has its own", param_hint=name)
+                raise typer.BadParameter(
+                    "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
+                    param_hint=name,
+                )
         from modelserver.client.remote import Platform
 
         with Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver") as platform:
