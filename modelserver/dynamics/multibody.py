@@ -178,7 +178,7 @@ class Dynamics:
         self._vectors = [(slice(row, row + 3), slice(row + n, row + n + 4)) for n, row in enumerate(vectors)]
         # their rows and columns in the upper triangle
         self._blocks = [((rows, slice(rows.start, nv)), (slice(rows.stop), rows)) for rows, _ in self._vectors]
-        self._still = np.zeros(nv)
+        self._zeros = np.zeros(nv)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -446,7 +446,7 @@ class Dynamics:
 
     def _move(self, v: Array, a: Array | None, turns: list[_Turn]) -> tuple[Array, Array]:
         """Return Pinocchio's velocity S q' and its derivative S q'' + dS q' (None: q'' = 0)."""
-        w, dw = self._arrange(v), self._still.copy() if a is None else self._arrange(a)
+        w, dw = self._arrange(v), self._zeros.copy() if a is None else self._arrange(a)
         for rows, _, phi in turns:
             w[rows], dw[rows] = compute_turn_motion(phi, w[rows].tolist(), dw[rows].tolist(), -1.0)
         return w, dw

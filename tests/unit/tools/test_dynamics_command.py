@@ -115,7 +115,7 @@ def test_given_wrong_words_then_the_error_names_them(capsys, geometry, words, me
         ["--cut-loops"],
     ],
 )
-def test_given_option_of_a_file_without_one_then_the_error_says_what_to_add(capsys, words) -> None:
+def test_given_option_of_a_file_without_one_then_the_error_names_what_to_add(capsys, words) -> None:
     with pytest.raises(SystemExit) as end:
         main(["dynamics", *words])
     assert end.value.code == 2
