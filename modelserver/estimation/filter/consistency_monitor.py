@@ -24,8 +24,9 @@ what has changed.
 What is corrected leaves an allowance that decays. Fixes that jump are not used, and dead reckoning is right for a
 while. Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of
 the turn since the window's start, and the pose is invalid only where they are too large. Fixes are trusted again when
-they agree with the path from there, or when they have moved as the path for two minutes and a fit of a drift beside an
-offset, a rotation, a scale and a turn rate shows it to be small, which takes turns (`fit_drift`).
+they agree with the path from there, or when they have moved as the path for two minutes: a fit of a drift beside an
+offset, a rotation, a scale and a turn rate shows it to be small, which takes turns, and leaves no more than the noise
+of fixes (`fit_drift`).
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
 gyro, as on a ferry (`Cause.HEADING`).
@@ -149,7 +150,8 @@ EXCLUDING_SIGMAS: Final = 3.0
 """Standard deviations by which the drift of fixes that are trusted again is less than the one that was found."""
 
 LARGEST_REST: Final = 2.0
-"""Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes."""
+"""Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes, and so may a
+drift, of those that are trusted again."""
 
 MODEL_ERROR: Final = 0.05
 """Meters that no cause explains, as slip that comes and goes: with fixes of centimeters."""
@@ -890,6 +892,7 @@ class DriftFit(NamedTuple):
     drift, drift_sigma: of the fixes from the first to the last, and its largest standard deviation, m.
     tolerance: standard deviation of the difference of two fixes at that interval, m.
     seconds: from the first to the last.
+    rest: mean square that the fit leaves, over each axis, relative to the variance of the fixes.
     """
 
     turn: float
@@ -898,6 +901,7 @@ class DriftFit(NamedTuple):
     drift_sigma: float
     tolerance: float
     seconds: float
+    rest: float
 
     @property
     def largest(self) -> float:
@@ -906,8 +910,9 @@ class DriftFit(NamedTuple):
 
     @property
     def is_steady(self) -> bool:
-        """Whether fixes are known to have moved as the path, whatever its heading."""
-        return self.drift_sigma <= STEADY_SIGMA * self.seconds and self.drift <= self.largest
+        """Whether fixes are known to have moved as the path, whatever its heading: all the time, not only on average."""
+        is_known = self.drift_sigma <= STEADY_SIGMA * self.seconds
+        return is_known and self.drift <= self.largest and self.rest <= LARGEST_REST
 
     def excludes(self, rate: float) -> bool:
         """Return whether fixes are known not to drift at a rate any more, m/s; 0 needs no proof."""
@@ -944,9 +949,11 @@ def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, se
         x = np.linalg.solve(information, (A.conj().T @ b).real)
         turn += float(x[4])
     P = np.linalg.inv(information)
+    left = b - (A @ x)
+    rest = float(np.mean(np.abs(left) ** 2)) / (2.0 * share)
     longest = 0.5 * (P[2, 2] + P[3, 3]) + math.hypot(0.5 * (P[2, 2] - P[3, 3]), P[2, 3])
     tolerance = math.sqrt(_get_fix_variance(first, last, noise._replace(inflation=1.0), settings))
-    return DriftFit(turn, math.sqrt(P[4, 4]), math.hypot(x[2], x[3]), math.sqrt(longest), tolerance, seconds)
+    return DriftFit(turn, math.sqrt(P[4, 4]), math.hypot(x[2], x[3]), math.sqrt(longest), tolerance, seconds, rest)
 
 
 def _shift_fix(node: PathNode, latency: float) -> complex:

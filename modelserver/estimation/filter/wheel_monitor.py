@@ -63,7 +63,8 @@ class WheelMonitor(NamedTuple):
             ratio = 0.0
         mean = self.mean_ratio + GAIN * (min(ratio, LARGEST_RATIO) - self.mean_ratio)
         if self.is_suspect:
-            return self._replace(mean_ratio=mean, is_suspect=not (is_moving and mean < TRUSTED_MEAN))
+            measures = is_moving and not are_stationary and mean < TRUSTED_MEAN
+            return self._replace(mean_ratio=mean, is_suspect=not measures)
         return self._replace(mean_ratio=mean, is_suspect=mean > SUSPECT_MEAN)
 
     def measures_speed(self, utime: int) -> bool:

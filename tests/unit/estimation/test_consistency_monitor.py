@@ -13,6 +13,7 @@ import pytest
 from modelserver.estimation.filter import consistency_monitor
 from modelserver.estimation.filter.consistency_monitor import (
     AGREEMENT_TIME,
+    LARGEST_REST,
     LONGEST_US,
     Cause,
     ConsistencyMonitor,
@@ -21,6 +22,7 @@ from modelserver.estimation.filter.consistency_monitor import (
     PathNode,
     PathNoise,
     compare_window,
+    fit_drift,
     replay_path,
 )
 from modelserver.estimation.filter.settings import FilterSettings
@@ -259,11 +261,28 @@ def test_given_fixes_that_drifted_then_they_are_trusted_where_they_are_only_if_t
     assert found.found is not None
     rate = found.monitor.resolve(found.found, found.node.utime).drift_rate
     assert 0.5 * abs(drift) < rate < 2.0 * abs(drift)
-    fit = DriftFit(turn=0.0, turn_sigma=0.01, drift=0.0, drift_sigma=0.01 * 120.0, tolerance=1.0, seconds=120.0)
+    fit = DriftFit(
+        turn=0.0, turn_sigma=0.01, drift=0.0, drift_sigma=0.01 * 120.0, tolerance=1.0, seconds=120.0, rest=1.0
+    )
     assert fit.excludes(rate)
     # the same again, or what cannot be separated from it
     assert not fit._replace(drift=120.0 * rate).excludes(rate)
     assert not fit._replace(drift_sigma=60.0 * rate).excludes(rate)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_given_fixes_that_begin_to_drift_then_three_minutes_on_average_do_not_excuse_them(seed: int) -> None:
+    fits = []
+    for drift in (0j, 0.5j):
+        *_, last = drive(300.0, Fault(270.0, drift=drift), seed)
+        nodes = (*last.monitor.older, *last.monitor.newest)
+        fits.append(fit_drift(nodes, last.monitor.rotation, NOISE, SETTINGS))
+    usual, drifting = fits
+    assert usual.rest < 0.5 * LARGEST_REST
+    assert drifting.rest > LARGEST_REST
+    steady = usual._replace(drift=0.0, drift_sigma=1.0)
+    assert steady.is_steady
+    assert not steady._replace(rest=drifting.rest).is_steady
 
 
 def test_given_fixes_that_jumped_then_no_drift_has_to_be_excluded() -> None:

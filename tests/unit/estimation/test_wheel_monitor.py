@@ -36,3 +36,5 @@ def test_given_stuck_wheels_of_a_vehicle_at_rest_then_they_stay_suspect_until_it
     assert resting.is_suspect
     assert not compare(resting, 0.05, 1, are_stationary=False, is_moving=True).is_suspect
     assert compare(resting, 10.0, 50, are_stationary=True, is_moving=True).is_suspect
+    # what it knows of its speed may be vague, and agree with any
+    assert compare(resting, 0.05, 50, are_stationary=True, is_moving=True).is_suspect
