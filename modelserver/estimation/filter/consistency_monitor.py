@@ -910,7 +910,7 @@ class DriftFit(NamedTuple):
 
     @property
     def is_steady(self) -> bool:
-        """Whether fixes are known to have moved as the path, whatever its heading: all the time, not only on average."""
+        """Whether fixes are known to have moved as the path, whatever its heading, all the time."""
         is_known = self.drift_sigma <= STEADY_SIGMA * self.seconds
         return is_known and self.drift <= self.largest and self.rest <= LARGEST_REST
 
