@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 from playwright.sync_api import Page
-from support_browser import CHROMIUM, open_browser, select_item, show
+from support_browser import CHROMIUM, open_link, select_item, show, start_browser
 from support_view import follow_demo, record_drive
 
 from mstools.commands.demo import find_vehicle_file
@@ -100,7 +100,7 @@ def take_charts(name: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "drive.html"
         file.write_text(charts.render_page("drive", render_drive()))
-        with open_browser(file.as_uri()) as page:
+        with start_browser() as browser, open_link(browser, file.as_uri()) as page:
             page.locator("html[data-drawn]").wait_for()
             page.add_style_tag(content="#theme { display: none }")
             write_picture(page.locator("body").screenshot(), IMAGES / name)
@@ -109,7 +109,7 @@ def take_charts(name: str) -> None:
 
 def take(name: str, source: Source, tab: str = "", button: str = "", seconds: float = 3.0) -> None:
     """Write one screenshot, after a tab and a button were clicked and some seconds have passed."""
-    with show(source, sharpness=1.0) as page:
+    with start_browser() as browser, show(browser, source, sharpness=1.0) as page:
         close_warning(page)
         if tab:
             page.get_by_role("tab", name=tab).click()
@@ -126,7 +126,8 @@ def take_editor(name: str) -> None:
     """Write the screenshot of the editor with a constraint selected."""
     file = find_vehicle_file()
     session = EditSession(EditedFile.open(file))
-    with show(open_geometry(file, {}), Editing(session), sharpness=1.0) as page:
+    editing = Editing(session)
+    with start_browser() as browser, show(browser, open_geometry(file, {}), editing, sharpness=1.0) as page:
         close_warning(page)
         page.get_by_role("tab", name="Edit").click()
         select_item(page, "constraint", "FrontNoddingSICKFixed")

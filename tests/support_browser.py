@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Browser, Locator, Page
 
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
@@ -40,11 +40,8 @@ FEWER_PICTURES = """{
 
 
 @contextmanager
-def open_browser(link: str, sharpness: float = 0.5) -> Iterator[Page]:
-    """Open a link in a headless browser; errors of its console fail the test.
-
-    `sharpness`: pixels along each side of the viewer's scene, not of its panels, relative to those of the page.
-    """
+def start_browser() -> Iterator[Browser]:
+    """Start a headless browser; one at a time in a process."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright, TemporaryDirectory() as folder:
@@ -52,25 +49,37 @@ def open_browser(link: str, sharpness: float = 0.5) -> Iterator[Page]:
         polite.write_text(f'#!/bin/sh\nexec nice -n 5 {CHROMIUM} "$@"\n')
         polite.chmod(0o700)
         browser = playwright.chromium.launch(executable_path=polite, args=OPTIONS, env=dict(os.environ))
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-        page.add_init_script(FEWER_PICTURES)
-        page.set_default_timeout(TIMEOUT_MS)
-        errors: list[str] = []
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        # nothing is loaded from the internet
-        page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
-        if link.startswith("http"):
-            link += f"{'&' if '?' in link else '?'}fixedDpr={sharpness}"
-        page.goto(link)
-        yield page
+        yield browser
         browser.close()
-        assert not errors, errors
 
 
 @contextmanager
-def show(source: Source, editing: Editing | None = None, sharpness: float = 0.5) -> Iterator[Page]:
-    """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_browser`."""
+def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[Page]:
+    """Open a link in a page without cookies of others; errors of its console fail the test.
+
+    `sharpness`: pixels along each side of the viewer's scene, not of its panels, relative to those of the page.
+    """
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.add_init_script(FEWER_PICTURES)
+    page.set_default_timeout(TIMEOUT_MS)
+    errors: list[str] = []
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    # nothing is loaded from the internet
+    page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
+    if link.startswith("http"):
+        link += f"{'&' if '?' in link else '?'}fixedDpr={sharpness}"
+    page.goto(link)
+    try:
+        yield page
+    finally:
+        page.close()
+    assert not errors, errors
+
+
+@contextmanager
+def show(browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5) -> Iterator[Page]:
+    """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_link`."""
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
@@ -80,7 +89,7 @@ def show(source: Source, editing: Editing | None = None, sharpness: float = 0.5)
     thread = threading.Thread(target=viewer.run, args=(stop.is_set,))
     thread.start()
     try:
-        with open_browser(served.link, sharpness) as page:
+        with open_link(browser, served.link, sharpness) as page:
             page.get_by_role("tab", name="Query").wait_for()
             yield page
     finally:

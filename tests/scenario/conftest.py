@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from support_browser import start_browser
 from support_lcm import MODELSERVER, TIMEOUT_S, Listener, reserved_url, run_process, wait_until
 from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, write_test_key
@@ -21,6 +22,9 @@ from modelserver.errors import TooNewError
 from modelserver.messages import Health
 from modelserver.signing.signatures import MAX_CLOCK_LEAD_S
 from modelserver.wire.codec import decode, encode
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 FAST_HEALTH = VEHICLE + "publish: {rate_hz: 50, health_hz: 20}\n"
 """Health comes often, so that a test need not wait for it."""
@@ -161,3 +165,9 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     with reserved_url() as url, daemon_at(url, tmp_path_factory.mktemp("daemon")) as daemon:
         daemon.feed()
         yield daemon
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with start_browser() as started:
+        yield started

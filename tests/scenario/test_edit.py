@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support_browser import TIMEOUT_MS, choose, find_fields, needs_browser, open_browser, select_item
-from support_lcm import MODELSERVER, TIMEOUT_S, run_process
+from support_browser import TIMEOUT_MS, choose, find_fields, needs_browser, open_link, select_item
+from support_lcm import MODELSERVER, TIMEOUT_S, reserved_url, run_process
 from support_signing import ALLOWED, write_test_key
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
@@ -27,7 +27,7 @@ from modelserver.client.remote import Platform
 from modelserver.formats import load_model
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 pytestmark = [pytest.mark.slow, needs_browser]
 
@@ -37,17 +37,30 @@ SCENE_WIDTH = 990
 """Pixels left of the panels."""
 
 
+def copy_raptor(folder: Path) -> Path:
+    """Copy the Raptor's files to a folder, with a key for commands, and return the folder."""
+    shutil.copy(RAPTOR / "geometry.yaml", folder)
+    text, _, _ = (RAPTOR / "vehicle.yaml").read_text().partition("\ndrivers:")
+    (folder / "vehicle.yaml").write_text(f"{text}\nstate_directory: state\n{ALLOWED}")
+    write_test_key(folder)
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    shutil.copy(RAPTOR / "geometry.yaml", tmp_path)
-    text, _, _ = (RAPTOR / "vehicle.yaml").read_text().partition("\ndrivers:")
-    (tmp_path / "vehicle.yaml").write_text(f"{text}\nstate_directory: state\n{ALLOWED}")
-    write_test_key(tmp_path)
-    return tmp_path
+    return copy_raptor(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def edited(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Page]]:
+    """Open one editor without a service; each test leaves its file saved."""
+    folder = copy_raptor(tmp_path_factory.mktemp("edited"))
+    with reserved_url() as url, edit(browser, folder, url) as page:
+        yield folder / "geometry.yaml", page
 
 
 @contextmanager
-def edit(folder: Path, url: str, *more: str) -> Iterator[Page]:
+def edit(browser: Browser, folder: Path, url: str, *more: str) -> Iterator[Page]:
     """Open the editor of a folder's vehicle file as a person does: by the command, and its link in a browser."""
     command = [*MODELSERVER, "view", str(folder / "vehicle.yaml"), "--edit", "--no-browser", "--port", "0", *more]
     with ExitStack() as stack:
@@ -56,7 +69,7 @@ def edit(folder: Path, url: str, *more: str) -> Iterator[Page]:
         stack.callback(process.stdout.close)
         link = re.search(r"http\S+\?token=\S+", process.stdout.readline())
         assert link is not None
-        page = stack.enter_context(open_browser(link[0]))
+        page = stack.enter_context(open_link(browser, link[0]))
         page.get_by_role("tab", name="Edit").click()
         page.get_by_text(re.compile("^geometry.yaml: ")).wait_for()
         yield page
@@ -114,7 +127,7 @@ def wait_for_text(page: Page, text: str) -> None:
 
 
 def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_undone(
-    folder: Path, lcm_url: str
+    browser: Browser, folder: Path, lcm_url: str
 ) -> None:
     pair = ("FrontSICKLaser:Scan", "Raptor:CG")
     key = str(folder / "commands.key")
@@ -122,7 +135,7 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
         stack.enter_context(run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], lcm_url))
         platform = stack.enter_context(Platform(lcm_url, timeout=1.0, retries=30))
         before = platform.get_pose(*pair).transformation.pose
-        page = stack.enter_context(edit(folder, lcm_url, "--key", key))
+        page = stack.enter_context(edit(browser, folder, lcm_url, "--key", key))
         select_item(page, "constraint", MOUNT)
         find_fields(page, "x, y, z (m)").nth(0).fill("0.0625")
         press(page, "Set")
@@ -158,88 +171,90 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
     assert (folder / "geometry.yaml").read_bytes() == (RAPTOR / "geometry.yaml").read_bytes()
 
 
-def test_given_no_key_then_the_service_denies_and_the_answer_stays(folder: Path, lcm_url: str) -> None:
+def test_given_no_key_then_the_service_denies_and_the_answer_stays(
+    browser: Browser, folder: Path, lcm_url: str
+) -> None:
     pair = ("FrontSICKLaser:Scan", "Raptor:CG")
     with ExitStack() as stack:
         stack.enter_context(run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], lcm_url))
         platform = stack.enter_context(Platform(lcm_url, timeout=1.0, retries=30))
         before = platform.get_pose(*pair).transformation.pose
-        page = stack.enter_context(edit(folder, lcm_url))
+        page = stack.enter_context(edit(browser, folder, lcm_url))
         press(page, "Apply to the service ...")
         wait_for_text(page, "^not applied: .*not signed")
         assert platform.get_pose(*pair).transformation.pose == before
 
 
-def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(folder: Path, lcm_url: str) -> None:
-    with edit(folder, lcm_url) as page:
-        select_item(page, "frame", "FLEA:Lens")
-        find_fields(page, "sigma (m)").nth(0).fill("-0.5")
-        press(page, "Set")
-        wait_for_text(page, "cannot be saved")
-        wait_for_text(page, "a standard deviation is not negative, got -0.5")
-        assert page.get_by_role("button", name="Save ...").is_disabled()
-        select_item(page, "body", "Raptor")
-        press(page, "1: FLEA:Lens")
-        wait_for_value(find_fields(page, "Name"), "Lens")
-        find_fields(page, "sigma (m)").nth(0).fill("0.015")
-        press(page, "Set")
-        wait_for_text(page, "^geometry.yaml: not saved$")
-        press(page, "Save ...")
-        press(page, "Save")
-        wait_for_text(page, "^geometry.yaml: saved$")
-    sigma = load_model(folder / "geometry.yaml").frame("FLEA:Lens").sigma
+def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited: tuple[Path, Page]) -> None:
+    path, page = edited
+    select_item(page, "frame", "FLEA:Lens")
+    find_fields(page, "sigma (m)").nth(0).fill("-0.5")
+    press(page, "Set")
+    wait_for_text(page, "cannot be saved")
+    wait_for_text(page, "a standard deviation is not negative, got -0.5")
+    assert page.get_by_role("button", name="Save ...").is_disabled()
+    select_item(page, "body", "Raptor")
+    press(page, "1: FLEA:Lens")
+    wait_for_value(find_fields(page, "Name"), "Lens")
+    find_fields(page, "sigma (m)").nth(0).fill("0.015")
+    press(page, "Set")
+    wait_for_text(page, "^geometry.yaml: not saved$")
+    press(page, "Save ...")
+    press(page, "Save")
+    wait_for_text(page, "^geometry.yaml: saved$")
+    sigma = load_model(path).frame("FLEA:Lens").sigma
     assert sigma is not None
     assert sigma.position[0] == 0.015
 
 
-def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(folder: Path, lcm_url: str) -> None:
-    before = load_model(folder / "geometry.yaml").frame("Raptor:CG").pose.xyz
-    with edit(folder, lcm_url) as page:
-        select_item(page, "frame", "Raptor:CG")
-        page.get_by_text("Gizmo", exact=True).first.click()
-        choose(page, "Snap", "1 cm, 5 deg")
-        center, tips = find_gizmo(page)
-        moved = ""
-        for x, y in tips:
-            # from a little inside the end of an arrow, outwards
-            dx, dy = (x - center[0], y - center[1])
-            page.mouse.move(x - 0.1 * dx, y - 0.1 * dy)
-            page.wait_for_timeout(300)
-            page.mouse.down()
-            for part in range(1, 6):
-                page.mouse.move(x + 0.2 * part * dx, y + 0.2 * part * dy)
-                page.wait_for_timeout(100)
-            page.mouse.up()
-            for _ in range(20):
-                page.wait_for_timeout(200)
-                moved = page.get_by_text(re.compile("^geometry.yaml: ")).inner_text()
-                if moved.endswith("not saved"):
-                    break
+def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited: tuple[Path, Page]) -> None:
+    path, page = edited
+    before = load_model(path).frame("Raptor:CG").pose.xyz
+    select_item(page, "frame", "Raptor:CG")
+    page.get_by_text("Gizmo", exact=True).first.click()
+    choose(page, "Snap", "1 cm, 5 deg")
+    center, tips = find_gizmo(page)
+    moved = ""
+    for x, y in tips:
+        # from a little inside the end of an arrow, outwards
+        dx, dy = (x - center[0], y - center[1])
+        page.mouse.move(x - 0.1 * dx, y - 0.1 * dy)
+        page.wait_for_timeout(300)
+        page.mouse.down()
+        for part in range(1, 6):
+            page.mouse.move(x + 0.2 * part * dx, y + 0.2 * part * dy)
+            page.wait_for_timeout(100)
+        page.mouse.up()
+        for _ in range(20):
+            page.wait_for_timeout(200)
+            moved = page.get_by_text(re.compile("^geometry.yaml: ")).inner_text()
             if moved.endswith("not saved"):
                 break
-        assert moved.endswith("not saved"), "no drag has moved the gizmo"
-        values = [float(find_fields(page, "x, y, z (m)").nth(n).input_value()) for n in range(3)]
-        assert values != pytest.approx(before, abs=0.009)
-        for value, old in zip(values, before, strict=True):
-            assert value == pytest.approx(old) or value * 100 == pytest.approx(round(value * 100))
-        press(page, "Undo: edit Raptor:CG")
-        wait_for_text(page, "^geometry.yaml: saved$")
-        wait_for_value(find_fields(page, "x, y, z (m)").nth(0), f"{before[0]:g}")
+        if moved.endswith("not saved"):
+            break
+    assert moved.endswith("not saved"), "no drag has moved the gizmo"
+    values = [float(find_fields(page, "x, y, z (m)").nth(n).input_value()) for n in range(3)]
+    assert values != pytest.approx(before, abs=0.009)
+    for value, old in zip(values, before, strict=True):
+        assert value == pytest.approx(old) or value * 100 == pytest.approx(round(value * 100))
+    press(page, "Undo: edit Raptor:CG")
+    wait_for_text(page, "^geometry.yaml: saved$")
+    wait_for_value(find_fields(page, "x, y, z (m)").nth(0), f"{before[0]:g}")
+    find_fields(page, "Gizmo").set_checked(False)
 
 
-def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(folder: Path, lcm_url: str) -> None:
-    path = folder / "geometry.yaml"
-    with edit(folder, lcm_url) as page:
-        select_item(page, "frame", "FLEA:Lens")
-        find_fields(page, "x, y, z (m)").nth(0).fill("0.07")
-        press(page, "Set")
-        wait_for_text(page, "^geometry.yaml: not saved$")
-        other = path.read_text().replace("name: raptor", "name: other")
-        path.write_text(other)
-        press(page, "Save ...")
-        press(page, "Save")
-        wait_for_text(page, "changed meanwhile on disk")
-        assert path.read_text() == other
-        press(page, "Read the file again")
-        press(page, "Drop them")
-        wait_for_text(page, "^geometry.yaml: saved$")
+def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited: tuple[Path, Page]) -> None:
+    path, page = edited
+    select_item(page, "frame", "FLEA:Lens")
+    find_fields(page, "x, y, z (m)").nth(0).fill("0.07")
+    press(page, "Set")
+    wait_for_text(page, "^geometry.yaml: not saved$")
+    other = path.read_text().replace("name: raptor", "name: other")
+    path.write_text(other)
+    press(page, "Save ...")
+    press(page, "Save")
+    wait_for_text(page, "changed meanwhile on disk")
+    assert path.read_text() == other
+    press(page, "Read the file again")
+    press(page, "Drop them")
+    wait_for_text(page, "^geometry.yaml: saved$")

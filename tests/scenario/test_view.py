@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,9 @@ from mstools.view.scene import PATH_COLOR, TRAIL_COLOR
 from mstools.view.sources import open_geometry, open_log
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
+
+    from mstools.view.sources import Source
 
 pytestmark = [pytest.mark.slow, needs_browser]
 
@@ -33,6 +35,13 @@ DRIVE_S = 30.0
 @pytest.fixture(scope="module")
 def drive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_drive(tmp_path_factory.mktemp("view"), DRIVE_S)
+
+
+@pytest.fixture(scope="module")
+def geometry(browser: Browser) -> Iterator[tuple[Source, Page]]:
+    source = open_geometry(find_vehicle_file(), {})
+    with show(browser, source) as page:
+        yield source, page
 
 
 def enter(page: Page, label: str, value: str) -> None:
@@ -63,44 +72,50 @@ def count_pixels(page: Page, color: tuple[int, int, int]) -> int:
     return int(np.sum(np.linalg.norm(pixels - wanted, axis=2) < 70.0))
 
 
-def test_given_a_geometry_file_when_two_frames_are_chosen_then_the_answer_and_its_path_are_shown() -> None:
-    source = open_geometry(find_vehicle_file(), {})
+def test_given_a_geometry_file_when_two_frames_are_chosen_then_the_answer_and_its_path_are_shown(
+    geometry: tuple[Source, Page],
+) -> None:
+    source, page = geometry
     found = source.answers.get_pose("Digiclops:ImagePlane", "Raptor:CG").transformation
-    with show(source) as page:
-        choose(page, "Frame", "Digiclops:ImagePlane")
-        choose(page, "in", "Raptor:CG")
-        wait_until(page, lambda: read_value(page, "x") == pytest.approx(found.pose.xyz[0], abs=1e-4))
-        assert read_value(page, "z") == pytest.approx(found.pose.xyz[2], abs=1e-4)
-        assert page.get_by_role("cell", name="Digiclops:ImagePlane").count() > 0
-        wait_until(page, lambda: count_pixels(page, PATH_COLOR) > 20)
-        page.get_by_role("button", name="Exchange").click()
-        inverse = found.pose.inverse()
-        wait_until(page, lambda: read_value(page, "x") == pytest.approx(inverse.xyz[0], abs=1e-4))
-        page.get_by_text("Copy", exact=True).click()
-        page.get_by_text("modelserver query 'Raptor:CG' 'Digiclops:ImagePlane'").wait_for()
+    choose(page, "Frame", "Digiclops:ImagePlane")
+    choose(page, "in", "Raptor:CG")
+    wait_until(page, lambda: read_value(page, "x") == pytest.approx(found.pose.xyz[0], abs=1e-4))
+    assert read_value(page, "z") == pytest.approx(found.pose.xyz[2], abs=1e-4)
+    assert page.get_by_role("cell", name="Digiclops:ImagePlane").count() > 0
+    wait_until(page, lambda: count_pixels(page, PATH_COLOR) > 20)
+    page.get_by_role("button", name="Exchange").click()
+    inverse = found.pose.inverse()
+    wait_until(page, lambda: read_value(page, "x") == pytest.approx(inverse.xyz[0], abs=1e-4))
+    page.get_by_text("Copy", exact=True).click()
+    page.get_by_text("modelserver query 'Raptor:CG' 'Digiclops:ImagePlane'").wait_for()
 
 
-def test_given_a_geometry_file_when_a_joint_is_moved_then_the_picture_and_the_answer_change() -> None:
-    source = open_geometry(find_vehicle_file(), {})
-    model = source.drive.model
-    assert model is not None
-    with show(source) as page:
-        choose(page, "Frame", "FrontSICKLaser:Scan")
-        choose(page, "in", "Raptor:CG")
-        wait_until(page, lambda: page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0)
-        before = read_value(page, "pitch")
-        page.get_by_role("tab", name="Joints").click()
-        enter(page, "FrontNoddingSICKAxis (deg)", "-20")
-        page.get_by_role("tab", name="Query").click()
-        wait_until(page, lambda: abs(read_value(page, "pitch") - before) > 5.0)
-        found = source.answers.get_pose("FrontSICKLaser:Scan", "Raptor:CG").transformation
-        assert read_value(page, "pitch") == pytest.approx(np.degrees(found.rpy[1]), abs=1e-3)
+def test_given_a_geometry_file_when_a_joint_is_moved_then_the_picture_and_the_answer_change(
+    geometry: tuple[Source, Page],
+) -> None:
+    source, page = geometry
+    choose(page, "Frame", "FrontSICKLaser:Scan")
+    choose(page, "in", "Raptor:CG")
+
+    def get_pitch() -> float:
+        return float(np.degrees(source.answers.get_pose("FrontSICKLaser:Scan", "Raptor:CG").transformation.rpy[1]))
+
+    before = get_pitch()
+    wait_until(page, lambda: read_value(page, "pitch") == pytest.approx(before, abs=1e-3))
+    assert page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0
+    page.get_by_role("tab", name="Joints").click()
+    enter(page, "FrontNoddingSICKAxis (deg)", "-20")
+    page.get_by_role("tab", name="Query").click()
+    wait_until(page, lambda: abs(read_value(page, "pitch") - before) > 5.0)
+    assert read_value(page, "pitch") == pytest.approx(get_pitch(), abs=1e-3)
 
 
-def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow(drive_log: Path) -> None:
+def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow(
+    browser: Browser, drive_log: Path
+) -> None:
     source = open_log(drive_log, "", None, lambda part: None)
     seconds = (source.drive.end - source.drive.begin) * 1e-6
-    with show(source) as page:
+    with show(browser, source) as page:
         page.get_by_role("tab", name="Time").click()
         clock = page.get_by_text(re.compile(r"^\d+\.\d\d s$"))
         assert clock.inner_text() == "0.00 s"
@@ -124,8 +139,8 @@ def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow
         page.get_by_text(re.compile(r"deg, height")).wait_for()
 
 
-def test_given_the_demo_then_the_laser_nods_in_the_page_while_it_drives() -> None:
-    with follow_demo() as source, show(source) as page:
+def test_given_the_demo_then_the_laser_nods_in_the_page_while_it_drives(browser: Browser) -> None:
+    with follow_demo() as source, show(browser, source) as page:
         choose(page, "Frame", "FrontSICKLaser:Scan")
         choose(page, "in", "Raptor:CG")
         wait_until(page, lambda: page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0)

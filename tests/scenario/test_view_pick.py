@@ -13,7 +13,7 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 from mstools.view.sources import open_geometry
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 pytestmark = [pytest.mark.slow, needs_browser]
 
@@ -50,10 +50,12 @@ def click_middle(page: Page, label: str, modifier: str = "") -> str:
     return str(field.input_value())
 
 
-def test_given_a_body_that_is_clicked_then_it_is_the_frame_and_with_shift_the_reference(tmp_path: Path) -> None:
+def test_given_a_body_that_is_clicked_then_it_is_the_frame_and_with_shift_the_reference(
+    browser: Browser, tmp_path: Path
+) -> None:
     path = tmp_path / "ball.yaml"
     path.write_text(GEOMETRY)
-    with show(open_geometry(path, {})) as page:
+    with show(browser, open_geometry(path, {})) as page:
         choose(page, "Frame", "Base:Other")
         assert click_middle(page, "Frame") == "Ball:Center"
         choose(page, "Frame", "Base:Other")
