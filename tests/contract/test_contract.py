@@ -218,7 +218,7 @@ def test_given_names_and_frames_as_long_as_geometry_allows_then_the_wire_takes_t
 
 def test_given_a_wheel_when_built_then_it_has_the_file_of_each_type() -> None:
     pytest.importorskip("hatchling", reason="hatchling, which builds the wheel, is not installed")
-    hook = script("wheel_lcm_files").LcmFilesHook(str(ROOT), {}, None, None, "", "wheel")
+    hook = script("wheel_hook").WheelHook(str(ROOT), {}, None, None, "", "wheel")
     build_data: dict[str, Any] = {"force_include": {}}
     hook.initialize("standard", build_data)
     assert build_data["force_include"] == {

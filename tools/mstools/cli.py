@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
-from modelserver.version import __version__
+from modelserver.version import __version__, is_filter_compiled
 from mstools.terminal.output import escape, print_problems
 from mstools.terminal.problems import suggest_path
 
@@ -168,13 +168,19 @@ def _stub() -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"modelserver {__version__}")
+        typer.echo(f"modelserver {__version__}{' (compiled filter)' if is_filter_compiled() else ''}")
         raise typer.Exit
 
 
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_show_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version",
+            help="Print the version, and whether the filter is compiled.",
+            callback=_show_version,
+            is_eager=True,
+        ),
     ] = False,
 ) -> None:
     pass

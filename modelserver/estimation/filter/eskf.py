@@ -51,7 +51,8 @@ from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
 
 KalmanFilter: Final = import_kalman_filter()
 
-ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
+ZERO: Vector3 = (0.0, 0.0, 0.0)
+"""Not Final: the compiled build could not read it, see `tools/wheel_hook.py`."""
 
 STANDARD_GRAVITY: Final = 9.80665
 EARTH_RADIUS: Final = 6_371_000.0

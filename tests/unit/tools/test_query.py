@@ -15,6 +15,7 @@ import pytest
 from modelserver import __version__
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality
 from modelserver.transforms import Pose, Transformation
+from modelserver.version import is_filter_compiled
 from mstools.cli import COMMANDS, main
 from mstools.commands.query import as_dict, describe
 
@@ -274,7 +275,8 @@ def test_given_wrong_usage_then_exit_is_2_and_the_way_to_help_is_reported(run: C
 
 
 def test_given_version_then_it_is_printed(run: Command) -> None:
-    assert run("--version") == (0, f"modelserver {__version__}\n", "")
+    build = " (compiled filter)" if is_filter_compiled() else ""
+    assert run("--version") == (0, f"modelserver {__version__}{build}\n", "")
 
 
 def test_given_help_then_every_command_is_listed_with_its_summary(run: Command) -> None:
