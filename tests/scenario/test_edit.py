@@ -52,7 +52,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def edited(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Page]]:
+def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Page]]:
     """Open one editor without a service; each test leaves its file saved."""
     folder = copy_raptor(tmp_path_factory.mktemp("edited"))
     with reserved_url() as url, edit(browser, folder, url) as page:
@@ -185,8 +185,8 @@ def test_given_no_key_then_the_service_denies_and_the_answer_stays(
         assert platform.get_pose(*pair).transformation.pose == before
 
 
-def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited: tuple[Path, Page]) -> None:
-    path, page = edited
+def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited_page: tuple[Path, Page]) -> None:
+    path, page = edited_page
     select_item(page, "frame", "FLEA:Lens")
     find_fields(page, "sigma (m)").nth(0).fill("-0.5")
     press(page, "Set")
@@ -207,8 +207,8 @@ def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edit
     assert sigma.position[0] == 0.015
 
 
-def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited: tuple[Path, Page]) -> None:
-    path, page = edited
+def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited_page: tuple[Path, Page]) -> None:
+    path, page = edited_page
     before = load_model(path).frame("Raptor:CG").pose.xyz
     select_item(page, "frame", "Raptor:CG")
     page.get_by_text("Gizmo", exact=True).first.click()
@@ -243,8 +243,8 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
     find_fields(page, "Gizmo").set_checked(False)
 
 
-def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited: tuple[Path, Page]) -> None:
-    path, page = edited
+def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: tuple[Path, Page]) -> None:
+    path, page = edited_page
     select_item(page, "frame", "FLEA:Lens")
     find_fields(page, "x, y, z (m)").nth(0).fill("0.07")
     press(page, "Set")
