@@ -204,6 +204,7 @@ def _fuse_aligned(
     uncorrected = state.nav
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
+        state = state._replace(nav=latency_estimator.hold_latency(uncorrected, state.nav, layout))
         state = correct_path(setup, state, uncorrected)
         state = state._replace(consistency=consistency_step.hold_heading(setup, state, nav))
     if not adds_nothing and decision.verdict is Verdict.USED:

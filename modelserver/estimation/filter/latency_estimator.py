@@ -6,10 +6,10 @@ error of the fixes. So the latency is also fitted by itself when the heading is 
 while rejected or drifting fixes suggest that it has changed (`inflate_latency`). It shows in acceleration and in turns;
 at constant speed straight ahead it is a displacement, and on a steady circle a rotation.
 
-On a steady circle fixes determine only the sum of the heading and of turn rate times latency. An inflated latency would
-follow whatever turns the heading there, such as an error of the gyro's scale, and take the heading along without limit.
-So it is not inflated while the two are correlated, and the heading's variance is that of a latency which may have
-changed (`compute_heading_variance`).
+On a steady circle fixes determine only the sum of the heading and of turn rate times latency. The latency would follow
+whatever turns the heading there, such as an error of the gyro's scale, and take the heading along without limit. So
+while the two are correlated it is neither inflated nor corrected (`hold_latency`), and the heading's variance is that
+of a latency which may have changed (`compute_heading_variance`).
 """
 
 from __future__ import annotations
@@ -117,6 +117,20 @@ def inflate_latency(
     P = nav.covariance.copy()
     P[at, at] = inflated
     return nav._replace(covariance=P)
+
+
+def hold_latency(before: NavState, after: NavState, layout: ErrorLayout) -> NavState:
+    """Return the state `after` a fix with the latency that it had `before`, where fixes cannot separate it.
+
+    The rest is what the covariance expects at that latency: the error P[:, t] / P[t, t] times the difference. So what
+    turns the heading on a steady circle stays an error of heading and gyro, which fixes correct.
+    """
+    at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
+    P = after.covariance
+    change = before.extras[extra] - after.extras[extra]
+    if not change or _is_separate(P, at):
+        return after
+    return after.inject(P[:, at] * (change / P[at, at]), P)
 
 
 def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:

@@ -687,3 +687,24 @@ def test_given_a_heading_that_goes_with_the_latency_then_it_is_not_inflated_but_
     assert after.covariance[at, at] == pytest.approx(variance)
     of_heading = latency_estimator.compute_heading_variance(nav, SETUP.layout)
     assert of_heading == pytest.approx(0.0 if is_inflated else 0.4**2 * (latency_estimator.CHANGE_SIGMA**2 - 0.05**2))
+
+
+@pytest.mark.parametrize(("correlation", "is_held"), [(0.0, False), (0.05, False), (0.5, True), (-0.5, True)])
+def test_given_a_heading_that_goes_with_the_latency_then_fixes_correct_the_heading_alone(correlation, is_held):
+    before = correlate_heading_with_latency(correlation)
+    at, extra = SETUP.layout.index(LATENCY), SETUP.layout.extra_index(LATENCY)
+    # as fixes correct it, along the line on which the covariance expects both
+    error = before.covariance[:, at] * (0.2 / before.covariance[at, at])
+    corrected = before.inject(error, before.covariance)
+    assert corrected.extras[extra] == pytest.approx(before.extras[extra] + 0.2)
+    after = latency_estimator.hold_latency(before, corrected, SETUP.layout)
+    if not is_held:
+        assert after is corrected
+        return
+    assert after.extras[extra] == pytest.approx(before.extras[extra], abs=1e-12)
+    assert after.yaw == pytest.approx(before.yaw, abs=1e-3)
+    # what the latency does not explain stays in the heading
+    turned = before.inject(np.eye(len(error))[8] * 0.05 + error, before.covariance)
+    assert latency_estimator.hold_latency(before, turned, SETUP.layout).yaw == pytest.approx(
+        before.yaw + 0.05, abs=3e-3
+    )
