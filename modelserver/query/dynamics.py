@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
-from modelserver.dynamics.rates import compute_turn_motion
+from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.dynamics.settings import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
@@ -224,12 +224,12 @@ def _lookup_floating(
     state = _collect(view, known, estimate.utime, joints)
     X = motion.pose.transformation.pose
     phi = so3.logarithm(X.wxyz)
-    J = so3.left_jacobian(phi)
-    rate = np.linalg.solve(J, np.array(motion.angular_velocity))
-    _, change = compute_turn_motion(phi, so3.to_vector3(rate.tolist()))
+    rate = compute_turn_rate(phi, motion.angular_velocity)
+    _, bias = compute_turn_motion(phi, rate)
+    change = so3.add(motion.angular_acceleration, so3.scale(-1.0, bias))
     state.q[:6] = (*X.xyz, *phi)
     state.v[:6] = (*motion.velocity, *rate)
-    state.a[:6] = (*motion.acceleration, *np.linalg.solve(J, np.array(motion.angular_acceleration) - change))
+    state.a[:6] = (*motion.acceleration, *compute_turn_rate(phi, change))
     invalid = state.invalid | Invalid(motion.pose.transformation.invalid_reasons) | estimate.invalid
     return state._replace(invalid=invalid, motion=motion)
 

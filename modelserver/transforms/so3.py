@@ -157,7 +157,7 @@ def from_rows(rows: tuple[Vector3, Vector3, Vector3]) -> Quaternion:
 
 def from_matrix(R: npt.ArrayLike) -> Quaternion:
     """Return the unit quaternion of a rotation matrix (3, 3); see `nearest_rotation` for one that is inexact."""
-    a, b, c = map(to_vector3, np.asarray(R, dtype=float))
+    a, b, c = map(to_vector3, np.asarray(R, dtype=float).tolist())
     return from_rows((a, b, c))
 
 

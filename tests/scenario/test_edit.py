@@ -116,6 +116,12 @@ def press(page: Page, name: str) -> None:
     page.get_by_role("button", name=name, exact=True).last.click()
 
 
+def set_number(page: Page, label: str, value: str) -> None:
+    """Set the first number of a row of the selected item."""
+    find_fields(page, label).nth(0).fill(value)
+    press(page, "Set")
+
+
 def wait_for_value(field: Locator, value: str) -> None:
     from playwright.sync_api import expect
 
@@ -137,8 +143,7 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
         before = platform.get_pose(*pair).transformation.pose
         page = stack.enter_context(edit(browser, folder, lcm_url, "--key", key))
         select_item(page, "constraint", MOUNT)
-        find_fields(page, "x, y, z (m)").nth(0).fill("0.0625")
-        press(page, "Set")
+        set_number(page, "x, y, z (m)", "0.0625")
         wait_for_text(page, "^geometry.yaml: not saved$")
         # nothing is applied yet
         assert platform.get_pose(*pair).transformation.pose == before
@@ -188,16 +193,14 @@ def test_given_no_key_then_the_service_denies_and_the_answer_stays(
 def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited_page: tuple[Path, Page]) -> None:
     path, page = edited_page
     select_item(page, "frame", "FLEA:Lens")
-    find_fields(page, "sigma (m)").nth(0).fill("-0.5")
-    press(page, "Set")
+    set_number(page, "sigma (m)", "-0.5")
     wait_for_text(page, "cannot be saved")
     wait_for_text(page, "a standard deviation is not negative, got -0.5")
     assert page.get_by_role("button", name="Save ...").is_disabled()
     select_item(page, "body", "Raptor")
     press(page, "1: FLEA:Lens")
     wait_for_value(find_fields(page, "Name"), "Lens")
-    find_fields(page, "sigma (m)").nth(0).fill("0.015")
-    press(page, "Set")
+    set_number(page, "sigma (m)", "0.015")
     wait_for_text(page, "^geometry.yaml: not saved$")
     press(page, "Save ...")
     press(page, "Save")
@@ -246,8 +249,7 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
 def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: tuple[Path, Page]) -> None:
     path, page = edited_page
     select_item(page, "frame", "FLEA:Lens")
-    find_fields(page, "x, y, z (m)").nth(0).fill("0.07")
-    press(page, "Set")
+    set_number(page, "x, y, z (m)", "0.07")
     wait_for_text(page, "^geometry.yaml: not saved$")
     other = path.read_text().replace("name: raptor", "name: other")
     path.write_text(other)

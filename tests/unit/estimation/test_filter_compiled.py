@@ -17,7 +17,6 @@ from modelserver.version import __version__
 
 ROOT = Path(__file__).resolve().parents[3]
 COMPILED = os.environ.get("MODELSERVER_COMPILED", "")
-DATA = Path(os.environ.get("MODELSERVER_DATA") or ROOT.parent / "shared" / "data")
 
 pytestmark = pytest.mark.skipif(not COMPILED, reason="MODELSERVER_COMPILED names no compiled build")
 
@@ -80,8 +79,5 @@ def test_given_a_simulated_drive_then_all_estimates_and_decisions_are_the_same_b
 
 @pytest.mark.slow
 @pytest.mark.realdata
-def test_given_a_recording_then_all_estimates_and_decisions_are_the_same_bits(tmp_path: Path) -> None:
-    bag = DATA / "husky" / "test1.bag"
-    if not bag.is_file():
-        pytest.skip("no husky/test1.bag; set MODELSERVER_DATA to the folder of recordings")
-    compare_builds(tmp_path, RECORDED, bag, ROOT / "config" / "husky" / "vehicle.yaml")
+def test_given_a_recording_then_all_estimates_and_decisions_are_the_same_bits(tmp_path: Path, data_dir: Path) -> None:
+    compare_builds(tmp_path, RECORDED, data_dir / "husky" / "test1.bag", ROOT / "config" / "husky" / "vehicle.yaml")

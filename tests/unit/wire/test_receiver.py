@@ -28,7 +28,7 @@ from modelserver.wire.receiver import (
     UdpReceiver,
     open_receiver,
 )
-from modelserver.wire.urls import parse_udp_address
+from modelserver.wire.urls import UdpAddress, parse_udp_address
 
 
 def wait_for(receiver: Receiver) -> Message:
@@ -49,6 +49,17 @@ def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
     with reserved_url() as url, closing(open_receiver(resolve_url(url))) as receiver:
         assert isinstance(receiver, request.param)
         yield receiver, lcm.LCM(resolve_url(url))
+
+
+@pytest.fixture
+def udp_pair() -> Iterator[tuple[UdpReceiver, UdpAddress, lcm.LCM]]:
+    """A receiver that is subscribed to A, its address, and a publisher."""
+    with reserved_url() as url:
+        address = parse_udp_address(url)
+        assert address is not None
+        with closing(UdpReceiver(address)) as receiver:
+            receiver.subscribe("A")
+            yield receiver, address, lcm.LCM(url)
 
 
 def test_given_messages_that_liblcm_sends_then_those_of_the_channels_are_received(
@@ -74,36 +85,32 @@ def test_given_no_route_then_the_error_names_what_to_check(monkeypatch: pytest.M
         open_receiver("udpm://239.1.2.3:7667?ttl=0")
 
 
-def test_given_a_flood_of_packets_without_a_message_then_receive_returns_and_the_message_behind_is_received() -> None:
-    with reserved_url() as url:
-        address = parse_udp_address(url)
-        assert address is not None
-        receiver = UdpReceiver(address)
-        receiver.subscribe("A")
-        publisher = lcm.LCM(url)
-        with closing(receiver), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            for packet in (b"LC03", b"LC03" + bytes(30), b"LC02\0\0\0\1A", b"no LCM", b"") * MAX_IGNORED:
-                sender.sendto(packet, (address.group, address.port))
-            publisher.publish("A", b"data")
-            assert receiver.receive() is None
-            assert wait_for(receiver) == (b"A", b"data")
-
-
-def test_given_a_kernel_without_the_filter_then_messages_of_other_channels_are_not_received(
-    monkeypatch: pytest.MonkeyPatch,
+def test_given_a_flood_of_packets_without_a_message_then_receive_returns_and_the_message_behind_is_received(
+    udp_pair: tuple[UdpReceiver, UdpAddress, lcm.LCM],
 ) -> None:
+    receiver, address, publisher = udp_pair
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for packet in (b"LC03", b"LC03" + bytes(30), b"LC02\0\0\0\1A", b"no LCM", b"") * MAX_IGNORED:
+            sender.sendto(packet, (address.group, address.port))
+        publisher.publish("A", b"data")
+        assert receiver.receive() is None
+        assert wait_for(receiver) == (b"A", b"data")
+
+
+@pytest.fixture
+def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "set_channel_filter", lambda receiving, channels: None)
-    with reserved_url() as url:
-        address = parse_udp_address(url)
-        assert address is not None
-        receiver = UdpReceiver(address)
-        receiver.subscribe("A")
-        publisher = lcm.LCM(url)
-        with closing(receiver):
-            for channel in ("OTHER", "AB", "A"):
-                publisher.publish(channel, b"data")
-            assert wait_for(receiver) == (b"A", b"data")
+
+
+@pytest.mark.usefixtures("no_filter")
+def test_given_a_kernel_without_the_filter_then_messages_of_other_channels_are_not_received(
+    udp_pair: tuple[UdpReceiver, UdpAddress, lcm.LCM],
+) -> None:
+    receiver, _, publisher = udp_pair
+    for channel in ("OTHER", "AB", "A"):
+        publisher.publish(channel, b"data")
+    assert wait_for(receiver) == (b"A", b"data")
 
 
 # --- fragments ------------------------------------------------------------------------------------------------
