@@ -102,7 +102,7 @@ class Editor:
                 event, lambda: self.select(GeometryItem(ItemKind(self._kind.value), event.target.value))
             )
         )
-        self._fields = ItemFields(gui, session, self._change_item, actions)
+        self._fields = ItemFields(server, session, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
             self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)

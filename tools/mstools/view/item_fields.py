@@ -73,12 +73,13 @@ class ItemFields:
 
     def __init__(
         self,
-        gui: viser.GuiApi,
+        server: viser.ViserServer,
         session: EditSession,
         change: ChangeItem,
         actions: queue.SimpleQueue[Callable[[], None]],
     ):
-        self._gui = gui
+        self._server = server
+        self._gui = gui = server.gui
         self._session = session
         self._change = change
         self._actions = actions
@@ -95,29 +96,34 @@ class ItemFields:
         """Show the fields of an item."""
         self._item = item
         self._fields, self._given = {}, {}
-        if self._form is not None:
-            self._form.remove()
-        document = self._session.document
         self._part = find_part(self._session.model, item)
-        with self._place:
-            self._form = self._gui.add_form(None)
-        with self._form:
-            self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
-            template = document.find_template(item)
-            if template:
-                users = ", ".join(document.list_users(template))
-                hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
-                self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
-            if isinstance(self._part, Constraint):
-                self._add_ends(self._part)
-            if self._part is not None:
-                self._add_pose(self._part.pose, self._part.sigma)
-            if isinstance(self._part, Constraint):
-                self._add_joint(self._part.joint)
-            self._add("description", self._gui.add_text("Description", self._get_description(item)))
-            button = self._gui.add_button("Set")
-        button.on_click(lambda _: self._actions.put(self.set))
+        old = self._form
+        with self._server.atomic():
+            with self._place:
+                self._form = self._gui.add_form(None)
+            with self._form:
+                self._add_fields(item)
+            if old is not None:
+                # last: a page hides a folder that was empty for a moment, and may never show it again
+                old.remove()
         self._form.on_submit(lambda _: self._actions.put(self.set))
+
+    def _add_fields(self, item: GeometryItem) -> None:
+        document = self._session.document
+        self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
+        template = document.find_template(item)
+        if template:
+            users = ", ".join(document.list_users(template))
+            hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
+            self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
+        if isinstance(self._part, Constraint):
+            self._add_ends(self._part)
+        if self._part is not None:
+            self._add_pose(self._part.pose, self._part.sigma)
+        if isinstance(self._part, Constraint):
+            self._add_joint(self._part.joint)
+        self._add("description", self._gui.add_text("Description", self._get_description(item)))
+        self._gui.add_button("Set").on_click(lambda _: self._actions.put(self.set))
 
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:

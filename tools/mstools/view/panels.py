@@ -533,12 +533,13 @@ class JointsPanel:
             for name, (slider, _) in self._sliders.items()
             if not math.isclose(slider.value, self._defaults[name], abs_tol=1e-6)
         }
-        for slider, _ in self._sliders.values():
-            slider.remove()
-        self._sliders, self._defaults = {}, {}
+        old, self._sliders, self._defaults = self._sliders, {}, {}
         with self._folder:
             for name, joint, number in list_coordinates(model):
                 self._add_slider(name, joint, number, moved.get(name))
+        for slider, _ in old.values():
+            # last: a page hides a folder that was empty for a moment, and may never show it again
+            slider.remove()
         if moved.keys() & self._sliders.keys():
             self._apply()
 
