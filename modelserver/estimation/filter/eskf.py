@@ -186,11 +186,12 @@ class Earth(NamedTuple):
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise: (rad/s)2/Hz, (m/s2)2/Hz, and of the random walks of the biases.
 
-    `gyros_drive_attitude` is False for a stationary vehicle: its attitude is constant, whatever the gyros measure, so a
-    correction of their bias must not rotate it.
+    `tilt` and `yaw` are those of the attitude. `gyros_drive_attitude` is False for a stationary vehicle: its attitude
+    is constant, whatever the gyros measure, so a correction of their bias must not rotate it.
     """
 
-    gyro: float
+    tilt: float
+    yaw: float
     accelerometer: float
     gyro_bias: float
     accelerometer_bias: float
@@ -342,17 +343,18 @@ def _transition_matrix(
 
 
 def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, decays: Sequence[float]) -> Array:
-    """Return Q (n, n) over the lag; the noise is the same along all axes. The array is valid until the next call."""
+    """Return Q (n, n) over the lag; the array is valid until the next call."""
     v = noise.accelerometer * dt
     p, pv = v * dt * dt / 3.0, v * dt / 2.0
-    w, bg, ba = noise.gyro * dt, noise.gyro_bias * dt, noise.accelerometer_bias * dt
+    tilt, yaw = noise.tilt * dt, noise.yaw * dt
+    bg, ba = noise.gyro_bias * dt, noise.accelerometer_bias * dt
     # exact for a Gauss-Markov process; dt, its limit, for a random walk
     extras = [
         density * ((1.0 - keep * keep) / (2.0 * rate) if rate > 0.0 else dt)
         for (density, rate), keep in zip(layout.densities_and_rates, decays, strict=True)
     ]
     return _process_noise_buffer(layout.size).fill(
-        *(p, p, p, v, v, v, w, w, w, bg, bg, bg, ba, ba, ba, *extras),
+        *(p, p, p, v, v, v, tilt, tilt, yaw, bg, bg, bg, ba, ba, ba, *extras),
         *(pv, pv, pv, pv, pv, pv),
     )
 

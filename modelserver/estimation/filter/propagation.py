@@ -32,15 +32,17 @@ TURN_TIME: Final = 10.0
 
 def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
     """Return the process noise at an instant of the state."""
-    if not setup.uses_imu(state.common.mode):
-        if state.is_stationary:
-            return setup.stationary
-        if measures_turn_rate(setup, state, nav.utime):
-            return setup.turning
-        return setup.rolling if state.common.wheels.measures_speed(nav.utime) else setup.coasting
-    if (nav.utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
+    if setup.uses_imu(state.common.mode):
+        if (nav.utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold:
+            return _select_imu_noise(setup, state)
+    elif state.is_stationary:
+        return setup.stationary
+    elif measures_turn_rate(setup, state, nav.utime):
+        return setup.turning
+    wheels = state.common.wheels
+    if not wheels.measures_speed(nav.utime):
         return setup.coasting
-    return _select_imu_noise(setup, state)
+    return setup.coasting._replace(yaw=wheels.turn_rate.sigma**2 * setup.settings.slip_time)
 
 
 def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
@@ -53,8 +55,9 @@ def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
         return noise
     if not state.common.measures_wheel_speed(nav.utime):
         return noise  # the non-holonomic constraint would turn the heading by it
-    # an error of the gyro's scale lasts through a turn; fixes correct it
-    return noise._replace(gyro=noise.gyro + TURN_TIME * (setup.settings.gyro_scale_sigma * rate) ** 2)
+    # an error of the gyro's scale lasts through a turn, and so does one of its axes; fixes correct it
+    turning = TURN_TIME * (setup.settings.gyro_scale_sigma * rate) ** 2
+    return noise._replace(tilt=noise.tilt + turning, yaw=noise.yaw + turning)
 
 
 def measures_turn_rate(setup: Setup, state: Navigating, utime: int) -> bool:
@@ -116,7 +119,7 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
         if measures_turn_rate(setup, state, nav.utime):
             turn = state.imu.rate[2] - nav.gyro_bias[2]
         elif wheels.measures_speed(nav.utime):
-            turn = wheels.turn_rate
+            turn = wheels.turn_rate.value
     return eskf.propagate_without_imu(nav, utime, (0.0, 0.0, turn), base)
 
 

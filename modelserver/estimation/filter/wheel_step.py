@@ -29,7 +29,12 @@ from modelserver.estimation.filter.fusion import (
     report_event,
 )
 from modelserver.estimation.filter.measurements import constraints
-from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
+from modelserver.estimation.filter.measurements.wheels import (
+    TurnRate,
+    WheelSpeed,
+    are_wheels_stationary,
+    estimate_turn_rate,
+)
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState, Leveling, N, PreviousSample
@@ -49,6 +54,10 @@ UNSTUCK_SPEED: Final = 0.3
 
 UNKNOWN_SPEED_SIGMA: Final = 2.0
 """Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
+
+VAGUE_SPEED_SIGMA: Final = 0.1
+VAGUE_DIRECTION: Final = 0.2
+"""The same, and that as a share of the speed, beyond which the velocity has no direction that shows the heading."""
 
 
 def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
@@ -111,13 +120,20 @@ def _fuse_speed(
         return state, ((reject(item, innovation),) if innovation else NOTHING), False
     if state.common.wheels.is_suspect:
         innovation = innovation._replace(monitored="stuck")
-    is_first_speed = not innovation.monitored and _is_speed_unknown(context.nav)
+    is_first_speed = not innovation.monitored and _has_speed_sigma(context.nav, UNKNOWN_SPEED_SIGMA)
     if is_first_speed:
         # the wheels' error is a share of speed: linearize at the speed that they measure, not at 0
         nav = _set_speed(context.nav, innovation, setup.rig.base, min(age, settings.wheel_period))
         again = measurement.evaluate(context._replace(nav=nav), sample)
         if not isinstance(again, str):
             context, innovation = context._replace(nav=nav), again
+    elif _has_speed_sigma(context.nav, max(VAGUE_SPEED_SIGMA, VAGUE_DIRECTION * math.hypot(*context.nav.velocity))):
+        # an error of the velocity must not turn the heading: linearize at the one that the wheels measure
+        speed = context.nav.body_velocity(setup.rig.base)[0] + float(innovation.residual.mean())
+        ahead = context.nav._replace(velocity=so3.rotate(context.nav.attitude, (speed, 0.0, 0.0)))
+        again = measurement.evaluate(context._replace(nav=ahead), sample)
+        if not isinstance(again, str) and again.jacobian.shape == innovation.jacobian.shape:
+            innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
     wheels = state.common.wheels
@@ -127,7 +143,7 @@ def _fuse_speed(
     if has_gyro and item.utime - state.imu.used_utime < FORCE_AGE_US:
         mount = _compare_force(setup, context.nav, innovation, mount, item.utime)
     if decision.verdict is Verdict.USED:
-        turn_rate = 0.0
+        turn_rate = TurnRate(nav.angular_rate[2], settings.wheel_rate_sigma)
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
@@ -202,9 +218,10 @@ def _set_speed(nav: NavState, innovation: Innovation, base: Vector3, seconds: fl
     return nav._replace(travel=(a + dx, b + dy, c + dz))
 
 
-def _is_speed_unknown(nav: NavState) -> bool:
+def _has_speed_sigma(nav: NavState, sigma: float) -> bool:
+    """Return whether the standard deviation of the horizontal velocity is larger, m/s."""
     P = nav.covariance
-    return float(P[3, 3] + P[4, 4]) > UNKNOWN_SPEED_SIGMA**2
+    return float(P[3, 3] + P[4, 4]) > sigma**2
 
 
 def _get_wheels(previous: PreviousSample | None) -> WheelsSample | None:
