@@ -324,6 +324,8 @@ def _transition_matrix(
     The array is valid until the next call.
     """
     ix, iy, iz = nav.impulse
+    if not gyros_drive_attitude:
+        ix = iy = 0.0  # it is stationary: what shakes it has no direction
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
     t, u = -dt, -0.5 * dt * dt
     k = 0.5 * dt

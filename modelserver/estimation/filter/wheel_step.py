@@ -127,7 +127,9 @@ def _fuse_speed(
         again = measurement.evaluate(context._replace(nav=nav), sample)
         if not isinstance(again, str):
             context, innovation = context._replace(nav=nav), again
-    elif _has_speed_sigma(context.nav, max(VAGUE_SPEED_SIGMA, VAGUE_DIRECTION * math.hypot(*context.nav.velocity))):
+    elif state.stationary.is_confirmed_by_wheels(item.utime) or _has_speed_sigma(
+        context.nav, max(VAGUE_SPEED_SIGMA, VAGUE_DIRECTION * math.hypot(*context.nav.velocity))
+    ):
         # an error of the velocity must not turn the heading: linearize at the one that the wheels measure
         speed = context.nav.body_velocity(setup.rig.base)[0] + float(innovation.residual.mean())
         ahead = context.nav._replace(velocity=so3.rotate(context.nav.attitude, (speed, 0.0, 0.0)))
