@@ -79,9 +79,9 @@ def propagate_imu(
         nav = eskf.propagate_covariance(nav, noise, setup.layout)._replace(rate=rate, force=force)
     else:
         if state.constraints.is_stationary:
-            turning = _get_stationary_rate(state, nav)
+            turning, place = _get_stationary_rate(state, nav), nav.position
             nav = eskf.propagate(nav._replace(rate=turning), utime, turning, force, state.earth, setup.rig.base)
-            nav = nav._replace(rate=rate)
+            nav = nav._replace(rate=rate, position=place)
         else:
             nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= eskf.COVARIANCE_STEP:
@@ -106,9 +106,9 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
             until = min(utime, held)
             measured = nav.rate
             if state.is_stationary:
-                rate = _get_stationary_rate(state, nav)
+                rate, place = _get_stationary_rate(state, nav), nav.position
                 nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
-                nav = nav._replace(rate=measured)
+                nav = nav._replace(rate=measured, position=place)
             else:
                 nav = eskf.propagate(nav, until, measured, nav.force, state.earth, base)
             if until == utime:

@@ -86,7 +86,9 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if has_imu and measurement.has_travel(sample, previous) and age < settings.wheel_period - 0.01:
         return state, NOTHING
     state = propagation.advance(setup, state, item.utime)
-    state, decisions, is_first_speed = _fuse_speed(setup, state, item, measurement, sample, age, previous)
+    state, decisions, is_first_speed = _fuse_speed(
+        setup, state, item, measurement, sample, age, previous, are_stationary=are_stationary is True
+    )
     if decisions and decisions[0].limit > 0.0:
         state, more = _judge(setup, state, item, decisions[0], are_stationary=are_stationary is True)
         decisions += more
@@ -111,6 +113,8 @@ def _fuse_speed(
     sample: WheelsSample,
     age: float,
     previous: WheelsSample | None,
+    *,
+    are_stationary: bool,
 ) -> tuple[N, tuple[Decision, ...], bool]:
     """Return the state after the update by the wheels, the decisions, and whether the speed was unknown before."""
     settings = setup.settings
@@ -127,12 +131,16 @@ def _fuse_speed(
         again = measurement.evaluate(context._replace(nav=nav), sample)
         if not isinstance(again, str):
             context, innovation = context._replace(nav=nav), again
-    elif state.stationary.is_confirmed_by_wheels(item.utime) or _has_speed_sigma(
+    elif are_stationary or _has_speed_sigma(
         context.nav, max(VAGUE_SPEED_SIGMA, VAGUE_DIRECTION * math.hypot(*context.nav.velocity))
     ):
-        # an error of the velocity must not turn the heading: linearize at the one that the wheels measure
-        speed = context.nav.body_velocity(setup.rig.base)[0] + float(innovation.residual.mean())
-        ahead = context.nav._replace(velocity=so3.rotate(context.nav.attitude, (speed, 0.0, 0.0)))
+        # an error of the velocity must change neither heading nor scale: linearize at the one that the wheels measure
+        before = context.nav.body_velocity(setup.rig.base)[0]
+        speed = 0.0 if are_stationary else before + float(innovation.residual.mean())
+        ahead = context.nav._replace(
+            velocity=so3.rotate(context.nav.attitude, (speed, 0.0, 0.0)),
+            travel=(speed * age if math.isfinite(age) else 0.0, 0.0, 0.0),
+        )
         again = measurement.evaluate(context._replace(nav=ahead), sample)
         if not isinstance(again, str) and again.jacobian.shape == innovation.jacobian.shape:
             innovation = innovation._replace(jacobian=again.jacobian)

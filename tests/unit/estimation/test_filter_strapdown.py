@@ -113,7 +113,7 @@ def find_largest_error(nav: NavState, dt: float) -> float:
         return eskf.propagate(given, utime, rate, force, earth, SETUP.rig.base)
 
     after = step(nav)
-    F = eskf._transition_matrix(after, dt, SETUP.layout, np.ones(N - STRAPDOWN))
+    F = eskf._transition_matrix(after, dt, SETUP.layout, np.ones(N - STRAPDOWN), SETUP.driving)
     h = 1e-6
     columns = []
     for k in range(N):
