@@ -192,6 +192,26 @@ def test_given_an_imu_that_shakes_or_turns_steadily_then_it_is_not_stationary():
     assert turning.get_quiet_time(turning.utime) == 0.0
 
 
+def test_given_an_engine_that_shakes_it_then_wheels_that_have_been_stationary_for_long_show_that_it_is():
+    detector = StationaryDetector()
+    shaken = random.Random(4).gauss
+    quiet = {}
+    for n in range(30 * 50):
+        t, utime = n / 50.0, T0 + n * 20_000
+        if n % 5 == 0:
+            # they roll until 10 s
+            detector = detector.update_wheels(utime, t >= 10.0)
+        force = (shaken(0.0, 0.2), shaken(0.0, 0.2), 9.8 + shaken(0.0, 0.2))
+        detector = detector.update(utime, (shaken(0.0, 0.006), 0.0, shaken(0.0, 0.006)), force, ZERO, 0.01, SETTINGS)
+        quiet[round(t, 2)] = detector.get_quiet_time(utime)
+    assert quiet[19.0] == 0.0
+    assert quiet[29.0] > 8.0
+    assert detector.update_wheels(detector.utime, False).get_quiet_time(detector.utime) == 0.0
+    # a wheel that is silent for a while begins again
+    late = detector.update_wheels(detector.utime + 2_000_000, True)
+    assert late.wheels_since == detector.utime + 2_000_000
+
+
 def test_given_rolling_wheels_then_a_quiet_imu_is_not_stationary_until_they_have_stopped():
     detector = run_detector(4.0, StationaryDetector(), 0.004)
     assert detector.update_wheels(detector.utime, False).get_quiet_time(detector.utime) == 0.0
