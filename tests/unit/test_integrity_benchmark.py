@@ -133,6 +133,29 @@ def test_on_a_steady_circle_with_an_unknown_latency_the_bound_covers_the_heading
     assert error.max() < 0.4
 
 
+@pytest.mark.slow
+def test_a_parked_vehicle_that_its_engine_shakes_neither_moves_nor_turns() -> None:
+    scenario = Scenario(VEHICLES["car"], 400.0, np.random.default_rng((52, 22, 1, 1)), has_velocity=False)
+    scenario.receiver = integrity.Receiver.UNSTATED
+    scenario.stops.append((150.0, 410.0))
+    scenario.idling = 0.4
+    looks = integrity.observe(scenario)
+    parked = looks.pose[looks.t > 180.0] - looks.pose[looks.t > 180.0][0]
+    assert np.hypot(parked[:, 0], parked[:, 1]).max() < 0.3
+    assert np.abs(parked[:, 2]).max() < math.radians(1.0)
+
+
+@pytest.mark.slow
+def test_a_silent_imu_makes_the_pose_neither_wrong_nor_invalid_for_long() -> None:
+    scenario = Scenario(VEHICLES["rover"], 300.0, np.random.default_rng(8), has_velocity=False)
+    scenario.silent = [(180.0, 183.0), (240.0, 243.0)]
+    looks = integrity.observe(scenario)
+    for key in ("horizontal", "heading"):
+        assert np.all(looks.errors[key][looks.valid] < looks.bounds[key][looks.valid])
+    late = looks.valid[(looks.t > 215.0) & (looks.t < 240.0) | (looks.t > 275.0)]
+    assert late.mean() > 0.9
+
+
 def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
     scenario = create_scenario("rover", 60.0)
     scenario.events = [(20.0, 30.0)]

@@ -130,6 +130,10 @@ AGREEMENT_TIME: Final = 10.0
 JUMP_AGREEMENT_TIME: Final = 3.0
 """Seconds for which fixes that drifted, or jumped, must agree with dead reckoning to be trusted again."""
 
+KNOWN_AGAIN: Final = 2.0
+"""Standard deviation of dead reckoning, relative to that of a fix, up to which fixes continue to agree; it is less than
+1 when they begin to."""
+
 NEW_TRUST_TIME: Final = 120.0
 NEW_TRUST_DISTANCE: Final = 20.0
 """Seconds, and meters, for which fixes must move as dead reckoning does to be trusted again wherever they are."""
@@ -138,7 +142,8 @@ LARGEST_UNMEASURED: Final = 1.0
 """Meters of that distance that wheels need not have measured."""
 
 LARGEST_LOST: Final = 0.05
-"""Standard deviation of the heading, rad, that gaps of the IMU may have cost in that time."""
+"""Standard deviation of the heading, rad, that gaps of the IMU may have cost in that time, and one of them in any
+window: the path turns there, and what it misses then is not an error of the fixes."""
 
 OWN_TURNS: Final = 3.0
 """Radians that a vehicle turns by, while its heading follows the gyro, that drives by itself again."""
@@ -478,7 +483,7 @@ class ConsistencyMonitor(NamedTuple):
     def lose(self, heading: float, distance: float) -> ConsistencyMonitor:
         """Return the monitor after a gap of the IMU, with what the path lost: variance, rad2, and distance, m."""
         after = self._replace(lost=self.lost + heading, unmeasured=self.unmeasured + distance)
-        if self.suspect is None and (heading > LARGEST_TURN_SIGMA**2 or distance > LARGEST_UNMEASURED):
+        if self.suspect is None and (heading > LARGEST_LOST**2 or distance > LARGEST_UNMEASURED):
             return after._replace(older=(), newest=(), last=None, num_exceeded=0)
         return after
 
@@ -593,7 +598,8 @@ class ConsistencyMonitor(NamedTuple):
         else:
             found = compare_window(self.suspect, node, noise, settings)
             size, sigma, sigmas = abs(found.error), found.sigma, found.sigmas
-            is_known = compute_longest_axis(*found.covariance) < node.white**2 + node.correlated**2
+            known = KNOWN_AGAIN if self.agreed_since else 1.0
+            is_known = compute_longest_axis(*found.covariance) < known**2 * (node.white**2 + node.correlated**2)
         largest = max(self.largest, size)
         # where dead reckoning has become so uncertain that it would not contradict them any more, that is no agreement
         agrees = sigmas <= AGREEMENT and (is_known or largest > THRESHOLD * sigma)

@@ -103,7 +103,7 @@ def compare_path(
     if is_gap or not is_compared:
         return state._replace(consistency=monitor), ()
     node = _create_node(setup, state._replace(consistency=monitor), newest)
-    noise = PathNoise(select_noise(setup, state, state.nav).gyro, state.gnss.noise_inflation)
+    noise = PathNoise(select_noise(setup, state, state.nav).yaw, state.gnss.noise_inflation)
     monitor = monitor.compare(node, noise, settings)
     found = monitor.find_cause(node, noise, settings)
     monitor = monitor.append(node)
@@ -262,7 +262,7 @@ def _turn_back(setup: Setup, state: Aligned, start: PathNode) -> NavState:
     """Return the state with the heading that it had at a node and the turns since, where it is."""
     nav = state.nav
     seconds = (nav.utime - start.utime) * 1e-6
-    variance = start.heading_variance + setup.driving.gyro * seconds + start.rate_variance * seconds**2
+    variance = start.heading_variance + setup.driving.yaw * seconds + start.rate_variance * seconds**2
     sigma = math.sqrt(max(variance - float(nav.covariance[8, 8]), 0.0))
     return _turn(nav, start.rotation - state.consistency.rotation, sigma, setup.layout)
 

@@ -186,15 +186,18 @@ class Earth(NamedTuple):
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise: (rad/s)2/Hz, (m/s2)2/Hz, and of the random walks of the biases.
 
-    `gyros_drive_attitude` is False for a stationary vehicle: its attitude is constant, whatever the gyros measure, so a
-    correction of their bias must not rotate it.
+    `tilt` and `yaw` are those of the attitude. `gyros_drive_attitude` is False where it is constant, or not measured by
+    gyros: a correction of their bias must not rotate it. `is_stationary`: the vehicle's place is constant too, whatever
+    velocity the accelerometers make up.
     """
 
-    gyro: float
+    tilt: float
+    yaw: float
     accelerometer: float
     gyro_bias: float
     accelerometer_bias: float
     gyros_drive_attitude: bool = True
+    is_stationary: bool = False
 
 
 def level_attitude(up: Vector3) -> Quaternion:
@@ -308,7 +311,7 @@ def propagate_covariance(nav: NavState, noise: ProcessNoise, layout: ErrorLayout
     workspace, zero = _workspace(layout.size, 1)
     workspace.x, workspace.P = zero, nav.covariance
     workspace.predict(
-        F=_transition_matrix(nav, dt, layout, decays, noise.gyros_drive_attitude),
+        F=_transition_matrix(nav, dt, layout, decays, noise),
         Q=_process_noise_matrix(noise, dt, layout, decays),
     )
     extras = tuple([value * keep for value, keep in zip(nav.extras, decays, strict=True)])
@@ -316,7 +319,7 @@ def propagate_covariance(nav: NavState, noise: ProcessNoise, layout: ErrorLayout
 
 
 def _transition_matrix(
-    nav: NavState, dt: float, layout: ErrorLayout, decays: Sequence[float], gyros_drive_attitude: bool = True
+    nav: NavState, dt: float, layout: ErrorLayout, decays: Sequence[float], noise: ProcessNoise
 ) -> Array:
     """Return F (n, n) over the lag: equations (2) to second order in dt. `decays` are those of the additional states.
 
@@ -324,12 +327,14 @@ def _transition_matrix(
     """
     ix, iy, iz = nav.impulse
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
-    t, u = -dt, -0.5 * dt * dt
-    k = 0.5 * dt
-    w = t if gyros_drive_attitude else 0.0
+    t, u, k, m = -dt, -0.5 * dt * dt, 0.5 * dt, dt
+    if noise.is_stationary:
+        # what shakes it has no direction, and does not move it
+        ix = iy = u = k = m = 0.0
+    w = t if noise.gyros_drive_attitude else 0.0
     return _transition_buffer(layout.size).fill(
         # position by velocity, attitude and accelerometer bias
-        *(dt, dt, dt),
+        *(m, m, m),
         *(k * iz, -k * iy, -k * iz, k * ix, k * iy, -k * ix),
         *(u * a, u * b, u * c, u * d, u * e, u * f, u * g, u * h, u * i),
         # velocity by attitude and accelerometer bias
@@ -342,17 +347,18 @@ def _transition_matrix(
 
 
 def _process_noise_matrix(noise: ProcessNoise, dt: float, layout: ErrorLayout, decays: Sequence[float]) -> Array:
-    """Return Q (n, n) over the lag; the noise is the same along all axes. The array is valid until the next call."""
+    """Return Q (n, n) over the lag; the array is valid until the next call."""
     v = noise.accelerometer * dt
-    p, pv = v * dt * dt / 3.0, v * dt / 2.0
-    w, bg, ba = noise.gyro * dt, noise.gyro_bias * dt, noise.accelerometer_bias * dt
+    p, pv = (0.0, 0.0) if noise.is_stationary else (v * dt * dt / 3.0, v * dt / 2.0)
+    tilt, yaw = noise.tilt * dt, noise.yaw * dt
+    bg, ba = noise.gyro_bias * dt, noise.accelerometer_bias * dt
     # exact for a Gauss-Markov process; dt, its limit, for a random walk
     extras = [
         density * ((1.0 - keep * keep) / (2.0 * rate) if rate > 0.0 else dt)
         for (density, rate), keep in zip(layout.densities_and_rates, decays, strict=True)
     ]
     return _process_noise_buffer(layout.size).fill(
-        *(p, p, p, v, v, v, w, w, w, bg, bg, bg, ba, ba, ba, *extras),
+        *(p, p, p, v, v, v, tilt, tilt, yaw, bg, bg, bg, ba, ba, ba, *extras),
         *(pv, pv, pv, pv, pv, pv),
     )
 

@@ -203,7 +203,11 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     dt = (utime - state.constraints.non_holonomic_utime) * 1e-6
     state = propagation.propagate_covariance(setup, state)
     state = state._replace(constraints=state.constraints._replace(non_holonomic_utime=utime))
-    innovation = constraints.non_holonomic(create_context(setup, state), max(dt, 1e-3))
+    innovation = constraints.non_holonomic(
+        create_context(setup, state),
+        max(dt, 1e-3),
+        are_wheels_stationary=state.stationary.is_confirmed_by_wheels(utime),
+    )
     before = state.nav
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
     if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):

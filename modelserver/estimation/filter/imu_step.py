@@ -106,7 +106,10 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         if isinstance(state, Aligned):
             gap = (utime - state.imu.used_utime) * 1e-6
             silent = min(gap, (utime - state.common.wheels.used_utime) * 1e-6)
-            turned, moved = setup.coasting.gyro * gap, 0.5 * settings.gap_acceleration * silent**2
+            turned, moved = (
+                propagation.select_noise(setup, state, state.nav).yaw * gap,
+                0.5 * settings.gap_acceleration * silent**2,
+            )
             state = state._replace(consistency=state.consistency.lose(turned, moved))
         decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
@@ -138,9 +141,6 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
         nav = eskf.propagate_covariance(nav, propagation.select_noise(setup, state, nav), setup.layout)
         P = nav.covariance.copy()
         P[11, 11] += settings.gyro_bias_walk**2 * lag
-        if not state.is_stationary:
-            P[6, 6] += settings.wheel_rate_sigma**2 * settings.slip_time * lag
-            P[7, 7] += settings.wheel_rate_sigma**2 * settings.slip_time * lag
         nav = nav._replace(covariance=P)
     state = state._replace(nav=nav, imu=imu, stationary=detector)
     if not (

@@ -141,8 +141,8 @@ def _compute_base_covariance(nav: NavState, setup: Setup, noise: ProcessNoise) -
         *(-dt * a, -dt * b, -dt * c, -dt * d, -dt * e, -dt * f, -dt * g, -dt * h, -dt * i),
     )
     P: Array = np.dot(np.dot(J, nav.covariance), J.T)
-    p, w = noise.accelerometer * dt**3 / 3.0, noise.gyro * dt
-    P.reshape(-1)[::7] += (p, p, p, w, w, w)
+    p, tilt = noise.accelerometer * dt**3 / 3.0, noise.tilt * dt
+    P.reshape(-1)[::7] += (p, p, p, tilt, tilt, noise.yaw * dt)
     return P
 
 

@@ -32,15 +32,17 @@ TURN_TIME: Final = 10.0
 
 def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
     """Return the process noise at an instant of the state."""
-    if not setup.uses_imu(state.common.mode):
-        if state.is_stationary:
-            return setup.stationary
-        if measures_turn_rate(setup, state, nav.utime):
-            return setup.turning
-        return setup.rolling if state.common.wheels.measures_speed(nav.utime) else setup.coasting
-    if (nav.utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
+    if setup.uses_imu(state.common.mode):
+        if (nav.utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold:
+            return _select_imu_noise(setup, state)
+    elif state.is_stationary:
+        return setup.stationary
+    elif measures_turn_rate(setup, state, nav.utime):
+        return setup.turning
+    wheels = state.common.wheels
+    if not wheels.measures_speed(nav.utime):
         return setup.coasting
-    return _select_imu_noise(setup, state)
+    return setup.coasting._replace(yaw=wheels.turn_rate.sigma**2 * setup.settings.slip_time)
 
 
 def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
@@ -53,8 +55,9 @@ def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
         return noise
     if not state.common.measures_wheel_speed(nav.utime):
         return noise  # the non-holonomic constraint would turn the heading by it
-    # an error of the gyro's scale lasts through a turn; fixes correct it
-    return noise._replace(gyro=noise.gyro + TURN_TIME * (setup.settings.gyro_scale_sigma * rate) ** 2)
+    # an error of the gyro's scale lasts through a turn, and so does one of its axes; fixes correct it
+    turning = TURN_TIME * (setup.settings.gyro_scale_sigma * rate) ** 2
+    return noise._replace(tilt=noise.tilt + turning, yaw=noise.yaw + turning)
 
 
 def measures_turn_rate(setup: Setup, state: Navigating, utime: int) -> bool:
@@ -76,9 +79,9 @@ def propagate_imu(
         nav = eskf.propagate_covariance(nav, noise, setup.layout)._replace(rate=rate, force=force)
     else:
         if state.constraints.is_stationary:
-            turning = _get_stationary_rate(state, nav)
+            turning, place = _get_stationary_rate(state, nav), nav.position
             nav = eskf.propagate(nav._replace(rate=turning), utime, turning, force, state.earth, setup.rig.base)
-            nav = nav._replace(rate=rate)
+            nav = nav._replace(rate=rate, position=place)
         else:
             nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= eskf.COVARIANCE_STEP:
@@ -103,9 +106,9 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
             until = min(utime, held)
             measured = nav.rate
             if state.is_stationary:
-                rate = _get_stationary_rate(state, nav)
+                rate, place = _get_stationary_rate(state, nav), nav.position
                 nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
-                nav = nav._replace(rate=measured)
+                nav = nav._replace(rate=measured, position=place)
             else:
                 nav = eskf.propagate(nav, until, measured, nav.force, state.earth, base)
             if until == utime:
@@ -116,7 +119,7 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
         if measures_turn_rate(setup, state, nav.utime):
             turn = state.imu.rate[2] - nav.gyro_bias[2]
         elif wheels.measures_speed(nav.utime):
-            turn = wheels.turn_rate
+            turn = wheels.turn_rate.value
     return eskf.propagate_without_imu(nav, utime, (0.0, 0.0, turn), base)
 
 

@@ -21,6 +21,9 @@ from modelserver.transforms import so3
 STATIONARY_ANGLE_WALK: Final = 1e-5
 """Angle random walk of a stationary vehicle, rad/sqrt(s): its tires give 0.02 deg in 10 minutes."""
 
+TILT_WALK: Final = 0.05
+"""Random walk of roll and pitch without gyros, rad/sqrt(s): 5 deg in 3 s on rough ground."""
+
 NO_TYPES: Final[Mapping[str, str]] = MappingProxyType({})
 
 
@@ -77,18 +80,17 @@ class Setup:
         if self.yaw_gyro is not None:
             biases = (0.0, 0.0)  # imu_step propagates that of its one axis
         gap_acceleration, gap_rate = s.gap_acceleration**2, s.gap_rate_sigma
-        self.driving = ProcessNoise(s.gyro_noise**2, s.accelerometer_noise**2, *biases)
+        gyro, tilt, still = s.gyro_noise**2, TILT_WALK**2, STATIONARY_ANGLE_WALK**2
+        self.driving = ProcessNoise(gyro, gyro, s.accelerometer_noise**2, *biases)
         self.stationary = ProcessNoise(
-            STATIONARY_ANGLE_WALK**2, s.accelerometer_noise**2, *biases, gyros_drive_attitude=False
+            still, still, s.accelerometer_noise**2, *biases, gyros_drive_attitude=False, is_stationary=True
         )
         # an unmeasured rate or acceleration lasts about a second
-        self.coasting = ProcessNoise(gap_rate**2, gap_acceleration, *biases, gyros_drive_attitude=False)
+        self.coasting = ProcessNoise(tilt, gap_rate**2, gap_acceleration, *biases, gyros_drive_attitude=False)
         # interpolated numbers run from one real sample to the next: a third of the error of a gap
-        self.interpolated = ProcessNoise((gap_rate / 3.0) ** 2, gap_acceleration, *biases)
-        # a single speed measures no turns: a third of the error of a gap, since they are smooth
-        rolling = s.wheel_rate_sigma**2 * s.slip_time if len(rig.wheel_frames) > 1 else (gap_rate / 3.0) ** 2
-        self.rolling = ProcessNoise(rolling, gap_acceleration, *biases, gyros_drive_attitude=False)
-        self.turning = ProcessNoise(s.gyro_noise**2, gap_acceleration, *biases)
+        third = (gap_rate / 3.0) ** 2
+        self.interpolated = ProcessNoise(third, third, gap_acceleration, *biases)
+        self.turning = ProcessNoise(tilt, gyro, gap_acceleration, *biases)
         self.findings = {mode: find_unusable(rig, mode) for mode in Mode}
 
     def uses_imu(self, mode: Mode) -> bool:

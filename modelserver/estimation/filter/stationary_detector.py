@@ -22,6 +22,11 @@ AVERAGING_TIME: Final = 0.3
 CONFIRMED_RATE: Final = 0.06
 """Largest mean rate beyond the bias, rad/s, of a vehicle whose wheels are stationary: the bias may have changed."""
 
+SURE_US: Final = 10_000_000
+LOUD: Final = 9.0
+"""Microseconds for which wheels must have been stationary so that an engine may shake the vehicle, and how much more it
+may, in variance: wheels that are stuck while it drives are suspect by then."""
+
 WHEELS_TIMEOUT: Final = 1.0
 """Seconds for which a wheel sample counts."""
 
@@ -36,7 +41,7 @@ class StationaryDetector(NamedTuple):
     rate_variance, force_variance: about them, summed over the axes, (rad/s)2 and (m/s2)2.
     since: first sample (utime) of the present quiet; 0 while it is not quiet.
     wheels_stationary: None: the wheels do not measure it.
-    wheels_utime: of that wheel sample.
+    wheels_utime, wheels_since: of that wheel sample, and of the first since when they have measured so.
     rate_sum: integral of the rate since the quiet began or the mean was last used, rad.
     sum_time: its duration, seconds.
     """
@@ -49,6 +54,7 @@ class StationaryDetector(NamedTuple):
     since: int = 0
     wheels_stationary: bool | None = None
     wheels_utime: int = 0
+    wheels_since: int = 0
     rate_sum: Vector3 = ZERO
     sum_time: float = 0.0
 
@@ -65,12 +71,10 @@ class StationaryDetector(NamedTuple):
                 settings.stationary_rate**2 * 9.0,
                 settings.stationary_force**2 * 9.0,
                 0,
-                self.wheels_stationary,
-                self.wheels_utime,
+                *self[6:9],
             )
-        _, last_mean_rate, last_mean_force, rate_variance, force_variance, since, are_stationary, wheels_utime, _, _ = (
-            self
-        )
+        _, last_mean_rate, last_mean_force, rate_variance, force_variance, since = self[:6]
+        are_stationary, wheels_utime, wheels_since = self[6:9]
         gain = dt / (AVERAGING_TIME + dt)
         keep = 1.0 - gain
         (mx, my, mz), (rx, ry, rz) = last_mean_rate, rate
@@ -81,14 +85,16 @@ class StationaryDetector(NamedTuple):
         ex, ey, ez = gx - fx, gy - fy, gz - fz
         force_variance = keep * (force_variance + gain * (ex * ex + ey * ey + ez * ez))
         mean_force = (fx + gain * ex, fy + gain * ey, fz + gain * ez)
-        is_quiet = (
-            rate_variance < 3.0 * settings.stationary_rate**2 and force_variance < 3.0 * settings.stationary_force**2
-        )
+        loudest = 3.0 * settings.stationary_force**2
+        is_confirmed = self.is_confirmed_by_wheels(utime)
+        if is_confirmed and utime - wheels_since > SURE_US:
+            loudest *= LOUD
+        is_quiet = rate_variance < 3.0 * settings.stationary_rate**2 and force_variance < loudest
         if is_quiet:
             bx, by, bz = bias
             a, b, c = ux - bx, uy - by, uz - bz
             most = settings.stationary_rate + 4.0 * bias_sigma
-            if self.is_confirmed_by_wheels(utime):
+            if is_confirmed:
                 most = max(most, CONFIRMED_RATE)
             are_rolling = are_stationary is False and (utime - wheels_utime) * 1e-6 < WHEELS_TIMEOUT
             is_quiet = a * a + b * b + c * c < most * most and not are_rolling
@@ -107,6 +113,7 @@ class StationaryDetector(NamedTuple):
                 (since or utime) if is_quiet else 0,
                 are_stationary,
                 wheels_utime,
+                wheels_since,
                 rate_sum,
                 sum_time,
             ),
@@ -117,7 +124,8 @@ class StationaryDetector(NamedTuple):
         if are_stationary is None:
             return self
         if are_stationary:
-            return StationaryDetector(*self[:6], True, utime, *self[8:])
+            since = self.wheels_since if self.is_confirmed_by_wheels(utime) else utime
+            return StationaryDetector(*self[:6], True, utime, since, *self[9:])
         return StationaryDetector(*self[:5], 0, False, utime)
 
     def restart_mean(self) -> StationaryDetector:

@@ -243,7 +243,7 @@ class StreamCorrelation(NamedTuple):
         if not 0.0 < seconds < MAX_STEP_TIME:
             # by how much the vehicle has turned meanwhile is not known
             return self._replace(last_wheels=sample, wheels=(), turns=self.turns if has_gyro else ())
-        turn = seconds * estimate_turn_rate(sample, before, setup.wheels, setup.settings)
+        turn = seconds * estimate_turn_rate(sample, before, setup.wheels, setup.settings).value
         angle = self.wheels[-1].angle + turn if self.wheels else turn
         streams = self._replace(last_wheels=sample, wheels=(*_keep(self.wheels, utime), WheelTurn(utime, angle)))
         if not has_gyro:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+from modelserver.estimation.filter.measurements.wheels import TurnRate
+
 SPEED_TIMEOUT_US: Final = 1_000_000
 """Microseconds for which the wheels used last measure the speed of the vehicle."""
 
@@ -44,7 +46,7 @@ class WheelMonitor(NamedTuple):
     ----------
     source: name of their source: the travel since a sample is that of one source.
     used_utime: last sample that passed its gate; 0: none yet.
-    turn_rate: by the wheels, rad/s; 0 if a gyro measures it.
+    turn_rate: by the wheels, or by the gyro while it measures it.
     steering: of the vehicle controller.
     mean_ratio: running mean of the NIS relative to its gate.
     is_suspect: whether they are stuck.
@@ -52,7 +54,7 @@ class WheelMonitor(NamedTuple):
 
     source: str = ""
     used_utime: int = 0
-    turn_rate: float = 0.0
+    turn_rate: TurnRate = TurnRate(0.0, 0.0)
     steering: SteeringAngle = SteeringAngle()
     mean_ratio: float = 0.0
     is_suspect: bool = False

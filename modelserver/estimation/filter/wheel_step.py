@@ -29,7 +29,12 @@ from modelserver.estimation.filter.fusion import (
     report_event,
 )
 from modelserver.estimation.filter.measurements import constraints
-from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
+from modelserver.estimation.filter.measurements.wheels import (
+    TurnRate,
+    WheelSpeed,
+    are_wheels_stationary,
+    estimate_turn_rate,
+)
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState, Leveling, N, PreviousSample
@@ -49,6 +54,10 @@ UNSTUCK_SPEED: Final = 0.3
 
 UNKNOWN_SPEED_SIGMA: Final = 2.0
 """Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
+
+VAGUE_SPEED_SIGMA: Final = 0.1
+VAGUE_DIRECTION: Final = 0.2
+"""The same, and that as a share of the speed, beyond which the velocity has no direction that shows the heading."""
 
 
 def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
@@ -77,7 +86,9 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if has_imu and measurement.has_travel(sample, previous) and age < settings.wheel_period - 0.01:
         return state, NOTHING
     state = propagation.advance(setup, state, item.utime)
-    state, decisions, is_first_speed = _fuse_speed(setup, state, item, measurement, sample, age, previous)
+    state, decisions, is_first_speed = _fuse_speed(
+        setup, state, item, measurement, sample, age, previous, are_stationary=are_stationary is True
+    )
     if decisions and decisions[0].limit > 0.0:
         state, more = _judge(setup, state, item, decisions[0], are_stationary=are_stationary is True)
         decisions += more
@@ -102,6 +113,8 @@ def _fuse_speed(
     sample: WheelsSample,
     age: float,
     previous: WheelsSample | None,
+    *,
+    are_stationary: bool,
 ) -> tuple[N, tuple[Decision, ...], bool]:
     """Return the state after the update by the wheels, the decisions, and whether the speed was unknown before."""
     settings = setup.settings
@@ -111,13 +124,26 @@ def _fuse_speed(
         return state, ((reject(item, innovation),) if innovation else NOTHING), False
     if state.common.wheels.is_suspect:
         innovation = innovation._replace(monitored="stuck")
-    is_first_speed = not innovation.monitored and _is_speed_unknown(context.nav)
+    is_first_speed = not innovation.monitored and _has_speed_sigma(context.nav, UNKNOWN_SPEED_SIGMA)
     if is_first_speed:
         # the wheels' error is a share of speed: linearize at the speed that they measure, not at 0
         nav = _set_speed(context.nav, innovation, setup.rig.base, min(age, settings.wheel_period))
         again = measurement.evaluate(context._replace(nav=nav), sample)
         if not isinstance(again, str):
             context, innovation = context._replace(nav=nav), again
+    elif are_stationary or _has_speed_sigma(
+        context.nav, max(VAGUE_SPEED_SIGMA, VAGUE_DIRECTION * math.hypot(*context.nav.velocity))
+    ):
+        # an error of the velocity must change neither heading nor scale: linearize at the one that the wheels measure
+        before = context.nav.body_velocity(setup.rig.base)[0]
+        speed = 0.0 if are_stationary else before + float(innovation.residual.mean())
+        ahead = context.nav._replace(
+            velocity=so3.rotate(context.nav.attitude, (speed, 0.0, 0.0)),
+            travel=(speed * age if math.isfinite(age) else 0.0, 0.0, 0.0),
+        )
+        again = measurement.evaluate(context._replace(nav=ahead), sample)
+        if not isinstance(again, str) and again.jacobian.shape == innovation.jacobian.shape:
+            innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
     wheels = state.common.wheels
@@ -127,7 +153,7 @@ def _fuse_speed(
     if has_gyro and item.utime - state.imu.used_utime < FORCE_AGE_US:
         mount = _compare_force(setup, context.nav, innovation, mount, item.utime)
     if decision.verdict is Verdict.USED:
-        turn_rate = 0.0
+        turn_rate = TurnRate(nav.angular_rate[2], settings.wheel_rate_sigma)
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
@@ -151,7 +177,7 @@ def _judge(
     if not judged.is_suspect:
         return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
     # they have held the state
-    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None))
+    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None, wheels_since=0))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 
 
@@ -202,9 +228,10 @@ def _set_speed(nav: NavState, innovation: Innovation, base: Vector3, seconds: fl
     return nav._replace(travel=(a + dx, b + dy, c + dz))
 
 
-def _is_speed_unknown(nav: NavState) -> bool:
+def _has_speed_sigma(nav: NavState, sigma: float) -> bool:
+    """Return whether the standard deviation of the horizontal velocity is larger, m/s."""
     P = nav.covariance
-    return float(P[3, 3] + P[4, 4]) > UNKNOWN_SPEED_SIGMA**2
+    return float(P[3, 3] + P[4, 4]) > sigma**2
 
 
 def _get_wheels(previous: PreviousSample | None) -> WheelsSample | None:

@@ -333,6 +333,31 @@ def test_given_fixes_that_were_off_for_seconds_then_they_are_trusted_again_soon(
     assert each.t < 203.0 + AGREEMENT_TIME + 5.0
 
 
+def test_given_a_path_that_becomes_vague_while_fixes_agree_then_they_are_trusted_and_else_not() -> None:
+    fault = Fault(200.0, 203.0, jump=4.0)
+    steps = drive(260.0, fault)
+    found = next(each for each in steps if each.found is not None)
+    assert found.found is not None
+    resolved = found.monitor.resolve(found.found, found.node.utime)
+    fix_sigma = math.hypot(found.node.white, found.node.correlated)
+
+    def trusts(share: float, begin: float) -> bool:
+        """Return whether they are trusted while the path's error is `share` of that of a fix from `begin` on, s."""
+        monitor, agrees = resolved, False
+        for each in drive(260.0, fault):
+            if each.t > found.t and not agrees:
+                assert monitor.suspect is not None
+                driven = abs(each.node.path - monitor.suspect.path)
+                sigma = share * fix_sigma / driven if each.t >= begin and driven > 1.0 else 1e-4
+                vague = monitor.suspect._replace(heading_variance=sigma**2, scale_variance=sigma**2, rate_variance=0.0)
+                monitor, agrees = monitor._replace(suspect=vague).check_trust(each.node, NOISE, SETTINGS)
+        return agrees
+
+    assert trusts(1.5, 207.0)
+    assert not trusts(1.5, 203.0)
+    assert not trusts(4.0, 207.0)
+
+
 def test_given_one_outlier_then_nothing_is_found() -> None:
     fault = Fault(200.0, 200.9, jump=25.0)
     assert all(each.found is None for each in drive(260.0, fault))

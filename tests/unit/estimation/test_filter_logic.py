@@ -192,6 +192,26 @@ def test_given_an_imu_that_shakes_or_turns_steadily_then_it_is_not_stationary():
     assert turning.get_quiet_time(turning.utime) == 0.0
 
 
+def test_given_an_engine_that_shakes_it_then_wheels_that_have_been_stationary_for_long_show_that_it_is():
+    detector = StationaryDetector()
+    shaken = random.Random(4).gauss
+    quiet = {}
+    for n in range(30 * 50):
+        t, utime = n / 50.0, T0 + n * 20_000
+        if n % 5 == 0:
+            # they roll until 10 s
+            detector = detector.update_wheels(utime, t >= 10.0)
+        force = (shaken(0.0, 0.2), shaken(0.0, 0.2), 9.8 + shaken(0.0, 0.2))
+        detector = detector.update(utime, (shaken(0.0, 0.006), 0.0, shaken(0.0, 0.006)), force, ZERO, 0.01, SETTINGS)
+        quiet[round(t, 2)] = detector.get_quiet_time(utime)
+    assert quiet[19.0] == 0.0
+    assert quiet[29.0] > 8.0
+    assert detector.update_wheels(detector.utime, False).get_quiet_time(detector.utime) == 0.0
+    # a wheel that is silent for a while begins again
+    late = detector.update_wheels(detector.utime + 2_000_000, True)
+    assert late.wheels_since == detector.utime + 2_000_000
+
+
 def test_given_rolling_wheels_then_a_quiet_imu_is_not_stationary_until_they_have_stopped():
     detector = run_detector(4.0, StationaryDetector(), 0.004)
     assert detector.update_wheels(detector.utime, False).get_quiet_time(detector.utime) == 0.0
@@ -575,19 +595,31 @@ def create_wheels_sample(seconds: float, *wheels: WheelSample) -> WheelsSample:
 def test_given_wheels_of_a_turning_vehicle_then_its_turn_rate_is_estimated(rate):
     v = 2.0
     pair = create_wheels_sample(0.0, WheelSample("RL", speed=v - rate * 0.5), WheelSample("RR", speed=v + rate * 0.5))
-    assert estimate_turn_rate(pair, None, create_wheel_speed("differential", "RL", "RR"), SETTINGS) == pytest.approx(
-        rate
-    )
+    found = estimate_turn_rate(pair, None, create_wheel_speed("differential", "RL", "RR"), SETTINGS)
+    assert found.value == pytest.approx(rate)
+    assert 0.02 < found.sigma < 0.1
     steered = []
     for name, y in (("FL", 0.5), ("FR", -0.5)):
         vx, vy = v - rate * y, rate * 1.2
         steered.append(WheelSample(name, speed=math.hypot(vx, vy), steering=math.atan2(vy, vx)))
     if rate:
-        assert estimate_turn_rate(
-            create_wheels_sample(0.0, *steered), None, create_wheel_speed("ackermann", "FL", "FR"), SETTINGS
-        ) == pytest.approx(rate)
+        measurement = create_wheel_speed("ackermann", "FL", "FR")
+        found = estimate_turn_rate(create_wheels_sample(0.0, *steered), None, measurement, SETTINGS)
+        assert found.value == pytest.approx(rate)
     one = create_wheels_sample(0.0, WheelSample("RL", speed=2.0))
-    assert estimate_turn_rate(one, None, create_wheel_speed("differential", "RL", "RR"), SETTINGS) == 0.0
+    unknown = estimate_turn_rate(one, None, create_wheel_speed("differential", "RL", "RR"), SETTINGS)
+    assert (unknown.value, unknown.sigma) == (0.0, SETTINGS.gap_rate_sigma / 3.0)
+
+
+def test_given_a_faster_or_a_skidding_vehicle_then_its_wheels_measure_the_turn_rate_less_well():
+    def find(speed: float, rate: float, kinematics: str) -> float:
+        wheels = (WheelSample("RL", speed=speed - rate * 0.5), WheelSample("RR", speed=speed + rate * 0.5))
+        measurement = create_wheel_speed(kinematics, "RL", "RR")
+        return estimate_turn_rate(create_wheels_sample(0.0, *wheels), None, measurement, SETTINGS).sigma
+
+    # each of the two wheels, 1 m apart, slips by 1 % of the speed
+    assert find(10.0, 0.0, "differential") == pytest.approx(0.1 * math.sqrt(2.0))
+    assert find(0.0, 0.5, "skid_steer") == pytest.approx(math.hypot(0.05, 0.15))
 
 
 def test_given_travel_then_the_mean_speed_is_used_and_without_it_the_present_speed():

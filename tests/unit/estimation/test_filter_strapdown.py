@@ -113,7 +113,7 @@ def find_largest_error(nav: NavState, dt: float) -> float:
         return eskf.propagate(given, utime, rate, force, earth, SETUP.rig.base)
 
     after = step(nav)
-    F = eskf._transition_matrix(after, dt, SETUP.layout, np.ones(N - STRAPDOWN))
+    F = eskf._transition_matrix(after, dt, SETUP.layout, np.ones(N - STRAPDOWN), SETUP.driving)
     h = 1e-6
     columns = []
     for k in range(N):
@@ -151,7 +151,7 @@ def test_given_gauss_markov_states_when_propagated_then_they_decay_exactly_and_k
 def test_given_two_hundred_noisy_runs_then_their_covariance_is_that_of_the_filter():
     rng = np.random.default_rng(5)
     dt, steps, runs = 0.05, 160, 200
-    noise = ProcessNoise(0.002**2, 0.03**2, 0.0, 0.0)
+    noise = ProcessNoise(0.002**2, 0.002**2, 0.03**2, 0.0, 0.0)
     base = SETUP.rig.base
     P = np.zeros((N, N))
     sigmas = {0: 0.1, 3: 0.05, 6: 0.01, 9: 0.002, 12: 0.02}

@@ -80,7 +80,7 @@ def list_findings(run: Run) -> list[str]:
     return [each.reason for each in run.localizer.summary(run.localizer.utime).findings if not each.is_choice]
 
 
-LONGER, STOP = 20.0, 35.0
+LONGER, STOP = 24.0, 35.0
 
 
 def assert_good(run: Run, heading_deg: float = 4.5, since: float = 9.0, until: float = 45.0) -> None:

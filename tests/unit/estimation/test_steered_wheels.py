@@ -198,7 +198,7 @@ def test_given_two_wheels_without_angles_then_they_measure_the_turn_rate(speed, 
         x, y, _ = rig.pose(WHEELS[name]).xyz
         speeds[name] = speed * math.hypot(1.0 - curvature * y, curvature * x)
     found = estimate_turn_rate(create_sample(speeds), None, wheel_speed, SETTINGS)
-    assert found == pytest.approx(speed * curvature, abs=0.01)
+    assert found.value == pytest.approx(speed * curvature, abs=0.01)
 
 
 # --- the controller's steering angle ---

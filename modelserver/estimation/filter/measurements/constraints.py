@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from modelserver.estimation.filter.error_layout import GYRO_BIAS, VELOCITY
-from modelserver.estimation.filter.eskf import Innovation
+from modelserver.estimation.filter.eskf import ZERO, Innovation
 from modelserver.estimation.filter.measurements.measurement import MeasurementContext, body_velocity_jacobian
 from modelserver.estimation.filter.measurements.wheels import YAW
 from modelserver.transforms import so3
@@ -24,18 +24,20 @@ ZERO_VELOCITY: Final = "zero_velocity"
 ZERO_RATE: Final = "zero_rate"
 
 
-def non_holonomic(context: MeasurementContext, dt: float) -> Innovation:
+def non_holonomic(context: MeasurementContext, dt: float, *, are_wheels_stationary: bool = False) -> Innovation:
     """Compare the sideways and upward speed of the rolling frame with 0.
 
     Sideways along the wheels: v_y - yaw v_x, with the angle between the wheels and the geometry's x axis. The noise is
     that of the side slip angle, proportional to the lateral acceleration, and of the point that moves straight ahead.
+    While wheels are stationary a velocity is an error, whose direction shows no heading.
     """
     nav, layout, settings = context.nav, context.layout, context.settings
     base = context.rig.base
     vx, vy, vz = nav.body_velocity(base)
     wz = nav.angular_rate[2]
     yaw = context.extra(YAW)
-    body = body_velocity_jacobian(nav, base, layout.size)
+    seen = nav._replace(velocity=ZERO) if are_wheels_stationary else nav
+    body = body_velocity_jacobian(seen, base, layout.size)
     H = np.array((body[1] - yaw * body[0], body[2]))
     if YAW in layout:
         H[0, layout.index(YAW)] = -vx

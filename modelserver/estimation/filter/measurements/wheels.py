@@ -66,6 +66,12 @@ SIGN_KNOWN = 3.0
 TURN_STEPS = 6
 """Iterations for the directions of steered wheels: at full lock each reduces the error to a fifth."""
 
+SKID_SHARE = 0.3
+"""Share of the difference of its sides by which a skid-steered vehicle turns less: sigma."""
+
+LARGEST_TURN_RATE = 10.0
+"""Turn rate, rad/s, beyond which wheels spin."""
+
 NO_ANGLES: Mapping[str, float] = MappingProxyType({})
 
 
@@ -351,22 +357,32 @@ def are_wheels_stationary(
     return all(abs(wheel.speed) <= settings.stationary_speed for wheel in wheels)
 
 
+class TurnRate(NamedTuple):
+    """A turn rate and its standard deviation, rad/s."""
+
+    value: float
+    sigma: float
+
+
 def estimate_turn_rate(
     sample: WheelsSample,
     previous: WheelsSample | None,
     measurement: WheelSpeed,
     settings: FilterSettings,
     steering: float = math.nan,
-) -> float:
-    """Return the turn rate that the wheels measure, rad/s; 0 where they do not. `steering`: as in `read_wheels`.
+) -> TurnRate:
+    """Return the turn rate that the wheels measure; 0, and how fast a vehicle turns, where they do not.
 
     Each wheel rolls at d . (v + w x c): two unknowns, forward speed and turn rate, by least squares. The direction of a
     wheel whose angle is not measured follows from the two, so it is found by iteration from straight ahead. A
     skid-steered vehicle's wheels slide: it turns by less than the difference of its sides, by an unknown share.
+    `steering`: as in `read_wheels`.
     """
+    # a single speed measures no turns: a third of the error of a gap, since they are smooth
+    unknown = TurnRate(0.0, settings.gap_rate_sigma / 3.0)
     wheels = [each for each in measurement.read_wheels(sample, previous, settings, steering) if not each.is_unsigned]
     if len(wheels) < 2:
-        return 0.0
+        return unknown
     speeds = np.array([wheel.speed for wheel in wheels])
     angles = [wheel.steering if math.isfinite(wheel.steering) else 0.0 for wheel in wheels]
     free = [n for n, wheel in enumerate(wheels) if not math.isfinite(wheel.steering)]
@@ -380,9 +396,15 @@ def estimate_turn_rate(
         )
         (v, w), _, rank, _ = np.linalg.lstsq(A, speeds, rcond=1e-6)
         if rank < 2:
-            return 0.0
+            return unknown
         for n in free:
             x, y, _ = wheels[n].contact
             ahead = math.copysign(1.0, v - w * y)
             angles[n] = min(max(math.atan2(ahead * w * x, ahead * (v - w * y)), -most), most)
-    return float(w) if abs(w) < 10.0 else 0.0
+    if abs(w) > LARGEST_TURN_RATE:
+        return unknown
+    # a fast one slips by more than a slow one that turns on the spot
+    variance = max(settings.wheel_rate_sigma**2, (settings.slip_ratio * v) ** 2 * np.linalg.inv(A.T @ A)[1, 1])
+    if measurement.skid:
+        variance += (SKID_SHARE * w) ** 2
+    return TurnRate(float(w), math.sqrt(variance))
