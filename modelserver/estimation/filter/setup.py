@@ -80,10 +80,10 @@ class Setup:
         if self.yaw_gyro is not None:
             biases = (0.0, 0.0)  # imu_step propagates that of its one axis
         gap_acceleration, gap_rate = s.gap_acceleration**2, s.gap_rate_sigma
-        gyro, tilt, still = s.gyro_noise**2, TILT_WALK**2, STATIONARY_ANGLE_WALK**2
+        gyro, tilt, parked = s.gyro_noise**2, TILT_WALK**2, STATIONARY_ANGLE_WALK**2
         self.driving = ProcessNoise(gyro, gyro, s.accelerometer_noise**2, *biases)
         self.stationary = ProcessNoise(
-            still, still, s.accelerometer_noise**2, *biases, gyros_drive_attitude=False, is_stationary=True
+            parked, parked, s.accelerometer_noise**2, *biases, gyros_drive_attitude=False, is_stationary=True
         )
         # an unmeasured rate or acceleration lasts about a second
         self.coasting = ProcessNoise(tilt, gap_rate**2, gap_acceleration, *biases, gyros_drive_attitude=False)
