@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, propagation
+from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
@@ -217,6 +218,16 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     return state, decision
 
 
+def _excludes(state: Aligned, item: Item) -> bool:
+    """Return whether a measurement of GNSS must not move the state: fixes have jumped, or its velocity may drift."""
+    monitor = state.consistency
+    if monitor.excludes_fixes:
+        return True
+    # it would bend the path by which the fixes are judged
+    is_drifting = monitor.suspect is not None and monitor.cause is Cause.GNSS
+    return is_drifting and item.kind == "gps_velocity" and state.common.measures_wheel_speed(item.utime)
+
+
 def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
     """Return the state after a correction by GNSS, with a path that did not follow it; `before` is that before it."""
     nav = state.nav
@@ -254,7 +265,7 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     if isinstance(innovation, str):
         return state, ((reject(item, innovation),) if innovation else NOTHING)
     is_gnss = isinstance(sample, GpsSample)
-    if is_gnss and isinstance(state, Aligned) and state.consistency.excludes_fixes:
+    if is_gnss and isinstance(state, Aligned) and _excludes(state, item):
         innovation = innovation._replace(monitored="inconsistent")
     nav, decision = eskf.update(context.nav, innovation, setup.settings, item.utime, item.source, item.seq, item.kind)
     state = state._replace(nav=nav)
