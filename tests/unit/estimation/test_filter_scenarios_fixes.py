@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from modelserver.messages import Invalid, Mode, Verdict
+from modelserver.messages import GpsSample, Invalid, Mode, Verdict
 from modelserver.simulation import (
     AbsolutePoseModel,
     DrivePhase,
+    Event,
     GpsModel,
     RangeModel,
     RelativePoseModel,
@@ -133,6 +135,30 @@ def test_given_delayed_velocities_with_their_latency_then_they_fit_the_drive():
 def _drop_latency(events):
     for event in events:
         yield replace(event, velocity_latency=0.0) if event.header.source == "gps" else event
+
+
+def test_given_fixes_that_drift_with_their_velocity_then_it_does_not_bend_the_path_that_judges_them():
+    run = simulation(EIGHT)
+    begin, rate = run.start_utime + 40_000_000, 0.8
+
+    def drift(events: Iterable[Event]) -> Iterable[Event]:
+        for event in events:
+            since = (event.header.utime - begin) * 1e-6
+            if isinstance(event, GpsSample) and since > 0.0 and event.velocity is not None:
+                x, y, z = event.velocity
+                north = math.degrees(rate * since / 6.37e6)
+                event = replace(event, latitude_deg=event.latitude_deg + north, velocity=(x, y + rate, z))
+            yield event
+
+    found = drive(run, 75.0, transform=drift)
+
+    suspect = [each for each in found.decisions("consistency", Verdict.RESET) if found.seconds(each) > 40.0]
+    assert suspect
+    refused = found.decisions("gps_velocity", Verdict.MONITORED, "inconsistent")
+    assert len(refused) > 20
+    assert min(each.utime for each in refused) >= suspect[0].utime
+    outside = [row for row in found.rows if row.valid and row.off > row.estimate.horizontal_protection_level]
+    assert len(outside) <= 2
 
 
 def test_given_no_fixes_but_a_pose_then_it_is_used_and_ranges_to_beacons_maintain_it():
