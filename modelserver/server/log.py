@@ -96,7 +96,8 @@ def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserve
         root.setLevel(level.upper())
         root.addHandler(make_handler(form, identifier))
     with contextlib.suppress(OSError, ValueError):  # standard error is no file
-        faulthandler.enable()
+        # the other threads may run meanwhile: reading their stacks can crash, before that of the loop is written
+        faulthandler.enable(all_threads=False)
 
 
 def make_handler(
