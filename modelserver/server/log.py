@@ -96,8 +96,7 @@ def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserve
         root.setLevel(level.upper())
         root.addHandler(make_handler(form, identifier))
     with contextlib.suppress(OSError, ValueError):  # standard error is no file
-        # the other threads may run meanwhile: reading their stacks can crash, before that of the loop is written
-        faulthandler.enable(all_threads=False)
+        faulthandler.enable()
 
 
 def make_handler(
