@@ -79,9 +79,7 @@ def propagate_imu(
         nav = eskf.propagate_covariance(nav, noise, setup.layout)._replace(rate=rate, force=force)
     else:
         if state.constraints.is_stationary:
-            turning, place = _get_stationary_rate(state, nav), nav.position
-            nav = eskf.propagate(nav._replace(rate=turning), utime, turning, force, state.earth, setup.rig.base)
-            nav = nav._replace(rate=rate, position=place)
+            nav = _propagate_stationary(setup, state, nav, utime, force, rate)
         else:
             nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= eskf.COVARIANCE_STEP:
@@ -106,9 +104,7 @@ def predict_nav(setup: Setup, state: Navigating, utime: int) -> NavState:
             until = min(utime, held)
             measured = nav.rate
             if state.is_stationary:
-                rate, place = _get_stationary_rate(state, nav), nav.position
-                nav = eskf.propagate(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
-                nav = nav._replace(rate=measured, position=place)
+                nav = _propagate_stationary(setup, state, nav, until, nav.force, measured)
             else:
                 nav = eskf.propagate(nav, until, measured, nav.force, state.earth, base)
             if until == utime:
@@ -134,6 +130,15 @@ def propagate_covariance(setup: Setup, state: N) -> N:
 def advance(setup: Setup, state: N, utime: int) -> N:
     """Return the state with its covariance at an instant not before its own."""
     return propagate_covariance(setup, predict(setup, state, utime))
+
+
+def _propagate_stationary(
+    setup: Setup, state: Navigating, nav: NavState, utime: int, force: Vector3, measured: Vector3
+) -> NavState:
+    """Return the nominal state of a stationary vehicle at a later instant: its place stays. `measured`: the rate."""
+    rate = _get_stationary_rate(state, nav)
+    after = eskf.propagate(nav._replace(rate=rate), utime, rate, force, state.earth, setup.rig.base)
+    return after._replace(rate=measured, position=nav.position)
 
 
 def _get_stationary_rate(state: Navigating, nav: NavState) -> Vector3:

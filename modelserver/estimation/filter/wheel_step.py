@@ -177,7 +177,7 @@ def _judge(
     if not judged.is_suspect:
         return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
     # they have held the state
-    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None, wheels_since=0))
+    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 
 
