@@ -1,4 +1,4 @@
-"""Platform, PlatformMirror and a log that lcm-logger wrote, asked the same of the running daemon."""
+"""Platform, PlatformMirror and a log, asked the same of the running daemon."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import lcm
 import numpy as np
 import pytest
 from conftest import Daemon, daemon_at
-from support_lcm import MODELSERVER, TIMEOUT_S, Listener, reserved_url, run_process, wait_until
+from support_lcm import MODELSERVER, TIMEOUT_S, reserved_url, wait_until
 from support_samples import GEOMETRY, VEHICLE, gps, imu
 
 import modelserver as ms
 from modelserver.client.interface import PlatformClient
 from modelserver.messages import JointSample, JointsSample, Quality, SensorHeader
 from modelserver.wire.codec import encode
-from mstools.spy.lcm_wheel import find_binary
 
 NODDING = GEOMETRY.replace(
     "xyz: [0, 0, 0.1]}", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0], sigma_deg: 0.1}}"
@@ -43,8 +43,8 @@ class Drive:
     """Times of samples."""
 
 
-def publish_drive(daemon: Daemon) -> list[int]:
-    """Publish a drive with a nodding camera that ends now; return the times of its samples of inertia."""
+def publish_drive(daemon: Daemon, settle: Callable[[], None]) -> list[int]:
+    """Publish a drive with a nodding camera that ends now, settling often; return the times of its IMU samples."""
     begin = time.time_ns() // 1000 - round(SECONDS * 1e6)
     times = [begin + n * 20_000 for n in range(round(SECONDS * 50))]
     with ms.Platform(daemon.url, name="feeder", timeout=TIMEOUT_S, retries=0) as platform:
@@ -55,10 +55,39 @@ def publish_drive(daemon: Daemon) -> list[int]:
             daemon.publish("IMU", encode(imu(utime)))
             if n % 5 == 0:
                 daemon.publish("GPS", encode(gps(utime, 2.0 * t)))
-                # in step with the daemon: who records has small buffers, and loses some of a burst
                 platform.get_transformation(CAMERA, BASE, at=utime, wait_ms=2000)
+                settle()
         platform.get_transformation(CAMERA, UTM, at=times[-1], wait_ms=2000)
+    settle()
     return times
+
+
+class Recorder:
+    """Writes all messages into a log, like lcm-logger, which loses some while it waits for the processor."""
+
+    def __init__(self, url: str, path: Path):
+        self._log = log = lcm.EventLog(str(path), "w", overwrite=True)
+        self._bus = lcm.LCM(url)
+        self._last = last = dict[str, bytes]()
+
+        # not self: a handler that refers to its bus keeps it open
+        def write(channel: str, data: bytes) -> None:
+            last[channel] = data
+            log.write_event(time.time_ns() // 1000, channel, data)
+
+        self._bus.subscribe(".*", write).set_queue_capacity(0)
+
+    def settle(self) -> None:
+        """Write all that was published before; called often, since its buffer is small."""
+        mark = b"%d" % time.monotonic_ns()
+        self._bus.publish("MARK", mark)
+        assert wait_until(self._bus, lambda: self._last.get("MARK") == mark)
+
+    def finish(self) -> None:
+        """Write all that was published, the model too, and close the log."""
+        self.settle()
+        assert wait_until(self._bus, lambda: "JOINTS_HELD" in self._last)
+        self._log.close()
 
 
 @pytest.fixture(scope="module")
@@ -71,20 +100,10 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
         ms.PlatformMirror(url, limit=600.0) as mirror,
     ):
         mirror.wait(TIMEOUT_S, pose=False)
-        with (
-            (folder / "errors").open("w+") as errors,
-            run_process(
-                [find_binary("lcm-logger"), "--quiet", "--flush-interval=50", log], url, stdout=errors, stderr=errors
-            ),
-        ):
-            # its file grows once it listens; snapshots come all the time
-            listener = Listener(url, "MODEL_SNAPSHOT")
-            assert wait_until(listener.bus, lambda: log.exists() and log.stat().st_size > 0)
-            times = publish_drive(daemon)
-            mirror.get_transformation(CAMERA, UTM, at=times[-1], wait_ms=10_000)
-            # earlier messages are in the log when a later one is
-            size = log.stat().st_size
-            assert wait_until(listener.bus, lambda: log.stat().st_size > size)
+        recorder = Recorder(url, log)
+        times = publish_drive(daemon, recorder.settle)
+        mirror.get_transformation(CAMERA, UTM, at=times[-1], wait_ms=10_000)
+        recorder.finish()
         yield Drive(daemon.platform(), mirror, log, times[0], times[260::40])
 
 
