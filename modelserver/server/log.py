@@ -13,8 +13,10 @@ import contextlib
 import faulthandler
 import logging
 import os
+import signal
 import socket
 import sys
+import threading
 import traceback
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final, TextIO
@@ -89,14 +91,24 @@ INDENT: Final = "    "
 def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserver") -> None:
     """Set up logging from `level` on, in a `form` of FORMATS, unless the program has set it up already.
 
-    A process that is killed by a fatal signal, such as the watchdog's, prints its stack.
+    A process that is killed by a fatal signal, such as the watchdog's, prints the stack of its main thread.
     """
     root = logging.getLogger()
     if not root.handlers:
         root.setLevel(level.upper())
         root.addHandler(make_handler(form, identifier))
     with contextlib.suppress(OSError, ValueError):  # standard error is no file
-        faulthandler.enable()
+        # other threads may run meanwhile: reading their stacks can crash, before that of the main thread is written
+        faulthandler.enable(all_threads=False)
+
+
+def start_in_background(thread: threading.Thread) -> None:
+    """Start a thread that never receives SIGABRT, the watchdog's signal, which prints the main thread's stack."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGABRT})
+    try:
+        thread.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def make_handler(

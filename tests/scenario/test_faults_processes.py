@@ -30,6 +30,22 @@ while True:
         print("saves", flush=True)
 """
 
+HANGING = """
+import threading, time
+from modelserver.server.log import set_up_logging, start_in_background
+def work():
+    while True:
+        time.sleep(1e-4)
+def hang():
+    print("hangs", flush=True)
+    while True:
+        time.sleep(1e-4)
+set_up_logging("info")
+for _ in range(8):
+    start_in_background(threading.Thread(target=work, daemon=True))
+hang()
+"""
+
 
 def answers(mirror: PlatformMirror) -> bool:
     """Return whether a mirror answers in world frames: its newest pose may be that of a service that starts."""
@@ -115,3 +131,16 @@ def test_given_every_file_of_the_state_torn_then_the_daemon_starts_reports_it_an
             run.wait_until(lambda killed=killed: run.is_answered_since(killed), "an answer")
             run.wait_until(lambda number=number: run.log.count("is damaged") > number, "a message about it")
         run.assert_consistent()
+
+
+def test_given_a_stopped_process_with_threads_then_its_abort_prints_the_stack_of_the_main_thread() -> None:
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", HANGING], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()
+        # as systemd does it: all threads wake at once, and any that does not block the signal may take it
+        for number in (signal.SIGSTOP, signal.SIGABRT, signal.SIGCONT):
+            process.send_signal(number)
+        errors = process.communicate(timeout=TIMEOUT_S)[1].decode()
+        assert process.returncode == -signal.SIGABRT
+        assert "in hang" in errors

@@ -37,7 +37,7 @@ from modelserver.server.journal.segments import (
     read_newest,
     seal_segment,
 )
-from modelserver.server.log import escape_text
+from modelserver.server.log import escape_text, start_in_background
 from modelserver.server.persistence.directory import (
     FileLock,
     describe_error,
@@ -130,7 +130,7 @@ class JournalWriter:
 
     def start(self) -> None:
         """Start the thread."""
-        self._thread.start()
+        start_in_background(self._thread)
 
     def close(self) -> None:
         """Write the rest, close the segment, and wait for that at most `CLOSE_TIMEOUT_S`."""

@@ -31,7 +31,7 @@ from modelserver.earth.geodesy import make_origin
 from modelserver.errors import quote
 from modelserver.files.regular import read_start
 from modelserver.messages import Origin, PersistedPose, PersistedState, RestoredState
-from modelserver.server.log import escape_text
+from modelserver.server.log import escape_text, start_in_background
 from modelserver.server.persistence.directory import (
     FileLock,
     LockHeldError,
@@ -317,7 +317,7 @@ class StateStore:
             self._change.notify()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._write_all, name="state store", daemon=True)
-                self._thread.start()
+                start_in_background(self._thread)
             return self._warning
 
     def close(self, state: PersistedState | None = None) -> None:
