@@ -16,7 +16,6 @@ from collections.abc import Callable
 from typing import Final
 
 from modelserver.messages import FixType, GpsSample, Sample
-from modelserver.server.log import start_in_background
 from msdrivers.line_settings import NtripSettings, split_address
 from msdrivers.protocol.ntrip import NtripError, NtripRequest, NtripSession, make_gga
 from msdrivers.runner import Runner
@@ -52,7 +51,7 @@ class CorrectionsClient:
 
     def start(self) -> None:
         """Start the thread."""
-        start_in_background(self._thread)
+        self._thread.start()
 
     def stop(self) -> None:
         """End the thread."""

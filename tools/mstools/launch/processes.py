@@ -82,7 +82,7 @@ class ChildProcess:
 
 
 class ChildProcesses:
-    """A group of child processes; leaving the block ends them, also on an error or SIGTERM.
+    """A group of child processes; leaving the block ends them, also on an error, SIGTERM or Ctrl-C.
 
     `on_line` gets each line that a child prints, with the child's name; it is called by a thread for each child.
     """
@@ -93,25 +93,31 @@ class ChildProcesses:
         self._on_line = on_line
         self._environment = dict(environment or {})
         self._started: list[ChildProcess] = []
-        self._before: Callable[[int, FrameType | None], object] | int | None = None
+        self._before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
+        self._signal = 0
 
     def __enter__(self) -> ChildProcesses:
-        def on_sigterm(number: int, frame: FrameType | None) -> None:
+        def end(number: int, frame: FrameType | None) -> None:
+            # Python drops what is raised in a destructor or a callback of its import system: `check` raises it again
+            self._signal = number
             raise SystemExit(128 + number)
 
-        self._before = signal.signal(signal.SIGTERM, on_sigterm)
+        self._before[signal.SIGTERM] = signal.signal(signal.SIGTERM, end)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            self._before[signal.SIGINT] = signal.signal(signal.SIGINT, end)
         return self
 
     def __exit__(self, *_: object) -> None:
         # a second Ctrl-C must not skip the rest
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._before.setdefault(signal.SIGINT, signal.getsignal(signal.SIGINT))
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             # a driver restores its device's state, for which the emulated device must still be there
             for is_last in (False, True):
                 self._stop([child for child in self._started if child.is_last is is_last])
         finally:
-            signal.signal(signal.SIGINT, before)
-            signal.signal(signal.SIGTERM, self._before)
+            for number, before in self._before.items():
+                signal.signal(number, before)
 
     def start(self, name: str, *arguments: str, is_last: bool = False) -> None:
         """Start a Python process with these arguments; `is_last`: it ends after those that need it."""
@@ -142,6 +148,8 @@ class ChildProcesses:
                 self._read(child)
 
     def _list_ended(self) -> list[tuple[ChildProcess, int]]:
+        if self._signal:
+            raise SystemExit(128 + self._signal)
         ended = ((child, child.process.poll()) for child in self._started)
         return [(child, code) for child, code in ended if code is not None]
 
