@@ -402,8 +402,9 @@ def test_given_timer_mode_then_poses_come_at_50_hz_on_three_channels(daemon: Dae
         bus.subscribe(name, handle)
     assert wait_until(bus, lambda: all(len(each) >= 50 for each in received.values()))
     steps = [b - a for a, b in itertools.pairwise(each.transformation.utime for each in received["POSE"])]
-    # on a busy machine ticks are left out, but never early: a quarter of them is on time
-    assert statistics.quantiles(steps)[0] == pytest.approx(20_000, abs=2_000)
+    # on a busy machine ticks are left out or late, and the next is on time: more than 50 a second there never are
+    assert statistics.mean(steps) >= 19_000
+    assert statistics.quantiles(steps)[0] <= 22_000
     assert statistics.quantiles([b - a for a, b in itertools.pairwise(arrivals)])[0] <= 0.024
     vectors = {each.transformation.utime: each.transformation for each in received["POSE_VECTOR"]}
     odoms = {each.transformation.utime: each.transformation for each in received["POSE_ODOM"]}
