@@ -11,7 +11,8 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page
 from support_browser import CHROMIUM, open_link, select_item, show, start_browser
-from support_view import follow_demo, record_drive
+from support_lcm import reserved_url
+from support_view import follow_drive, record_drive
 
 from mstools.commands.demo import find_vehicle_file
 from mstools.edit.session import EditedFile, EditSession
@@ -36,7 +37,7 @@ def main() -> int:
         source = open_log(log, "", None, lambda part: None)
         take("view-log.png", source, "Time", "Play", 12.0)
         take("view-state.png", open_log(log, "", None, lambda part: None), "Time", "Play", 20.0)
-    with follow_demo() as source:
+    with tempfile.TemporaryDirectory() as folder, reserved_url() as url, follow_drive(url, Path(folder)) as source:
         take("view-live.png", source, seconds=25.0)
     return 0
 

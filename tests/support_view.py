@@ -1,18 +1,16 @@
-"""What tests of the viewer show: a log of the Raptor's service on a fake bus, and the demo."""
+"""What tests of the viewer show: a log of the Raptor's service on a fake bus, and the service itself."""
 
 from __future__ import annotations
 
 import math
-import re
-import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import lcm
-from support_daemon import write_raptor
-from support_lcm import MODELSERVER, run_process
+from support_daemon import Trial, trial, write_raptor
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, ImuSample, JointSample, JointsSample, SensorHeader, WheelsSample
@@ -80,15 +78,21 @@ def record_drive(folder: Path, seconds: float) -> Path:
 
 
 @contextmanager
-def follow_demo() -> Iterator[Source]:
-    """Run the demo, and yield its service as a source of the viewer."""
+def follow_drive(url: str, folder: Path) -> Iterator[Source]:
+    """Run the Raptor's service on a drive while its laser nods, and yield it as a source of the viewer."""
     from mstools.view.sources import open_live
 
-    with run_process([*MODELSERVER, "demo", "--seconds", "300"], "", stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        with process.stdout:
-            found = next(match for line in process.stdout if (match := re.search(r"--url '?(udpm:[^\s']+)", line)))
-            yield open_live(found[1], "", 2.0)
+    with trial(url, folder) as found:
+        found.spawn(publish_nodding, found)
+        yield open_live(url, "", 2.0)
+
+
+def publish_nodding(found: Trial) -> None:
+    """Publish the front laser's angle until the trial ends."""
+    bus = lcm.LCM(found.url)
+    while not found.is_stopped:
+        bus.publish("JOINTS", encode(make_joints(time.time_ns() // 1000)))
+        time.sleep(JOINTS_PERIOD_US * 1e-6)
 
 
 def make_joints(utime: int) -> JointsSample:

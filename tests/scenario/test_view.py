@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support_browser import choose, find_fields, needs_browser, show
-from support_view import follow_demo, record_drive
+from support_view import follow_drive, record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
@@ -139,8 +139,10 @@ def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow
         page.get_by_text(re.compile(r"deg, height")).wait_for()
 
 
-def test_given_the_demo_then_the_laser_nods_in_the_page_while_it_drives(browser: Browser) -> None:
-    with follow_demo() as source, show(browser, source) as page:
+def test_given_the_running_service_then_the_laser_nods_in_the_page_while_it_drives(
+    browser: Browser, lcm_url: str, tmp_path: Path
+) -> None:
+    with follow_drive(lcm_url, tmp_path) as source, show(browser, source) as page:
         choose(page, "Frame", "FrontSICKLaser:Scan")
         choose(page, "in", "Raptor:CG")
         wait_until(page, lambda: page.get_by_role("cell", name="FrontNoddingSICKAxis").count() > 0)
