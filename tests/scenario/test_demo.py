@@ -105,11 +105,13 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
     assert list_running(vehicle_in(out)) == {}
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_given_a_running_demo_when_it_is_sent_a_signal_then_its_children_end_too(number, code):
+@pytest.mark.parametrize(
+    ("begin", "number", "code"), [(ALL_STARTED, signal.SIGINT, 130), ("modelserver run", signal.SIGTERM, 143)]
+)
+def test_given_a_demo_when_it_is_sent_a_signal_then_its_children_end_too(begin, number, code):
     process = start("--seconds", "60")
     try:
-        vehicle, _ = all_started(process)
+        vehicle = vehicle_in(text_until(process, begin))
         process.send_signal(number)
         process.communicate(timeout=TIMEOUT_S)
     finally:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -99,11 +100,10 @@ def in_prose(text: str) -> Iterator[tuple[int, str]]:
             yield number, found[0]
 
 
-def in_name(name: str) -> Iterator[str]:
-    """Yield the banned words in an identifier."""
-    for word in WORD.findall(name):
-        if WORDS_OF_NAMES.match(word):
-            yield word
+@cache
+def in_name(name: str) -> tuple[str, ...]:
+    """Return the banned words in an identifier."""
+    return tuple(word for word in WORD.findall(name) if WORDS_OF_NAMES.match(word))
 
 
 def in_python(text: str) -> Iterator[tuple[int, str]]:
