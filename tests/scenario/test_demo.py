@@ -11,24 +11,49 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from support_lcm import TIMEOUT_S
+from support_drive import RAPTOR
+from support_lcm import MODELSERVER, TIMEOUT_S
 
 from modelserver.errors import NoServerError
 from mstools.commands import demo
 from mstools.launch.processes import ChildProcesses, LaunchError
 
-DEMO = [sys.executable, "-c", "from mstools.cli import main; main()", "demo"]
+SMALLER_DEMO = """
+import os
+from pathlib import Path
+from mstools.cli import main
+from mstools.commands import demo
+demo.find_vehicle_file = lambda: Path(os.environ["VEHICLE_FILE"])
+main()
+"""
+"""The `modelserver` command whose demo is that of another vehicle file."""
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+def start(*arguments: str, program: Sequence[str] = MODELSERVER, **environment: str) -> subprocess.Popen[str]:
     # unbuffered: what it prints is waited for line by line
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     return subprocess.Popen(
-        [*DEMO, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        [*program, "demo", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment | {"PYTHONUNBUFFERED": "1"},
     )
+
+
+@pytest.fixture
+def smaller(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A running demo of the Raptor with two drivers: what is tested of its processes is the same for five."""
+    text, _, _ = (RAPTOR / "vehicle.yaml").read_text().partition("\n  wheels: # the drive-by-wire controller")
+    file = tmp_path / "vehicle.yaml"
+    file.write_text(text)
+    shutil.copy(RAPTOR / "geometry.yaml", tmp_path)
+    process = start("--seconds", "60", program=[sys.executable, "-c", SMALLER_DEMO], VEHICLE_FILE=str(file))
+    yield process
+    close(process)
 
 
 def close(process: subprocess.Popen[str]) -> None:
@@ -68,10 +93,11 @@ def text_until(process: subprocess.Popen[str], pattern: str) -> str:
     return "".join(lines)
 
 
-DRIVERS = ("gps", "imu", "wheels", "raptor", "front_axis")
-PROCESSES = {"run"} | {f"{what} {name}" for what in ("driver", "emulate") for name in DRIVERS}
-ALL_STARTED = "modelserver emulate front_axis"
-"""What the demo prints when the last of its processes has been started."""
+PROCESSES = {"run", "driver gps", "driver imu", "emulate gps", "emulate imu"}
+"""Of the demo of two drivers."""
+
+ALL_STARTED = "modelserver emulate imu"
+"""What it prints when the last of its processes has been started."""
 
 
 def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
@@ -108,52 +134,40 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
 @pytest.mark.parametrize(
     ("begin", "number", "code"), [(ALL_STARTED, signal.SIGINT, 130), ("modelserver run", signal.SIGTERM, 143)]
 )
-def test_given_a_demo_when_it_is_sent_a_signal_then_its_children_end_too(begin, number, code):
-    process = start("--seconds", "60")
-    try:
-        vehicle = vehicle_in(text_until(process, begin))
-        process.send_signal(number)
-        process.communicate(timeout=TIMEOUT_S)
-    finally:
-        close(process)
-    assert process.returncode == code
+def test_given_a_demo_when_it_is_sent_a_signal_then_its_children_end_too(smaller, begin, number, code):
+    vehicle = vehicle_in(text_until(smaller, begin))
+    smaller.send_signal(number)
+    smaller.communicate(timeout=TIMEOUT_S)
+    assert smaller.returncode == code
     assert list_running(vehicle) == {}
 
 
-def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_reports_which_and_ends_the_others():
-    process = start("--seconds", "60")
-    try:
-        vehicle, running = all_started(process)
-        os.kill(running["driver imu"], signal.SIGKILL)
-        _, err = process.communicate(timeout=TIMEOUT_S)
-    finally:
-        close(process)
-    assert process.returncode == 1
+def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_reports_which_and_ends_the_others(smaller):
+    vehicle, running = all_started(smaller)
+    os.kill(running["driver imu"], signal.SIGKILL)
+    _, err = smaller.communicate(timeout=TIMEOUT_S)
+    assert smaller.returncode == 1
     assert "process imu was killed by SIGKILL. Its output:" in err
     assert "imu: closed:" in err  # from before its device was there
     assert list_running(vehicle) == {}
 
 
-def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
-    process = start("--seconds", "60")
-    try:
-        vehicle, running = all_started(process)
-        with contextlib.ExitStack() as stack:
-            ends = select.poll()
-            for number in running.values():
-                end = os.pidfd_open(number)
-                stack.callback(os.close, end)
-                ends.register(end, select.POLLIN)
-            process.kill()
-            process.communicate(timeout=TIMEOUT_S)
-            deadline = time.monotonic() + TIMEOUT_S
-            for _ in running:
-                ((ended, _),) = ends.poll(max(0.0, deadline - time.monotonic()) * 1e3)[:1] or pytest.fail(
-                    f"still running: {sorted(list_running(vehicle))}"
-                )
-                ends.unregister(ended)
-    finally:
-        close(process)
+def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running(smaller):
+    vehicle, running = all_started(smaller)
+    with contextlib.ExitStack() as stack:
+        ends = select.poll()
+        for number in running.values():
+            end = os.pidfd_open(number)
+            stack.callback(os.close, end)
+            ends.register(end, select.POLLIN)
+        smaller.kill()
+        smaller.communicate(timeout=TIMEOUT_S)
+        deadline = time.monotonic() + TIMEOUT_S
+        for _ in running:
+            ((ended, _),) = ends.poll(max(0.0, deadline - time.monotonic()) * 1e3)[:1] or pytest.fail(
+                f"still running: {sorted(list_running(vehicle))}"
+            )
+            ends.unregister(ended)
     assert list_running(vehicle) == {}
     # a killed demo cannot take its folder away
     shutil.rmtree(Path(vehicle).parent)

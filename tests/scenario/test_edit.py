@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
@@ -51,12 +51,24 @@ def folder(tmp_path: Path) -> Path:
     return copy_raptor(tmp_path)
 
 
+class EditedPage(NamedTuple):
+    """The editor of a geometry file, beside a service that is reached at `url`."""
+
+    path: Path
+    page: Page
+    url: str
+
+
 @pytest.fixture(scope="module")
-def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Page]]:
-    """Open one editor without a service; each test leaves its file saved."""
+def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[EditedPage]:
+    """Open one editor, without a key for commands; each test leaves its file saved."""
     folder = copy_raptor(tmp_path_factory.mktemp("edited"))
-    with reserved_url() as url, edit(browser, folder, url) as page:
-        yield folder / "geometry.yaml", page
+    with (
+        reserved_url() as url,
+        run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], url),
+        edit(browser, folder, url) as page,
+    ):
+        yield EditedPage(folder / "geometry.yaml", page, url)
 
 
 @contextmanager
@@ -176,22 +188,17 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
     assert (folder / "geometry.yaml").read_bytes() == (RAPTOR / "geometry.yaml").read_bytes()
 
 
-def test_given_no_key_then_the_service_denies_and_the_answer_stays(
-    browser: Browser, folder: Path, lcm_url: str
-) -> None:
+def test_given_no_key_then_the_service_denies_and_the_answer_stays(edited_page: EditedPage) -> None:
     pair = ("FrontSICKLaser:Scan", "Raptor:CG")
-    with ExitStack() as stack:
-        stack.enter_context(run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], lcm_url))
-        platform = stack.enter_context(Platform(lcm_url, timeout=1.0, retries=30))
+    with Platform(edited_page.url, timeout=1.0, retries=30) as platform:
         before = platform.get_pose(*pair).transformation.pose
-        page = stack.enter_context(edit(browser, folder, lcm_url))
-        press(page, "Apply to the service ...")
-        wait_for_text(page, "^not applied: .*not signed")
+        press(edited_page.page, "Apply to the service ...")
+        wait_for_text(edited_page.page, "^not applied: .*not signed")
         assert platform.get_pose(*pair).transformation.pose == before
 
 
-def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited_page: tuple[Path, Page]) -> None:
-    path, page = edited_page
+def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edited_page: EditedPage) -> None:
+    path, page, _ = edited_page
     select_item(page, "frame", "FLEA:Lens")
     set_number(page, "sigma (m)", "-0.5")
     wait_for_text(page, "cannot be saved")
@@ -210,8 +217,8 @@ def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edit
     assert sigma.position[0] == 0.015
 
 
-def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited_page: tuple[Path, Page]) -> None:
-    path, page = edited_page
+def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited_page: EditedPage) -> None:
+    path, page, _ = edited_page
     before = load_model(path).frame("Raptor:CG").pose.xyz
     select_item(page, "frame", "Raptor:CG")
     page.get_by_text("Gizmo", exact=True).first.click()
@@ -246,8 +253,8 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
     find_fields(page, "Gizmo").set_checked(False)
 
 
-def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: tuple[Path, Page]) -> None:
-    path, page = edited_page
+def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: EditedPage) -> None:
+    path, page, _ = edited_page
     select_item(page, "frame", "FLEA:Lens")
     set_number(page, "x, y, z (m)", "0.07")
     wait_for_text(page, "^geometry.yaml: not saved$")
