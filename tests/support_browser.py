@@ -7,7 +7,7 @@ import re
 import shutil
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -38,6 +38,7 @@ OPTIONS = (
 LOCAL = ("http://127.0.0.1:", "ws://127.0.0.1:", "file:", "blob:", "data:")
 WIDTH, HEIGHT = 1400, 900
 TIMEOUT_MS = 60_000
+RETYPE_MS = 5_000
 FEWER_PICTURES = """{
   const request = window.requestAnimationFrame.bind(window);
   window.requestAnimationFrame = (draw) => setTimeout(() => request(draw), 250);
@@ -107,11 +108,17 @@ def show(browser: Browser, source: Source, editing: Editing | None = None, sharp
 
 
 def choose(page: Page, label: str, option: str) -> None:
-    """Choose an option of a dropdown, by typing as a person does."""
+    """Choose an option of a dropdown, by typing as a person does: again where its list was replaced meanwhile."""
+    from playwright.sync_api import TimeoutError as NotThereError
+
     box = page.get_by_role("combobox", name=label, exact=True)
-    box.click()
-    box.fill(option)
-    page.get_by_role("option", name=option, exact=True).click()
+    for _ in range(TIMEOUT_MS // RETYPE_MS):
+        box.click()
+        box.fill(option)
+        with suppress(NotThereError):
+            page.get_by_role("option", name=option, exact=True).click(timeout=RETYPE_MS)
+            return
+    raise AssertionError(f"{label} has no option {option}")
 
 
 def find_fields(page: Page, label: str) -> Locator:
