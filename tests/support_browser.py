@@ -26,8 +26,8 @@ needs_browser = pytest.mark.skipif(
     not CHROMIUM, reason="no Chromium: sudo apt install chromium; pages are not tested in a browser without it"
 )
 
-# software rendering, as a machine without a graphics card has it, of the scene alone: the panels around it are
-# composed without a graphics card's way of doing it; root needs no-sandbox
+# software rendering, as a machine without a graphics card has it; the page around the scene is composed without the
+# emulated card, at half of the cost; root needs no-sandbox
 OPTIONS = (
     "--no-sandbox",
     "--use-angle=swiftshader",

@@ -89,10 +89,9 @@ def follow_drive(url: str, folder: Path) -> Iterator[Source]:
 
 def publish_nodding(found: Trial) -> None:
     """Publish the front laser's angle until the trial ends."""
-    bus = lcm.LCM(found.url)
     while not found.is_stopped:
-        bus.publish("JOINTS", encode(make_joints(time.time_ns() // 1000)))
-        time.sleep(JOINTS_PERIOD_US * 1e-6)
+        found.publish("JOINTS", encode(make_joints(time.time_ns() // 1000)))
+        found.wait(JOINTS_PERIOD_US * 1e-6)
 
 
 def make_joints(utime: int) -> JointsSample:

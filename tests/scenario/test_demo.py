@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from support_drive import RAPTOR
+from support_daemon import write_raptor
 from support_lcm import MODELSERVER, TIMEOUT_S
 
 from modelserver.errors import NoServerError
@@ -32,6 +32,12 @@ main()
 """
 """The `modelserver` command whose demo is that of another vehicle file."""
 
+TWO_DRIVERS = """\
+drivers:
+  gps: {device: novatel, port: /dev/ttyUSB0, rate_hz: 4}
+  imu: {device: gx1, port: /dev/ttyUSB1}
+"""
+
 
 def start(*arguments: str, program: Sequence[str] = MODELSERVER, **environment: str) -> subprocess.Popen[str]:
     # unbuffered: what it prints is waited for line by line
@@ -47,10 +53,7 @@ def start(*arguments: str, program: Sequence[str] = MODELSERVER, **environment: 
 @pytest.fixture
 def smaller(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A running demo of the Raptor with two drivers: what is tested of its processes is the same for five."""
-    text, _, _ = (RAPTOR / "vehicle.yaml").read_text().partition("\n  wheels: # the drive-by-wire controller")
-    file = tmp_path / "vehicle.yaml"
-    file.write_text(text)
-    shutil.copy(RAPTOR / "geometry.yaml", tmp_path)
+    file = write_raptor(tmp_path, TWO_DRIVERS)
     process = start("--seconds", "60", program=[sys.executable, "-c", SMALLER_DEMO], VEHICLE_FILE=str(file))
     yield process
     close(process)
@@ -131,14 +134,20 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
     assert list_running(vehicle_in(out)) == {}
 
 
-@pytest.mark.parametrize(
-    ("begin", "number", "code"), [(ALL_STARTED, signal.SIGINT, 130), ("modelserver run", signal.SIGTERM, 143)]
-)
-def test_given_a_demo_when_it_is_sent_a_signal_then_its_children_end_too(smaller, begin, number, code):
-    vehicle = vehicle_in(text_until(smaller, begin))
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_given_a_running_demo_when_it_is_sent_a_signal_then_its_children_end_too(smaller, number, code):
+    vehicle, _ = all_started(smaller)
     smaller.send_signal(number)
     smaller.communicate(timeout=TIMEOUT_S)
     assert smaller.returncode == code
+    assert list_running(vehicle) == {}
+
+
+def test_given_a_demo_that_is_being_started_when_it_is_sent_a_signal_then_its_children_end_too(smaller):
+    vehicle = vehicle_in(text_until(smaller, "modelserver run"))
+    smaller.send_signal(signal.SIGTERM)
+    smaller.communicate(timeout=TIMEOUT_S)
+    assert smaller.returncode == 143
     assert list_running(vehicle) == {}
 
 

@@ -439,7 +439,7 @@ def slow_steps(monkeypatch: pytest.MonkeyPatch, rig: JournalRig, seconds: float 
     monkeypatch.setattr(DeferredReply, "step", slow)
 
 
-@pytest.mark.parametrize("segment_bytes", [1 << 20, 140_000])
+@pytest.mark.parametrize("segment_bytes", [1 << 20, 2_000])
 def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reproduced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment_bytes: int
 ) -> None:
@@ -459,7 +459,7 @@ def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reprod
     first = channels.index("REPLY_LONG")
     assert "POSE" in channels[first : first + 60]
     if segment_bytes < 1 << 20:
-        assert len(rig.segments) > 40
+        assert len(rig.segments) > 4
     assert is_reproduced(again(rig))
 
 
