@@ -7,6 +7,7 @@ import random
 import shutil
 import signal
 import socket
+import statistics
 import subprocess
 import threading
 import time
@@ -331,7 +332,7 @@ def test_given_devices_unplugged_for_5_s_then_they_stream_within_2_s_of_their_re
 def assert_rate(name: str, samples: list[Any]) -> None:
     """Check that samples come at the device's rate: by its own time, where it has one, and none is left out.
 
-    Else by the host's: those of the first and second half that a busy machine delayed least are that far apart.
+    Else by the host's, for most of the time: an emulator that a busy machine stops leaves out what was due meanwhile.
     """
     period_us = 1_000_000 / RATES_HZ[name]
     if samples[0].header.device_utime:
@@ -339,9 +340,10 @@ def assert_rate(name: str, samples: list[Any]) -> None:
         steps = [after - before for before, after in itertools.pairwise(times)]
         assert steps == pytest.approx([period_us] * len(steps), abs=2)
         return
-    delays = [sample.header.host_utime - period_us * number for number, sample in enumerate(samples)]
-    half = len(samples) // 2
-    assert abs(min(delays[half:]) - min(delays[:half])) < 0.1 * period_us * len(samples)
+    times = [sample.header.host_utime for sample in samples]
+    count = len(times) // 4
+    spans = [after - before for before, after in zip(times, times[count:], strict=False)]
+    assert statistics.median(spans) == pytest.approx(count * period_us, rel=0.1)
 
 
 def test_given_a_stall_and_damage_then_the_driver_reports_and_recovers(bench: Bench) -> None:
