@@ -144,34 +144,30 @@ class Trajectory:
     Raises ValueError for a phase without duration, a number that is not finite, or a drive that does not stop.
     """
 
-    __slots__ = ("_pieces", "_starts", "duration")
+    __slots__ = ("_phases", "_pieces", "_starts", "duration")
 
     def __init__(self, phases: Iterable[DrivePhase], start: tuple[float, float] = (0.0, 0.0), yaw: float = 0.0):
-        """Compute the drive from its phases; it starts at `start` (east and north, m) with `yaw` (rad)."""
-        self._pieces: list[_Piece] = []
+        """Set the phases of the drive, which starts at `start` (east and north, m) with `yaw` (rad)."""
+        self._phases: list[DrivePhase] = []
+        """With the speed and curvature at its end."""
         self._starts: list[float] = []
         self.duration = 0.0
         """Seconds until the vehicle is stationary for good."""
         speed = curvature = 0.0
-        x, y = start
-        distance = 0.0
         for phase in phases:
-            to_speed = speed if phase.speed is None else phase.speed
-            to_curvature = curvature if phase.curvature is None else phase.curvature
-            if not all(map(math.isfinite, (phase.duration, to_speed, to_curvature))) or phase.duration <= 0:
+            speed = speed if phase.speed is None else phase.speed
+            curvature = curvature if phase.curvature is None else phase.curvature
+            if not all(map(math.isfinite, (phase.duration, speed, curvature))) or phase.duration <= 0:
                 raise ValueError(f"a phase must have a positive duration and finite numbers; got {phase}")
-            piece = _Piece(phase.duration, (speed, to_speed), (curvature, to_curvature), (x, y), yaw, distance)
-            self._pieces.append(piece)
+            self._phases.append(DrivePhase(phase.duration, speed, curvature))
             self._starts.append(self.duration)
             self.duration += phase.duration
-            x, y = piece.knots[-1]
-            # values at u = 1
-            yaw, distance = sum(piece.yaw), sum(piece.distance)
-            speed, curvature = to_speed, to_curvature
-        if not self._pieces:
+        if not self._phases:
             raise ValueError("a trajectory must have at least one phase")
         if speed != 0.0:
             raise ValueError(f"the drive ends at {speed:g} m/s; it must end stationary: add a phase with speed 0")
+        self._pieces = [_Piece(self._phases[0], (0.0, 0.0), start, yaw, 0.0)]
+        """Of the phases so far: each follows from the one before it, and a device needs only those until now."""
 
     def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
@@ -191,6 +187,8 @@ class Trajectory:
         """Return the phase at an instant, and the share of its duration that is over."""
         t = min(max(t, 0.0), self.duration)
         index = max(bisect_right(self._starts, t) - 1, 0)
+        while len(self._pieces) <= index:
+            self._pieces.append(self._pieces[-1].continue_with(self._phases[len(self._pieces)]))
         return self._pieces[index], (t - self._starts[index]) / self._pieces[index].duration
 
 
@@ -198,14 +196,12 @@ class _Piece:
     """Polynomials of one phase, of the share u of its duration."""
 
     def __init__(
-        self,
-        duration: float,
-        speed: tuple[float, float],
-        curvature: tuple[float, float],
-        start: tuple[float, float],
-        yaw: float,
-        distance: float,
+        self, phase: DrivePhase, before: tuple[float, float], start: tuple[float, float], yaw: float, distance: float
     ):
+        """Compute a phase that begins with speed and curvature `before`, and at `start`."""
+        duration = phase.duration
+        assert phase.speed is not None
+        assert phase.curvature is not None
 
         def derive(coefficients: Coefficients) -> Coefficients:
             return _trim(polynomial.polyder(coefficients) / duration)
@@ -213,8 +209,8 @@ class _Piece:
         def integrate(coefficients: Coefficients, start: float) -> Coefficients:
             return _trim(polynomial.polyint(np.multiply(coefficients, duration), k=start))
 
-        self.duration = duration
-        self.speed, self.curvature = _ramp(*speed), _ramp(*curvature)
+        self.duration, self.last = duration, (phase.speed, phase.curvature)
+        self.speed, self.curvature = _ramp(before[0], phase.speed), _ramp(before[1], phase.curvature)
         self.yaw_rate = _trim(polynomial.polymul(self.speed, self.curvature))
         self.speed_rate, self.curvature_rate = derive(self.speed), derive(self.curvature)
         self.jerk, self.curvature_rate_rate = derive(self.speed_rate), derive(self.curvature_rate)
@@ -224,6 +220,11 @@ class _Piece:
         self.knots = [start]
         for step in range(steps):
             self.knots.append(self._integrate(self.knots[-1], step / steps, 1.0 / steps))
+
+    def continue_with(self, phase: DrivePhase) -> _Piece:
+        """Return the next phase."""
+        # values at u = 1
+        return _Piece(phase, self.last, self.knots[-1], sum(self.yaw), sum(self.distance))
 
     def _integrate(self, start: tuple[float, float], u: float, share: float) -> tuple[float, float]:
         """Return the position reached from `start`, at share `u`, after a further share of the duration."""
