@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 import lcm
+from support_command import run_command
 from support_drive import (
     CHANNELS,
     MAX_MISLEADING_S,
@@ -91,7 +92,8 @@ class Trial:
     folder: Path
     ride: SimulatedDrive
     vehicle: Path
-    command: Sequence[str] = MODELSERVER
+    program: Sequence[str] = ()
+    """What runs the daemon, if not the `modelserver` command."""
     received: ReceivedMessages = field(default_factory=ReceivedMessages)
     answers: list[float] = field(default_factory=list)
     errors: list[tuple[float, Exception]] = field(default_factory=list)
@@ -108,12 +110,16 @@ class Trial:
     # --- the daemon ---
 
     def start(self, *before: str) -> float:
-        """Start the daemon, with `before` in front of its command; return the time, seconds of the monotonic clock."""
+        """Start the daemon, with `before` in front of its program; return the time, seconds of the monotonic clock."""
         self._starts += 1
         started = self.started_at = time.monotonic()
         log = self._running.enter_context((self.folder / f"daemon{self._starts}.log").open("w"))
-        command = [*before, *self.command, "run", "-c", str(self.vehicle)]
-        self.process = self._running.enter_context(run_process(command, self.url, stderr=log))
+        words = ["run", "-c", str(self.vehicle)]
+        if self.program or before:
+            program = [*before, *(self.program or MODELSERVER), *words]
+            self.process = self._running.enter_context(run_process(program, self.url, stderr=log))
+        else:
+            self.process = self._running.enter_context(run_command(words, self.url, stderr=log))
         return started
 
     @property
@@ -303,7 +309,7 @@ def trial(
     seconds: float = ELAPSED_S + 4.0 * TIMEOUT_S,
     past: float = ELAPSED_S,
     feeding: bool = True,
-    command: Sequence[str] = MODELSERVER,
+    program: Sequence[str] = (),
     more: str = "",
     before: Sequence[str] = (),
     changes: Mapping[str, str] = MappingProxyType({}),
@@ -312,10 +318,10 @@ def trial(
     """Run the daemon beside a drive whose first seconds are `past`; the block begins when its pose is valid.
 
     Without `feeding` it begins when the daemon answers. `more` and `changes` are of the vehicle file, `before` of the
-    command, `models` of the sensors.
+    program, `models` of the sensors.
     """
     vehicle = write_raptor(folder, more, changes)
-    found = Trial(url, folder, SimulatedDrive.create(0, 1.0), vehicle, command)
+    found = Trial(url, folder, SimulatedDrive.create(0, 1.0), vehicle, program)
     found.open()
     try:
         started = found.start(*before)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support_browser import start_browser
-from support_lcm import MODELSERVER, TIMEOUT_S, Listener, reserved_url, run_process, wait_until
+from support_command import run_command
+from support_lcm import TIMEOUT_S, Listener, reserved_url, wait_until
 from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, write_test_key
 
@@ -113,7 +114,7 @@ def daemon_at(
     listener = Listener(url, f"{prefix}MODELSERVER_HEALTH")
     with (
         (folder / "daemon.log").open("w") as errors,
-        run_process([*MODELSERVER, "run", "-c", path], url, stderr=errors) as process,
+        run_command(["run", "-c", path], url, stderr=errors) as process,
     ):
         daemon = Daemon(url, folder, process, listener)
         # its own log too: there may be another daemon on the bus

@@ -20,7 +20,8 @@ from typing import Any
 
 import lcm
 import pytest
-from support_lcm import MODELSERVER, TIMEOUT_S, invoke, reserved_url, run_process, wait_until
+from support_command import run_command
+from support_lcm import MODELSERVER, TIMEOUT_S, invoke, reserved_url, wait_until
 
 from modelserver.messages import DriverHealth, DriverPhase, FixType, GpsSample, SensorHeader, VehicleCommand
 from modelserver.wire.codec import decode, encode
@@ -192,9 +193,7 @@ class Bench:
     def driver(self, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         with (
             (self.folder / "driver.log").open("a") as log,
-            run_process(
-                (*MODELSERVER, "driver", name, "-c", self.vehicle, *arguments), self.url, stderr=log
-            ) as process,
+            run_command(("driver", name, "-c", self.vehicle, *arguments), self.url, stderr=log) as process,
         ):
             yield process
 
@@ -209,10 +208,10 @@ class Bench:
             "wheels": ("--can", f"239.74.163.2:{self.port}"),
             "raptor": ("--can", f"239.74.163.2:{self.port}"),
         }
-        command = (*MODELSERVER, "emulate", name, "-c", self.vehicle, *lines.get(name, pty), *arguments)
+        words = ("emulate", name, "-c", self.vehicle, *lines.get(name, pty), *arguments)
         with (
             (self.folder / "device.log").open("a") as log,
-            run_process(command, self.url, stderr=log, stdout=subprocess.PIPE) as process,
+            run_command(words, self.url, stderr=log, stdout=subprocess.PIPE) as process,
         ):
             assert process.stdout is not None
             with process.stdout:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pytest
 from support_browser import TIMEOUT_MS, choose, find_fields, needs_browser, open_link, select_item
-from support_lcm import MODELSERVER, TIMEOUT_S, reserved_url, run_process
+from support_command import run_command
+from support_lcm import TIMEOUT_S, reserved_url
 from support_signing import ALLOWED, write_test_key
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
@@ -65,7 +66,7 @@ def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> I
     folder = copy_raptor(tmp_path_factory.mktemp("edited"))
     with (
         reserved_url() as url,
-        run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], url),
+        run_command(["run", "-c", str(folder / "vehicle.yaml")], url),
         edit(browser, folder, url) as page,
     ):
         yield EditedPage(folder / "geometry.yaml", page, url)
@@ -74,9 +75,9 @@ def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> I
 @contextmanager
 def edit(browser: Browser, folder: Path, url: str, *more: str) -> Iterator[Page]:
     """Open the editor of a folder's vehicle file as a person does: by the command, and its link in a browser."""
-    command = [*MODELSERVER, "view", str(folder / "vehicle.yaml"), "--edit", "--no-browser", "--port", "0", *more]
+    words = ["view", str(folder / "vehicle.yaml"), "--edit", "--no-browser", "--port", "0", *more]
     with ExitStack() as stack:
-        process = stack.enter_context(run_process(command, url, stdout=subprocess.PIPE))
+        process = stack.enter_context(run_command(words, url, stdout=subprocess.PIPE))
         assert process.stdout is not None
         stack.callback(process.stdout.close)
         link = re.search(r"http\S+\?token=\S+", process.stdout.readline())
@@ -150,7 +151,7 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
     pair = ("FrontSICKLaser:Scan", "Raptor:CG")
     key = str(folder / "commands.key")
     with ExitStack() as stack:
-        stack.enter_context(run_process([*MODELSERVER, "run", "-c", str(folder / "vehicle.yaml")], lcm_url))
+        stack.enter_context(run_command(["run", "-c", str(folder / "vehicle.yaml")], lcm_url))
         platform = stack.enter_context(Platform(lcm_url, timeout=1.0, retries=30))
         before = platform.get_pose(*pair).transformation.pose
         page = stack.enter_context(edit(browser, folder, lcm_url, "--key", key))

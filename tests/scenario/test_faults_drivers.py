@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import lcm
+from support_command import run_command
 from support_daemon import RESTART_SEC, START_TIMEOUT_S, Trial
 from support_drive import RAPTOR, SimulatedDrive
-from support_lcm import MODELSERVER, run_process
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import DriverHealth, DriverPhase
@@ -47,8 +47,8 @@ class Drivers:
 
     def start(self, name: str) -> None:
         log = self._stack.enter_context((self._folder / f"driver_{name}.log").open("a"))
-        command = (*MODELSERVER, "driver", name, "-c", str(self._run.vehicle))
-        self.processes[name] = self._stack.enter_context(run_process(command, self._run.url, stderr=log))
+        words = ("driver", name, "-c", str(self._run.vehicle))
+        self.processes[name] = self._stack.enter_context(run_command(words, self._run.url, stderr=log))
 
     def is_streaming(self, name: str, since: float) -> bool:
         return self.received_at.get(name, 0.0) > since and self.health[name].phase is DriverPhase.STREAMING
@@ -73,8 +73,8 @@ def test_given_each_driver_killed_and_hung_then_it_streams_again_and_the_pose_is
         start_utime = round(time.time() + 2.0) * 1_000_000
         together = ("--start", str(start_utime), "--seconds", f"{SECONDS:g}", "--seed", str(SEED))
         for name, line in lines.devices.items():
-            command = (*MODELSERVER, "emulate", name, "-c", str(lines.vehicle), *line, *together)
-            stack.enter_context(run_process(command, run.url, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+            words = ("emulate", name, "-c", str(lines.vehicle), *line, *together)
+            stack.enter_context(run_command(words, run.url, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
         run.ride = SimulatedDrive(
             start_utime, SECONDS, make_simulation(load_config(lines.vehicle), start_utime, SECONDS)
         )

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from support_daemon import CLOCK_STEP_PROGRAM, trial
-from support_lcm import reserved_url
+from support_lcm import MODELSERVER, reserved_url
 
 from modelserver.messages import Invalid
 
@@ -79,7 +79,7 @@ def test_given_the_clock_set_by_an_hour_then_the_pose_is_not_valid_until_it_is_r
 ) -> None:
     step = tmp_path / "step"
     monkeypatch.setenv("CLOCK_STEP", str(step))
-    with trial(lcm_url, tmp_path, command=(sys.executable, "-c", CLOCK_STEP_PROGRAM)) as run:
+    with trial(lcm_url, tmp_path, program=(sys.executable, "-c", CLOCK_STEP_PROGRAM)) as run:
         step.write_text(str(hours * 3_600_000_000_000))
         stepped = len(run.received.poses)
         run.process.send_signal(signal.SIGUSR1)
@@ -132,7 +132,7 @@ def test_given_the_network_down_and_up_or_taken_away_and_back_then_the_daemon_se
         ip("link", "set", "far0", "up")
         ip("addr", "add", "10.9.9.1/24", "dev", "usb0")
         up("usb0")
-        with reserved_url() as url, trial(url, tmp_path) as run:
+        with reserved_url() as url, trial(url, tmp_path, program=MODELSERVER) as run:
             ip("link", "set", "usb0", "down")
             run.wait(1.0)
             up("usb0")

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 from conftest import FAST_HEALTH, Daemon
-from support_lcm import MODELSERVER, TIMEOUT_S, invoke, run_process
+from support_command import run_command
+from support_lcm import MODELSERVER, TIMEOUT_S, invoke
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.messages import Invalid
@@ -111,7 +112,7 @@ def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_i
     start_daemon: StartDaemon,
 ) -> None:
     daemon = start_daemon()
-    with run_process([*MODELSERVER, "status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
+    with run_command(["status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         with process.stdout:
             lines = [process.stdout.readline() for _ in range(3)]
