@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Browser, ConsoleMessage, Locator, Page
 
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
@@ -46,6 +46,9 @@ FEWER_PICTURES = """{
 }"""
 """Four pictures a second: drawing without a graphics card takes all processors, which the page and other tests need."""
 
+REMOVED_MEANWHILE = "Tried to update non-existent component"
+"""viser's page has removed a field before it reads a change of it, which it then leaves out: seen once in ten runs."""
+
 
 @contextmanager
 def start_browser() -> Iterator[Browser]:
@@ -71,7 +74,12 @@ def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[P
     page.add_init_script(FEWER_PICTURES)
     page.set_default_timeout(TIMEOUT_MS)
     errors: list[str] = []
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+
+    def on_console(message: ConsoleMessage) -> None:
+        if message.type == "error" and not message.text.startswith(REMOVED_MEANWHILE):
+            errors.append(message.text)
+
+    page.on("console", on_console)
     page.on("pageerror", lambda error: errors.append(str(error)))
     # nothing is loaded from the internet
     page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
