@@ -81,14 +81,18 @@ def run_process(arguments: Sequence[str | Path], url: str, **options: object) ->
     try:
         yield process
     finally:
-        if process.poll() is None:
-            process.terminate()
-        try:
-            process.wait(TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            raise
+        end_process(process)
+
+
+def end_process(process: subprocess.Popen[str]) -> None:
+    """End a process by SIGTERM. One that does not end is killed, and raises subprocess.TimeoutExpired."""
+    process.terminate()
+    try:
+        process.wait(TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise
 
 
 MODELSERVER = (sys.executable, "-c", "from mstools.cli import main; main()")
