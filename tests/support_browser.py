@@ -47,7 +47,8 @@ FEWER_PICTURES = """{
 """Four pictures a second: drawing without a graphics card takes all processors, which the page and other tests need."""
 
 REMOVED_MEANWHILE = "Tried to update non-existent component"
-"""viser's page has removed a field before it reads a change of it, which it then leaves out: seen once in ten runs."""
+"""Error of viser's page where a field is made, changed and removed between two pictures, as by two selections: it
+applies changes last, and leaves this one out."""
 
 
 @contextmanager
