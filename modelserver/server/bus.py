@@ -21,7 +21,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Protocol, TypeAlias
+from typing import Final, Literal, Protocol, TypeAlias
 
 from modelserver.wire.provider import open_lcm, resolve_url
 from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, open_receiver
@@ -89,6 +89,8 @@ REQUEST_QUEUE_BYTES: Final = 1 << 20
 
 Handler: TypeAlias = Callable[[str, bytes], None]
 
+Inboxes: TypeAlias = Literal["samples", "requests", "both"]
+
 
 class Inbox(Protocol):
     """A queue of received messages. Handlers run only within `drain`."""
@@ -117,8 +119,8 @@ class Bus(Protocol):
     def publish(self, channel: str, data: bytes) -> None:
         """Publish a message."""
 
-    def wait(self, seconds: float, requests: bool = True) -> None:
-        """Wait until a message has arrived or the time is up; without `requests` for samples only."""
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        """Wait until a message has arrived in an inbox, or the time is up."""
 
 
 MAX_READ_AHEAD: Final = 1000
@@ -225,18 +227,19 @@ class LcmBus:
         self._membership = MulticastMembership(self.url)
         self._renew_at = time.monotonic() + RENEW_S
 
-    def wait(self, seconds: float, requests: bool = True) -> None:
-        """Wait until a message has arrived or the time is up; without `requests` for samples only."""
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        """Wait until a message has arrived in an inbox, or the time is up."""
         begin = time.monotonic()
         if begin >= self._renew_at:
             self._renew_at = begin + RENEW_S
             self._membership.renew()
+        if inboxes != "both":
+            inbox = self.sensors if inboxes == "samples" else self.requests
+            readable = inbox.is_queueing or select.select((inbox.fileno,), (), (), max(0.0, seconds))[0]
+            inbox.expected = None if readable else 0
+            return
         if self.sensors.is_queueing:
             self.sensors.expected = self.requests.expected = None
-            return
-        if not requests:
-            readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
-            self.sensors.expected = None if readable else 0
             return
         # poll is cheaper but counts in milliseconds; select meets the deadline to the microsecond
         milliseconds = int(seconds * 1e3)

@@ -3,7 +3,8 @@
 A tick computes the pose for its deadline and publishes it at the deadline. It therefore begins a lead time earlier. The
 lead is a stochastic approximation of a quantile of the computing time of ticks (Robbins and Monro 1951): up by
 `UP_STEPS` steps after a tick that was not ready in time, down by one step after one that was. It settles where one tick
-in `UP_STEPS + 1` is not ready. Samples that arrive during the lead wait until after the deadline.
+in `UP_STEPS + 1` is not ready, so most poses are ready early. Until the deadline nothing is passed to the core,
+whose time never goes back; only cached replies are sent.
 
 Ticks that take no time keep the lead at 0. A tick that is later than any lead could compensate was delayed by something
 else (a paused process, a busy processor) and is no measurement. Missed ticks are skipped and counted: catching up would
@@ -109,14 +110,15 @@ class StartedTick(NamedTuple):
 
 
 class TickTimer:
-    """Deadlines of ticks every `period_ns`: `start_tick`, then at most once `wait_to_publish`, then `finish_tick`."""
+    """Deadlines of ticks every `period_ns`: `start_tick`, `set_ready` if there is a pose, `finish_tick`."""
 
     def __init__(self, clock: Clock, period_ns: int):
         self._clock = clock
         self._period_ns = period_ns
         self.lead = TickLead()
         self.due_ns = clock.monotonic_ns()
-        self._publish_ns = 0
+        self.publish_ns = 0
+        """Deadline of the tick in progress, monotonic nanoseconds; without one the last deadline."""
         self._latency_ns = 0
 
     @property
@@ -133,26 +135,19 @@ class TickTimer:
         late_ns = now.monotonic_ns - due
         missed = max(late_ns, 0) // self._period_ns
         self.due_ns += (missed + 1) * self._period_ns
-        self._publish_ns = due
+        self.publish_ns = due
         if late_ns < 0:
             return StartedTick(Instant(due, now.utime - late_ns // 1000), missed, self._latency_ns)
         return StartedTick(now, missed, late_ns)
 
-    def wait_to_publish(self) -> None:
-        """Wait for the deadline of the tick in progress, and update the lead. Without a tick in progress do nothing."""
-        due, self._publish_ns = self._publish_ns, 0
-        if not due:
-            return
-        ready = self._clock.monotonic_ns()
-        self.lead.update(ready - (due - self.lead.ns))
-        if ready < due:
-            self._clock.sleep((due - ready) * 1e-9)
-            ready = self._clock.monotonic_ns()
-        self._latency_ns = ready - due
+    def set_ready(self) -> None:
+        """Update the lead: the pose of the tick in progress is ready."""
+        self.lead.update(self._clock.monotonic_ns() - (self.publish_ns - self.lead.ns))
 
     def finish_tick(self) -> None:
-        """End the tick: what is handled next comes after its deadline, also if it has published nothing."""
-        early = self._publish_ns - self._clock.monotonic_ns()
-        self._publish_ns = 0
-        if early > 0:
-            self._clock.sleep(early * 1e-9)
+        """Wait for the deadline of the tick in progress: its pose is published next."""
+        now_ns = self._clock.monotonic_ns()
+        if now_ns < self.publish_ns:
+            self._clock.sleep((self.publish_ns - now_ns) * 1e-9)
+            now_ns = self._clock.monotonic_ns()
+        self._latency_ns = now_ns - self.publish_ns

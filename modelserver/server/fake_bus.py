@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from modelserver.server.bus import Handler
+from modelserver.server.bus import Handler, Inboxes
 from modelserver.server.clock import FakeClock
 
 
@@ -58,9 +58,10 @@ class FakeBus:
         self.sensors.put(channel, data)
         self.requests.put(channel, data)
 
-    def wait(self, seconds: float, requests: bool = True) -> None:
-        """Advance the clock if no message is pending."""
-        if not (self.sensors.pending or (requests and self.requests.pending)):
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        """Advance the clock if no message is pending in an inbox."""
+        has_samples = inboxes != "requests" and self.sensors.pending
+        if not has_samples and (inboxes == "samples" or not self.requests.pending):
             self._clock.advance(max(seconds, 0.0))
 
     def get_published(self, channel: str) -> list[bytes]:

@@ -3,7 +3,8 @@
 `run_once` makes one pass:
 
 1. samples from the bus (`ingress`), up to the next tick and at most `MAX_SAMPLES_NS`;
-2. the tick, if it is due (`clock.TickTimer`);
+2. the tick, if it is due (`clock.TickTimer`); its pose is published at its deadline, and until then requests are
+   answered from the cache;
 3. a slice of request work (`requests.handler`);
 4. wait for a message or the next tick.
 
@@ -41,6 +42,7 @@ from modelserver.server.ingress import (
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
+from modelserver.server.requests.scheduler import RunDelay
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
@@ -57,6 +59,9 @@ not delay ticks, nor a late tick samples."""
 
 NETWORK_ERRORS = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
 """Errors of sending while the network is down: no error of the server."""
+
+LAST_REQUEST_NS = 100_000
+"""Requests are answered from the cache until so long before a pose is published: most take less."""
 
 FLOOD_PAUSE_S = 0.002
 """How long requests wait for the next pass at most, seconds, in a flood or without time for them."""
@@ -79,7 +84,7 @@ class Hooks:
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
     gauges: reads resources of the process for the health report, given the number of waiting requests.
-    run_delay: reads the run-queue delay of the loop's thread, nanoseconds; None if unknown.
+    run_delay: reads the run-queue delay of the loop's thread; None if unknown.
     on_tick: called after each tick without error.
     verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
     journal: records everything that is handled and published; one that nothing begins records nothing.
@@ -92,7 +97,7 @@ class Hooks:
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
     gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
-    run_delay: Callable[[], int | None] = lambda: None
+    run_delay: Callable[[], RunDelay | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
     journal: JournalQueue = field(default_factory=JournalQueue)
@@ -153,6 +158,7 @@ class Loop:
         self._logged: set[tuple[str, str]] = set()
         self._timer = TickTimer(clock, settings.period_ns)
         self._reload_requested = self._stop_requested = False
+        self._waiting_poses: list[tuple[str, bytes]] | None = None  # for the deadline of the tick in progress, if any
         self._has_backlog = False  # whether samples remained after the samples of the last pass
         prefix = settings.channel_prefix
         self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
@@ -210,7 +216,7 @@ class Loop:
         seconds = max(0.0, (begin_ns - now_ns) * 1e-9)
         if requests.is_flooded:
             # waking for each request of a flood would be most of the work
-            self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), requests=False)
+            self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), "samples")
         elif not requests.is_ready:
             if requests.waiting:
                 seconds = min(seconds, FLOOD_PAUSE_S)
@@ -243,17 +249,32 @@ class Loop:
         self._conflicts.clear_expired(now)
         is_report_due = now.monotonic_ns >= self.state.health_due_ns
         self._rejections.flush(now, is_report_due)
+        self._waiting_poses = []
         try:
-            try:
-                gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
-                self.step(messages.Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
-                self._hooks.on_tick(self.state)
-            finally:
-                self._timer.finish_tick()
+            gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
+            self.step(messages.Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
+        except Exception as error:
+            self.handle_error("tick", error)
+        self._serve_cached(self._timer.publish_ns)
+        self._timer.finish_tick()
+        poses, self._waiting_poses = self._waiting_poses, None
+        for channel, data in poses:
+            self._transmit(channel, data)
+        try:
+            self._hooks.on_tick(self.state)
         except Exception as error:
             self.handle_error("tick", error)
         for warning in self._journal.poll_warnings():
             self.step(warning, self._clock.now())
+
+    def _serve_cached(self, end_ns: int) -> None:
+        """Answer requests from the cache until shortly before `end_ns`; the others are queued."""
+        while not self._requests.is_flooded:
+            room_ns = end_ns - LAST_REQUEST_NS - self._clock.monotonic_ns()
+            if room_ns <= 0:
+                return
+            self._bus.wait(room_ns * 1e-9, "requests")
+            self._requests.serve_cached()
 
     def execute(self, command: messages.SignedCommand, now: Instant) -> None:
         """Execute a command whose signature is verified."""
@@ -332,8 +353,12 @@ class Loop:
             self.send(outputs)
 
     def publish(self, channel: str, data: bytes) -> None:
-        """Publish a message: the only place that does."""
+        """Record and publish a message."""
         self._journal.record_published(channel, data)
+        self._transmit(channel, data)
+
+    def _transmit(self, channel: str, data: bytes) -> None:
+        """Publish a message that is recorded: the only place that does."""
         try:
             self._bus.publish(channel, data)
         except Exception as error:
@@ -353,11 +378,21 @@ class Loop:
         self._requests.cache(output, encoded)
 
     def _send_pose(self, output: messages.PublishPose) -> None:
-        world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
-        self._timer.wait_to_publish()
-        self.publish(self._pose, world)
-        self.publish(self._pose_vector, vector)
-        self.publish(self._odom, odom)
+        encoded = (
+            (self._pose, encode(output.world)),
+            (self._pose_vector, encode(output.world, "pose_vector_t")),
+            (self._odom, encode(output.odom)),
+        )
+        if self._waiting_poses is None:
+            for channel, data in encoded:
+                self.publish(channel, data)
+            return
+        if not self._waiting_poses:
+            self._timer.set_ready()
+        # in the journal they stand here, so that a replay publishes in the same order
+        for channel, data in encoded:
+            self._journal.record_published(channel, data)
+        self._waiting_poses += encoded
 
     def _send_decisions(self, output: messages.PublishDecisions) -> None:
         for start in range(0, len(output.decisions), MAX_DECISIONS):

@@ -41,6 +41,7 @@ from modelserver.server.requests.scheduler import (
     DeferredRequest,
     QueuedRequest,
     RequestScheduler,
+    RunDelay,
 )
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
@@ -113,7 +114,7 @@ class RequestHandler:
         prefix: str,
         limits: LimitsConfig,
         verifier: CommandVerifier | None = None,
-        run_delay: Callable[[], int | None] = lambda: None,
+        run_delay: Callable[[], RunDelay | None] = lambda: None,
     ):
         self._context = context
         self._bus = bus
@@ -136,7 +137,7 @@ class RequestHandler:
         self.deferred: DeferredReply | None = None
         """The deferred reply in progress."""
         self._stepped_ns = 0
-        self._is_first = False
+        self._is_first = self._only_cached = False
         self.is_flooded = False
         """Whether requests were dropped in the last pass."""
         self.is_ready = False
@@ -199,6 +200,12 @@ class RequestHandler:
             self._report = report
             self._context.step(messages.HealthWarning("requests", report), clock.now())
         return clock.monotonic_ns()
+
+    def serve_cached(self) -> None:
+        """Receive a request that has arrived: answer it from the cache, or queue it."""
+        self._only_cached = True
+        self._bus.requests.drain(1)
+        self._only_cached = False
 
     def prepare(self, until_ns: int) -> bool:
         """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
@@ -274,7 +281,12 @@ class RequestHandler:
             name = SIGNED_CLIENT if signed else client_of(data)
             client = scheduler.client(name, now_ns)
             request = new_tuple(QueuedRequest, (name, channel, type_name, data))
-            if self._is_first and scheduler.admit(client, now_ns):
+            if self._only_cached:
+                may_answer = type_name == CACHED_TYPE and scheduler.may_exceed and not scheduler.queued
+                if may_answer and self._send_cached(name, channel, data):
+                    scheduler.charge(name, 1.0, now_ns)
+                    return
+            elif self._is_first and scheduler.admit(client, now_ns):
                 self._is_first = False
                 self._answer(request)
                 return

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import random
 
 from support_samples import START, ScriptedLocalizer
 from test_loop import PERIOD_NS, Rig
 
+from modelserver.messages import CHANNEL_OF, GetStateVector, GetTransformation, RequestHeader
+from modelserver.server.bus import Inboxes
 from modelserver.server.clock import MAX_LEAD_NS, TickLead
+from modelserver.wire.codec import encode
 
 MS = 1_000_000
 
@@ -74,7 +78,7 @@ def test_given_a_lead_and_a_localizer_that_breaks_then_the_loop_goes_on() -> Non
     rig.loop._timer.lead.ns = 500_000
     rig.turns(10)
     assert rig.loop.state.handler_errors >= 1
-    assert rig.loop._timer._publish_ns == 0
+    assert rig.loop._waiting_poses is None
 
 
 def test_given_a_lead_and_a_tick_without_pose_then_what_is_handled_next_comes_after_the_deadline() -> None:
@@ -85,3 +89,64 @@ def test_given_a_lead_and_a_tick_without_pose_then_what_is_handled_next_comes_af
         due = rig.loop._timer.due_ns
         rig.turns(2)
         assert rig.now.monotonic_ns >= due
+
+
+def test_given_requests_while_a_pose_waits_for_its_deadline_then_only_the_cached_reply_is_sent_before() -> None:
+    rig = Rig()
+    fixed = GetTransformation(RequestHeader(1, "REPLY_FIXED"), "Cart:Mast", "Cart:Base")
+    rig.send(fixed)
+    rig.turns(3)
+    assert rig.bus.get_published("REPLY_FIXED")
+    rig.loop._timer.lead.ns = 1_500_000
+    rig.turns(1)
+    due = rig.loop._timer.due_ns
+    sent: list[tuple[str, int]] = []
+    publish, wait = rig.bus.publish, rig.bus.wait
+
+    def wait_for_requests(seconds: float, inboxes: Inboxes = "both") -> None:
+        if inboxes == "requests" and not sent:
+            rig.clock.advance(0.0005)
+            for request in (fixed, GetStateVector(RequestHeader(2, "REPLY_OF_CORE"))):
+                rig.bus.requests.put(CHANNEL_OF[type(request)], encode(request))
+        wait(seconds, inboxes)
+
+    rig.bus.wait = wait_for_requests  # type: ignore[method-assign]
+    rig.bus.publish = lambda channel, data: (  # type: ignore[method-assign]
+        sent.append((channel, rig.clock.monotonic_ns())),
+        publish(channel, data),
+    )[1]
+    rig.turns(1)
+    assert sent == [
+        ("REPLY_FIXED", due - 996_000),
+        ("POSE", due),
+        ("POSE_VECTOR", due),
+        ("POSE_ODOM", due),
+        ("REPLY_OF_CORE", due),
+    ]
+    assert rig.loop.state.ticks_missed == 0
+
+
+def test_given_a_flood_while_a_pose_waits_for_its_deadline_then_the_pose_is_on_time() -> None:
+    rig = Rig()
+    rig.turns(3)
+    rig.loop._timer.lead.ns = 1_500_000
+    rig.turns(1)
+    due = rig.loop._timer.due_ns
+    request = encode(GetStateVector(RequestHeader(2, "REPLY_OF_CORE")))
+    drain = rig.bus.requests.drain
+
+    def drain_flood(limit: int, seconds: float = math.inf) -> int:
+        for _ in range(limit):
+            rig.bus.requests.put(CHANNEL_OF[GetStateVector], request)
+        rig.clock.advance(2e-6 * limit)
+        return drain(limit, seconds)
+
+    rig.bus.requests.drain = drain_flood  # type: ignore[method-assign]
+    published: list[int] = []
+    publish = rig.bus.publish
+    rig.bus.publish = lambda channel, data: (  # type: ignore[method-assign]
+        published.append(rig.clock.monotonic_ns()) if channel == "POSE" else None,
+        publish(channel, data),
+    )[1]
+    rig.turns(1)
+    assert published == [due]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,6 +33,7 @@ from modelserver.messages import (
     SwitchMode,
     TimeQuery,
 )
+from modelserver.server.bus import Inboxes
 from modelserver.server.journal.segments import files_of
 from modelserver.server.journal.verify import VerificationReport, verify
 from modelserver.server.requests.deferred import DeferredReply
@@ -460,6 +462,29 @@ def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reprod
     assert "POSE" in channels[first : first + 60]
     if segment_bytes < 1 << 20:
         assert len(rig.segments) > 4
+    assert is_reproduced(again(rig))
+
+
+def test_given_requests_while_poses_wait_for_their_deadlines_when_verified_then_all_is_reproduced(
+    tmp_path: Path,
+) -> None:
+    rig = JournalRig(tmp_path)
+    rig.drive(3.0)
+    fixed = GetTransformation(ME, "Cart:Mast", "Cart:Base", TimeQuery())
+    rig.send(fixed)
+    rig.loop._timer.lead.ns = 1_500_000
+    wait, asked = rig.bus.wait, itertools.count()
+
+    def wait_for_requests(seconds: float, inboxes: Inboxes = "both") -> None:
+        if inboxes == "requests" and not rig.bus.requests.pending:
+            rig.clock.advance(0.0004)
+            rig.send(fixed if next(asked) % 3 else GetStateVector(ME))
+        wait(seconds, inboxes)
+
+    rig.bus.wait = wait_for_requests  # type: ignore[method-assign]
+    rig.drive(1.0)
+    replies = rig.bus.get_published(ME.reply_channel)
+    assert len(replies) > 100  # two a tick at least
     assert is_reproduced(again(rig))
 
 
