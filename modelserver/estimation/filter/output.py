@@ -78,7 +78,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
     horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
     heading = monitor.bound_heading(heading, utime)
-    if heading > settings.heading_limit:
+    if heading > setup.heading_limit:
         invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, PROTECTION_LEVEL_EXCEEDED
     if horizontal > _get_horizontal_limit(setup, state):
         invalid |= 256  # PROTECTION_LEVEL_EXCEEDED

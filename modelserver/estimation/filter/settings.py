@@ -208,8 +208,9 @@ class FilterSettings(FixSettings):
     horizontal_limit: float | None = None
     """Horizontal protection level beyond which a pose is not valid, meters. If not given it is by the receiver's class:
     10 m with carrier corrections, 20 m with code corrections, 36 m without."""
-    heading_limit: float = 0.6
-    """Heading protection level beyond which a pose is not valid, radians."""
+    heading_limit: float | None = None
+    """Heading protection level beyond which a pose is not valid, radians. If not given 0.6; without wheels 0.35, since
+    nothing measures then that the vehicle moves along its own axis, as the heading by fixes assumes."""
     maximum_tilt: float = 1.05
     """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
     maximum_speed: float = 60.0
@@ -226,7 +227,7 @@ class FilterSettings(FixSettings):
                 problems.append(f"{name} is at most {most:g}, got {getattr(self, name)}")
         for name, most, words in (("maximum_tilt", 1.5708, "pi/2"), ("heading_limit", 3.1416, "pi")):
             value = getattr(self, name)
-            if math.inf > value > most:
+            if value is not None and math.inf > value > most:
                 hint = f"; {value:g} degrees are {math.radians(value):.3g}"
                 problems.append(f"{name} is at most {words} radians, got {value}{hint}")
         if not 8 <= self.replay_budget <= 4096 and self.replay_budget > 0:

@@ -50,6 +50,7 @@ class WheelMonitor(NamedTuple):
     steering: of the vehicle controller.
     mean_ratio: running mean of the NIS relative to its gate.
     is_suspect: whether they are stuck.
+    has_held: whether a sample was used since the wheels are stationary: where they are stuck, it has held the state.
     """
 
     source: str = ""
@@ -58,16 +59,18 @@ class WheelMonitor(NamedTuple):
     steering: SteeringAngle = SteeringAngle()
     mean_ratio: float = 0.0
     is_suspect: bool = False
+    has_held: bool = False
 
-    def compare(self, ratio: float, *, are_stationary: bool, is_moving: bool) -> WheelMonitor:
+    def compare(self, ratio: float, *, is_used: bool, are_stationary: bool, is_moving: bool) -> WheelMonitor:
         """Return the monitor after a sample with a NIS of `ratio` times its gate; `is_moving`: known without it."""
         if not are_stationary and not self.is_suspect:
             ratio = 0.0
         mean = self.mean_ratio + GAIN * (min(ratio, LARGEST_RATIO) - self.mean_ratio)
+        has_held = are_stationary and (self.has_held or is_used)
         if self.is_suspect:
             measures = is_moving and not are_stationary and mean < TRUSTED_MEAN
-            return self._replace(mean_ratio=mean, is_suspect=not measures)
-        return self._replace(mean_ratio=mean, is_suspect=mean > SUSPECT_MEAN)
+            return self._replace(mean_ratio=mean, is_suspect=not measures, has_held=has_held)
+        return self._replace(mean_ratio=mean, is_suspect=mean > SUSPECT_MEAN, has_held=has_held)
 
     def measures_speed(self, utime: int) -> bool:
         """Return whether the wheels measure the speed at an instant."""

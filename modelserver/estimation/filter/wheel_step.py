@@ -170,14 +170,16 @@ def _judge(
     sigma = math.sqrt(max(P[3, 3], P[4, 4]))
     is_moving = math.hypot(*nav.velocity[:2]) > 4.0 * sigma + UNSTUCK_SPEED
     ratio = decision.statistic / decision.limit
-    judged = wheels.compare(ratio, are_stationary=are_stationary, is_moving=is_moving)
+    is_used = decision.verdict is Verdict.USED
+    judged = wheels.compare(ratio, is_used=is_used, are_stationary=are_stationary, is_moving=is_moving)
     state = state._replace(common=state.common._replace(wheels=judged))
     if judged.is_suspect == wheels.is_suspect:
         return state, NOTHING
     if not judged.is_suspect:
         return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
-    # they have held the state
-    state = release_motion(state)._replace(stationary=state.stationary._replace(wheels_stationary=None))
+    if state.is_stationary or judged.has_held:
+        state = release_motion(state)
+    state = state._replace(stationary=state.stationary._replace(wheels_stationary=None))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 
 

@@ -7,9 +7,17 @@ import pytest
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 
 
-def compare(monitor: WheelMonitor, ratio: float, times: int, *, are_stationary: bool, is_moving: bool) -> WheelMonitor:
+def compare(
+    monitor: WheelMonitor,
+    ratio: float,
+    times: int,
+    *,
+    are_stationary: bool,
+    is_moving: bool,
+    is_used: bool = True,
+) -> WheelMonitor:
     for _ in range(times):
-        monitor = monitor.compare(ratio, are_stationary=are_stationary, is_moving=is_moving)
+        monitor = monitor.compare(ratio, is_used=is_used, are_stationary=are_stationary, is_moving=is_moving)
     return monitor
 
 
@@ -38,3 +46,12 @@ def test_given_stuck_wheels_of_a_vehicle_at_rest_then_they_stay_suspect_until_it
     assert compare(resting, 10.0, 50, are_stationary=True, is_moving=True).is_suspect
     # what it knows of its speed may be vague, and agree with any
     assert compare(resting, 0.05, 50, are_stationary=True, is_moving=True).is_suspect
+
+
+def test_given_stuck_wheels_that_were_never_used_then_they_have_not_held_the_state() -> None:
+    driving = compare(WheelMonitor(), 0.1, 10, are_stationary=False, is_moving=True)
+    stuck = compare(driving, 100.0, 3, are_stationary=True, is_moving=True, is_used=False)
+    assert stuck.is_suspect
+    assert not stuck.has_held
+    used = compare(driving, 8.0, 1, are_stationary=True, is_moving=True)
+    assert compare(used, 100.0, 3, are_stationary=True, is_moving=True, is_used=False).has_held
