@@ -90,8 +90,7 @@ def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Una
         speed_sigma = math.sqrt(max(nav.covariance[3, 3], nav.covariance[4, 4]))
         rotation = fit.rotation._replace(sigma=math.hypot(fit.rotation.sigma, 0.5 * speed_sigma / speed))
         fit = fit._replace(rotation=rotation)
-        is_forward = _find_direction(setup, state, nav.yaw + rotation.angle, speed) > 0
-        if speed_sigma > LARGEST_SPEED_SIGMA * speed and not is_forward:
+        if speed_sigma > LARGEST_SPEED_SIGMA * speed and _compare_accelerations(setup, state, rotation.angle) <= 0:
             return state, None
     if fit is None or fit.rotation.sigma > settings.align_sigma:
         return state, None
@@ -119,9 +118,14 @@ def _find_direction(setup: Setup, state: Unaligned, heading: float, speed: float
     """
     if speed > setup.settings.reverse_speed:
         return 1
+    return _compare_accelerations(setup, state, heading - state.nav.yaw)
+
+
+def _compare_accelerations(setup: Setup, state: Unaligned, angle: float) -> int:
+    """Return 1 if the accelerations are those of N rotated by `angle`, -1 of the opposite, 0 without evidence."""
     if not setup.uses_imu(state.common.mode):
         return 0
-    return heading_alignment.find_direction_of_travel(state.alignment.fixes, heading - state.nav.yaw, setup.settings)
+    return heading_alignment.find_direction_of_travel(state.alignment.fixes, angle, setup.settings)
 
 
 def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotation, newest: PathFix) -> Aligned:

@@ -172,10 +172,10 @@ class FilterSettings(FixSettings):
     """Longest stretch of fixes that heading is found from, seconds."""
     align_speed: float = 1.0
     """Least speed at which the receiver's velocity gives the heading, m/s."""
-    reverse_speed: float = 6.0
-    """Speed from which on the vehicle is known to drive forward, m/s, if neither wheels nor accelerations show it: a
-    road vehicle's reverse gear is as short as its first and ends at about 20 km/h. For a vehicle that drives as fast
-    either way set it to `maximum_speed`."""
+    reverse_speed: float = 10.0
+    """Speed from which on the vehicle is known to drive forward, m/s, if neither wheels nor accelerations show it: the
+    reverse gear of a road vehicle ends at about 20 km/h, and electric ones are limited to little more. For a vehicle
+    that drives as fast either way set it to `maximum_speed`."""
 
     # --- losing and finding fixes ---
 

@@ -35,7 +35,6 @@ pytestmark = pytest.mark.slow
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor" / "vehicle.yaml"
 AT_ONCE = DrivePhase(1e-3, -2.0)
-STRAIGHT_BACK = (AT_ONCE, DrivePhase(60.0))
 CURVES_BACK = (
     AT_ONCE,
     DrivePhase(10.0),
@@ -155,9 +154,9 @@ def test_given_no_direction_when_it_rolls_backward_then_heading_waits_for_accele
         assert run.decisions("wheel_speed", Verdict.REJECTED, "direction")
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_given_a_straight_at_steady_speed_without_a_direction_then_no_heading_is_valid_and_the_reason_is_found(sign):
-    phases = tuple(replace(each, speed=each.speed and -sign * each.speed) for each in STRAIGHT_BACK)
+@pytest.mark.parametrize("speed", [2.0, -2.0, -9.0])
+def test_given_a_straight_at_steady_speed_without_a_direction_then_no_heading_is_valid_and_the_reason_is_found(speed):
+    phases = (DrivePhase(1e-3, speed), DrivePhase(60.0))
     run = drive_raptor(phases, 30.0, wheels=False, status=False)
     assert find_first_valid(run) == math.inf
     found = run.localizer.summary(run.localizer.utime).findings
@@ -165,7 +164,7 @@ def test_given_a_straight_at_steady_speed_without_a_direction_then_no_heading_is
 
 
 def test_given_a_speed_that_no_vehicle_backs_up_with_then_it_drives_forward():
-    run = drive_raptor((DrivePhase(1e-3, 9.0), DrivePhase(60.0)), 12.0, wheels=False, status=False)
+    run = drive_raptor((DrivePhase(1e-3, 11.0), DrivePhase(60.0)), 12.0, wheels=False, status=False)
     assert find_first_valid(run) < 8.0
     assert find_longest_misleading(run) <= 1.0
 
