@@ -251,16 +251,15 @@ class Loop:
         self._rejections.flush(now, is_report_due)
         self._waiting_poses = []
         try:
-            gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
-            self.step(messages.Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
-        except Exception as error:
-            self.handle_error("tick", error)
-        self._serve_cached(self._timer.publish_ns)
-        self._timer.finish_tick()
-        poses, self._waiting_poses = self._waiting_poses, None
-        for channel, data in poses:
-            self._transmit(channel, data)
-        try:
+            try:
+                gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
+                self.step(messages.Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
+            finally:
+                self._serve_cached(self._timer.publish_ns)
+                self._timer.finish_tick()
+                poses, self._waiting_poses = self._waiting_poses, None
+                for channel, data in poses:
+                    self._transmit(channel, data)
             self._hooks.on_tick(self.state)
         except Exception as error:
             self.handle_error("tick", error)

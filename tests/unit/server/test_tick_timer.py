@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 
 from support_samples import START, ScriptedLocalizer
 from test_loop import PERIOD_NS, Rig
 
+from modelserver.core import CoreState
 from modelserver.messages import CHANNEL_OF, GetStateVector, GetTransformation, RequestHeader
 from modelserver.server.bus import Inboxes
 from modelserver.server.clock import MAX_LEAD_NS, TickLead
@@ -150,3 +152,16 @@ def test_given_a_flood_while_a_pose_waits_for_its_deadline_then_the_pose_is_on_t
     )[1]
     rig.turns(1)
     assert published == [due]
+
+
+def test_given_a_tick_that_fails_then_the_watchdog_is_not_notified() -> None:
+    class Broken(ScriptedLocalizer):
+        def estimate(self, utime: int):  # type: ignore[no-untyped-def]
+            raise RuntimeError("broken")
+
+    for localizer, is_notified in ((ScriptedLocalizer(), True), (Broken(), False)):
+        rig = Rig(localizer=localizer)
+        notified: list[CoreState] = []
+        rig.loop._hooks = replace(rig.loop._hooks, on_tick=notified.append)
+        rig.turns(6)
+        assert bool(notified) is is_notified
