@@ -10,10 +10,8 @@ therefore a guarantee, not a cap on an idle server.
 
 Contention (`ContentionDetector`): something else needs the time, such as ticks, sensors or other programs. There are
 three indications, each read outside: a late tick, a backlog of samples, and the run-queue delay of the server's thread
-(Linux: /proc/thread-self/schedstat), how long it was ready to run and had no processor, in the mean over the times it
-ran. Its share of the time is no indication: a client that waits for each reply shares a processor with the server, and
-each of thousands of short delays a second is only the client that has not yet begun to wait. An indication counts for
-`CONTENTION_NS`, and the detector stays on at a shorter delay than it turns on: hysteresis.
+(Linux: /proc/thread-self/schedstat), the time in which it was ready to run and had no processor. An indication counts
+for `CONTENTION_NS`, and the detector stays on at a lower share than it turns on: hysteresis.
 
 One program may have any number of clients, so the totals are bounded too: waiting requests, clients with a queue of
 their own, rejections with a reply. Beyond these bounds requests are dropped and counted.
@@ -32,11 +30,10 @@ from modelserver.messages import Request
 DELAY_PERIOD_NS: Final = 100_000_000
 """Period of reading the run-queue delay."""
 
-ENTER_DELAY_NS: Final = 200_000
-STAY_DELAY_NS: Final = 100_000
-"""Mean run-queue delay above which contention begins and continues. Measured on two processors: 20 to 50 us beside a
-client that waits for each reply, 60 to 90 us if both have one processor, 200 to 400 us beside a busy program on each
-processor, up to milliseconds where the server wants more than its share beside them."""
+ENTER_SHARE: Final = 0.2
+STAY_SHARE: Final = 0.1
+"""Share of time in the run queue above which contention begins and continues. A single client that waits for each reply
+causes a few hundredths."""
 
 LATE_TICK_NS: Final = 2_000_000
 """A later tick indicates contention."""
@@ -45,20 +42,13 @@ CONTENTION_NS: Final = 500_000_000
 """How long an indication counts."""
 
 
-class RunDelay(NamedTuple):
-    """Run-queue delay of a thread: the total in nanoseconds, and how often it has run."""
-
-    total_ns: int
-    runs: int
-
-
 class ContentionDetector:
     """Detects contention from late ticks, sample backlogs and run-queue delays."""
 
     def __init__(self) -> None:
         self._until_ns = 0
         self._sampled_ns = 0
-        self._delay: RunDelay | None = None
+        self._delay_ns: int | None = None
 
     def is_contended(self, now_ns: int) -> bool:
         """Return whether there was an indication lately."""
@@ -68,14 +58,14 @@ class ContentionDetector:
         """Return whether the run-queue delay is due to be read for `add_delay`."""
         return now_ns - self._sampled_ns >= DELAY_PERIOD_NS
 
-    def add_delay(self, delay: RunDelay | None, now_ns: int) -> None:
-        """Process a reading of the run-queue delay of the server's thread; None if the system has none."""
-        before, self._delay = self._delay, delay
-        self._sampled_ns = now_ns
-        if before is None or delay is None:
+    def add_delay(self, total_ns: int | None, now_ns: int) -> None:
+        """Process a reading of the thread's total run-queue delay; None if the system has none."""
+        before, self._delay_ns = self._delay_ns, total_ns
+        elapsed, self._sampled_ns = now_ns - self._sampled_ns, now_ns
+        if before is None or total_ns is None or elapsed <= 0:
             return
-        limit_ns = STAY_DELAY_NS if self.is_contended(now_ns) else ENTER_DELAY_NS
-        if delay.total_ns - before.total_ns > limit_ns * (delay.runs - before.runs):
+        share = (total_ns - before) / elapsed
+        if share > (STAY_SHARE if self.is_contended(now_ns) else ENTER_SHARE):
             self._until_ns = now_ns + CONTENTION_NS
 
     def add_tick(self, late_ns: int, now_ns: int) -> None:

@@ -24,7 +24,6 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus, FakeInbox
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.scheduler import RunDelay
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
 
@@ -91,9 +90,7 @@ class TimedBus(FakeBus):
 class Rig:
     """A loop on a timed bus, with ticks at 100 Hz."""
 
-    def __init__(
-        self, answer_s: float = 200e-6, run_delay: Callable[[], RunDelay | None] = lambda: None, **limits: Any
-    ):
+    def __init__(self, answer_s: float = 200e-6, run_delay: Callable[[], int | None] = lambda: None, **limits: Any):
         self.clock = FakeClock(START, BEGIN_NS)
         self.bus = TimedBus(self.clock, answer_s)
         state = start_core(ScriptedLocalizer())
@@ -190,12 +187,9 @@ def test_given_an_idle_service_then_one_client_is_never_held_back() -> None:
 def test_given_a_processor_that_others_want_then_the_client_gets_the_share_of_the_time_and_its_rate_at_least(
     hz: float, share: float, rate: float
 ) -> None:
-    # half of the time the thread was ready to run and had no processor, 1 ms each time; a reply takes 0.2 ms
-    def read_delay() -> RunDelay:
-        delay_ms = (rig.clock.monotonic_ns() - BEGIN_NS) // 2 // MS
-        return RunDelay(delay_ms * MS, delay_ms)
-
-    rig = Rig(run_delay=read_delay, client_hz=hz, request_share=share)
+    # half of the time the thread was ready to run and had no processor; a reply takes 0.2 ms
+    delay = lambda: (rig.clock.monotonic_ns() - BEGIN_NS) // 2  # noqa: E731
+    rig = Rig(run_delay=delay, client_hz=hz, request_share=share)
     begin = rig.seconds
     count = len(lone_client(rig, 4000))
     assert count / (rig.seconds - begin) == pytest.approx(rate, rel=0.15)
