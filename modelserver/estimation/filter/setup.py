@@ -64,8 +64,9 @@ class Setup:
         present = [each for each in created if each is not None]
         self.horizon_us = round(settings.horizon * 1e6)
         self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
-        given, by_wheels = settings.heading_limit, HEADING_LIMIT if self.wheels else HEADING_LIMIT_WITHOUT_WHEELS
-        self.heading_limit = by_wheels if given is None else given
+        self.heading_limit = HEADING_LIMIT if self.wheels else HEADING_LIMIT_WITHOUT_WHEELS
+        if settings.heading_limit is not None:
+            self.heading_limit = settings.heading_limit
         extras = [*gnss_states(settings)] if rig.gps_frame else [gnss_states(settings)[0]]
         if self.wheels is not None:
             extras += wheel_states(settings)

@@ -62,7 +62,10 @@ class WheelMonitor(NamedTuple):
     has_held: bool = False
 
     def compare(self, ratio: float, *, is_used: bool, are_stationary: bool, is_moving: bool) -> WheelMonitor:
-        """Return the monitor after a sample with a NIS of `ratio` times its gate; `is_moving`: known without it."""
+        """Return the monitor after a sample with a NIS of `ratio` times its gate.
+
+        `is_used`: whether the state was updated with it; `is_moving`: known without it.
+        """
         if not are_stationary and not self.is_suspect:
             ratio = 0.0
         mean = self.mean_ratio + GAIN * (min(ratio, LARGEST_RATIO) - self.mean_ratio)

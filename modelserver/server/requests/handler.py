@@ -203,8 +203,10 @@ class RequestHandler:
     def serve_cached(self) -> None:
         """Receive a request that has arrived: answer it from the cache, or queue it."""
         self._only_cached = True
-        self._bus.requests.drain(1)
-        self._only_cached = False
+        try:
+            self._bus.requests.drain(1)
+        finally:
+            self._only_cached = False
 
     def prepare(self, until_ns: int) -> bool:
         """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
