@@ -10,6 +10,7 @@ import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
 from modelserver.estimation.filter import eskf, latency_estimator, propagation, protection_levels
+from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.fusion import uses_gnss
@@ -255,10 +256,11 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
         if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
             invalid |= 128  # GPS_REJECTED
         monitor = state.consistency
-        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do
-        is_covered = monitor.suspect is not None and (
-            not monitor.is_jump or (utime - monitor.since) * 1e-6 <= JUMP_TIME
-        )
+        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do, and
+        # not the heading of a vehicle that moves beside its own axis
+        is_covered = monitor.suspect is not None and monitor.cause is not Cause.HEADING
+        if monitor.is_jump and (utime - monitor.since) * 1e-6 > JUMP_TIME:
+            is_covered = False
         if monitor.cause is not None and not is_covered:
             invalid |= 8192  # GNSS_INCONSISTENT
     else:

@@ -9,6 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from modelserver.estimation.filter import heading_step, output
+from modelserver.estimation.filter.consistency_monitor import Cause
+from modelserver.estimation.filter.gnss_monitor import OutputOffset
+from modelserver.estimation.filter.heading_alignment import Rotation
+from modelserver.estimation.filter.state import Aligned
 from modelserver.messages import GpsSample, Invalid, Mode, Verdict
 from modelserver.simulation import (
     AbsolutePoseModel,
@@ -195,3 +200,32 @@ def test_given_an_outage_without_wheels_but_with_visual_odometry_then_the_error_
     assert seeing.last.off < seeing.last.estimate.horizontal_protection_level
     assert seeing.last.estimate.horizontal_protection_level < 0.5 * blind.last.estimate.horizontal_protection_level
     assert blind.last.off < blind.last.estimate.horizontal_protection_level
+
+
+def test_given_a_position_set_from_fixes_then_the_offset_of_the_former_one_is_not_added_to_it():
+    localizer = drive(simulation(EIGHT), 30.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    assert state.gnss.last_fix is not None
+    drifted = state._replace(gnss=state.gnss._replace(offset=OutputOffset((100.0, -50.0, 0.0))))
+
+    after = heading_step.initialize(localizer.setup, drifted, drifted.nav, Rotation(0.0, 0.0), state.gnss.last_fix)
+
+    found = output.estimate(localizer.setup, after, localizer.odom, localizer.utime, localizer.utime)
+    before = localizer.estimate(localizer.utime)
+    assert math.dist(found.enu.xyz[:2], before.enu.xyz[:2]) < 2.0
+
+
+def test_given_a_vehicle_that_moves_beside_its_own_axis_then_its_pose_is_not_valid_however_small_the_bound():
+    localizer = drive(simulation(EIGHT), 30.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    monitor = state.consistency
+
+    def find_invalid(cause: Cause) -> Invalid:
+        judged = state._replace(consistency=monitor._replace(cause=cause, since=monitor.utime, suspect=monitor.last))
+        return output.estimate(localizer.setup, judged, localizer.odom, localizer.utime, localizer.utime).invalid
+
+    assert not localizer.estimate(localizer.utime).invalid
+    assert not find_invalid(Cause.GNSS)  # its bound covers what fixes that drift do
+    assert find_invalid(Cause.HEADING) is Invalid.GNSS_INCONSISTENT
