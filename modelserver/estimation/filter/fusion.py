@@ -40,9 +40,15 @@ CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
 
 HELD_SPEED: Final = 1.5
+HELD_TILT: Final = 0.05
 HELD_TURN: Final = 0.05
 HELD_RATE: Final = 0.01
-"""Sigma of the speed (m/s), the turn (rad) and the gyro's bias (rad/s) after a mistaken rest of seconds."""
+"""Sigma of the speed (m/s), the tilt and the turn (rad) and the gyro's bias (rad/s) after a mistaken rest of seconds: a
+tilt explains a speed that did not change."""
+
+LOST_TURN: Final = 0.3
+LOST_RATE: Final = 0.01
+"""Sigma of the turn (rad) and of the gyro's bias (rad/s) after an outage in which wheels were stuck."""
 
 ZUPT_PERIOD: Final = 0.2
 """Seconds between two zero-velocity updates."""
@@ -240,10 +246,24 @@ def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
 def release_motion(state: N) -> N:
     """Return the state with the uncertainty of a vehicle whose wheels are stationary, and that is not."""
     P = state.nav.covariance.copy()
-    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (8, HELD_TURN)):
+    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (6, HELD_TILT), (7, HELD_TILT), (8, HELD_TURN)):
         P[axis, axis] += sigma * sigma
     if state.is_stationary:
         P[11, 11] += HELD_RATE * HELD_RATE  # ZARU
+    return state._replace(nav=state.nav._replace(covariance=P))
+
+
+def release_heading(state: N) -> N:
+    """Return the state with the uncertainty of a heading after an outage in which wheels were stuck.
+
+    The non-holonomic constraint shows heading and gyro bias by the speed. One that nothing measured may have been
+    wrong by more than its uncertainty, and so are they then, and stay so.
+    """
+    P = state.nav.covariance.copy()
+    for axis, sigma in ((8, LOST_TURN), (11, LOST_RATE)):
+        variance = P[axis, axis] + sigma * sigma
+        P[axis, :] = P[:, axis] = 0.0
+        P[axis, axis] = variance
     return state._replace(nav=state.nav._replace(covariance=P))
 
 

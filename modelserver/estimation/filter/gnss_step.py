@@ -33,6 +33,7 @@ from modelserver.estimation.filter.fusion import (
     create_context,
     fuse_measurement,
     reject,
+    release_heading,
     report_reset,
     uses_gnss,
 )
@@ -180,6 +181,8 @@ def _fuse_aligned(
         state, decisions = _check_heading(setup, state, newest)
         if decisions:
             return state, decisions
+    if is_used and since > 1e-6 * propagation.OUTAGE_US and state.common.wheels.is_suspect:
+        state = release_heading(state)
     adds_nothing = _adds_nothing(setup, state, fix)
     decisions = NOTHING
     # a restored heading has its own check

@@ -196,7 +196,9 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
     state = state._replace(constraints=state.constraints._replace(contradiction=contradiction))
     if contradiction > LARGEST_CONTRADICTION and state.stationary.is_confirmed_by_wheels(utime):
         # wheels that are stuck, and it moves so smoothly that it seems stationary
-        common = state.common._replace(moving_until=utime + round(MOVING_TIME * 1e6))
+        common = state.common._replace(
+            moving_until=utime + round(MOVING_TIME * 1e6), wheels=state.common.wheels.suspect()
+        )
         state = release_motion(state)._replace(stationary=StationaryDetector(), common=common)
         state = state._replace(constraints=state.constraints._replace(contradiction=0.0))
         return state, (*decisions, report_event(state, constraints.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))

@@ -86,6 +86,25 @@ def test_given_encoders_that_are_stuck_on_a_smooth_road_then_odom_continues():
     assert not [word for word in found.decisions("zero_rate", Verdict.USED) if found.seconds(word) > 10.0]
 
 
+def test_given_encoders_stuck_at_rest_when_it_starts_without_fixes_then_speed_and_heading_do_not_rest_on_them():
+    phases = (*EIGHT, DrivePhase(10.0, 0.0), DrivePhase(4.0, 4.0), DrivePhase(30.0, 4.0), DrivePhase(4.0, 0.0))
+    at = sum(phase.duration for phase in EIGHT) + 5.0
+    encoder = EncoderModel(stuck=(("left", at), ("right", at)))
+    gps = replace(PLAIN_GPS, outages=((at, at + 25.0),))
+    wheels = WheelsModel(WHEELS_TIMING, encoder=encoder)
+
+    found = drive(simulation(phases, gps_model=gps, wheels_model=wheels), at + 35.0)
+
+    # it moves from at + 5 on; the wheels are found to be stuck a second later
+    driving = found.between(at + 7.0, at + 9.0)
+    assert all(abs(row.estimate.motion.velocity[0] - row.speed) < 0.2 for row in driving)
+    # the constraint has shown a heading by a speed that nothing measured
+    back = found.between(at + 25.5)
+    assert back[0].estimate.heading_protection_level > 0.6
+    assert all(abs(row.heading) < row.estimate.heading_protection_level for row in back)
+    assert found.last.valid
+
+
 def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_covers_the_turn_meanwhile():
     begin, end = START_UTIME + 25_000_000, START_UTIME + 25_900_000
     held: list[ImuSample] = []
