@@ -267,7 +267,9 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "get_motion_request_t": st.builds(messages.GetMotion, request_headers, frames, frames, frames, times),
     "get_motion_reply_t": failed.map(messages.MotionReply)
     | st.builds(
-        messages.MotionReply, fine, st.builds(messages.MotionAnswer, answers(), texts, *[places] * 4, covariances)
+        messages.MotionReply,
+        fine,
+        st.builds(messages.MotionAnswer, answers(), texts, *[places] * 4, covariances, covariances),
     ),
     "get_explanation_request_t": st.builds(messages.GetExplanation, request_headers, frames, frames, times),
     "get_explanation_reply_t": failed.map(messages.ExplanationReply)

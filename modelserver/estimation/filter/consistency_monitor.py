@@ -224,7 +224,7 @@ class PathNode(NamedTuple):
     heading_variance, rate_variance, scale_variance: of the heading (rad2), and of those.
     has_gyro, is_measured: whether a gyro measures the turns, and wheels the path too.
     own_heading: by the gyro alone, along the path's axes, rad.
-    latency, latency_variance: of fixes, s and s2.
+    latency, latency_variance: of fixes, s and s2; `shows_latency`: whether fixes separate it from the heading.
     lost: variance of the heading that was lost in gaps of the IMU since the start of the path, rad2.
     unmeasured: the part of `distance` whose length nothing measured, m.
     white, correlated: standard deviations of the two errors of the fix, m.
@@ -251,6 +251,7 @@ class PathNode(NamedTuple):
     own_heading: float
     latency: float
     latency_variance: float
+    shows_latency: bool
     lost: float
     unmeasured: float
     white: float
@@ -737,13 +738,10 @@ def _explain(
     for (cause, _, _), ((a, b), left, evidence) in zip(planar, fits, strict=True):
         if cause is Cause.GNSS or left <= largest:
             found.append(Inconsistency(cause, newest, math.hypot(a, b), none - evidence, lever_arm=complex(a, b)))
-    single = (
-        (Cause.GYRO, 1j * moments),
-        (Cause.WHEELS, paths),
+    single = [(Cause.GYRO, 1j * moments), (Cause.WHEELS, paths)]
+    if window[-1].shows_latency:
         # before the window too, and from its start on
-        (Cause.LATENCY, start.velocity - velocities),
-        (Cause.LATENCY, -velocities),
-    )
+        single += [(Cause.LATENCY, start.velocity - velocities), (Cause.LATENCY, -velocities)]
     fits = fit.solve([((model, TYPICAL_CHANGE[cause]),) for cause, model in single])
     for (cause, _), ((factor,), left, evidence) in zip(single, fits, strict=True):
         if left <= largest:

@@ -27,7 +27,7 @@ from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.fusion import correct_path, report_event
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
-from modelserver.estimation.filter.latency_estimator import compute_heading_variance
+from modelserver.estimation.filter.latency_estimator import compute_heading_variance, is_separate
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
@@ -79,6 +79,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
         wrap_angle(nav.yaw - monitor.rotation),
         nav.extras[layout.extra_index(LATENCY)],
         float(P[layout.index(LATENCY), layout.index(LATENCY)]),
+        is_separate(P, layout.index(LATENCY)),
         monitor.lost,
         monitor.unmeasured,
         newest.white,

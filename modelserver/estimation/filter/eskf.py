@@ -170,6 +170,14 @@ class NavState(NamedTuple):
             ),
         )
 
+    def change(self, index: int, amount: float) -> NavState:
+        """Return the state with one element of the error changed by an amount, and the others as is expected with it.
+
+        That is P[:, index] / P[index, index] times the amount; the covariance stays.
+        """
+        P = self.covariance
+        return self.inject(P[:, index] * (amount / P[index, index]), P)
+
 
 class Earth(NamedTuple):
     """Gravity at N's origin, m/s2, and the earth rate along N's axes, rad/s."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
-from modelserver.estimation.filter import eskf, propagation
+from modelserver.estimation.filter import eskf, latency_estimator, propagation
 from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
@@ -217,6 +217,11 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     )
     before = state.nav
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
+    nav = latency_estimator.hold_latency(before, state.nav, setup.layout)
+    if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
+        # by a speed that nothing measures the constraint would change the bias for good
+        nav = nav.change(11, before.gyro_bias[2] - nav.gyro_bias[2])
+    state = state._replace(nav=nav)
     if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):
         # the constraint turns the heading to the course of the fixes
         turn = wrap_angle(state.nav.yaw - before.yaw)

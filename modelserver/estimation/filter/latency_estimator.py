@@ -8,8 +8,9 @@ at constant speed straight ahead it is a displacement, and on a steady circle a 
 
 On a steady circle fixes determine only the sum of the heading and of turn rate times latency. The latency would follow
 whatever turns the heading there, such as an error of the gyro's scale, and take the heading along without limit. So
-while the two are correlated it is neither inflated nor corrected (`hold_latency`), and the heading's variance is that
-of a latency which may have changed (`compute_heading_variance`).
+while the two are correlated it is neither inflated nor corrected, by fixes or by wheels (`hold_latency`), nor is it the
+cause of an inconsistency; and the heading's variance is that of a latency which may have changed
+(`compute_heading_variance`).
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def inflate_latency(
     seconds = (residual[0] * vx + residual[1] * vy) / square
     variance = float(nav.covariance[at, at])
     inflated = min(variance + CHANGE_SIGMA**2 * weight, CHANGE_SIGMA**2, seconds * seconds)
-    if not inflated > variance or not _is_separate(nav.covariance, at):
+    if not inflated > variance or not is_separate(nav.covariance, at):
         return nav
     P = nav.covariance.copy()
     P[at, at] = inflated
@@ -120,17 +121,17 @@ def inflate_latency(
 
 
 def hold_latency(before: NavState, after: NavState, layout: ErrorLayout) -> NavState:
-    """Return the state `after` a fix with the latency that it had `before`, where fixes cannot separate it.
+    """Return the state `after` an update with the latency that it had `before`, where fixes cannot separate it.
 
-    The rest is what the covariance expects at that latency: the error P[:, t] / P[t, t] times the difference. So what
-    turns the heading on a steady circle stays an error of heading and gyro, which fixes correct.
+    What turns the heading on a steady circle stays an error of heading and gyro, which fixes correct.
     """
-    at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
-    P = after.covariance
-    change = before.extras[extra] - after.extras[extra]
-    if not change or _is_separate(P, at):
+    if LATENCY not in layout:
         return after
-    return after.inject(P[:, at] * (change / P[at, at]), P)
+    at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
+    change = before.extras[extra] - after.extras[extra]
+    if not change or is_separate(after.covariance, at):
+        return after
+    return after.change(at, change)
 
 
 def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:
@@ -138,13 +139,14 @@ def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:
     if LATENCY not in layout:
         return 0.0
     at = layout.index(LATENCY)
-    if _is_separate(nav.covariance, at):
+    if is_separate(nav.covariance, at):
         return 0.0
     turn_rate = nav.rate[2] - nav.gyro_bias[2]
     return max(CHANGE_SIGMA**2 - float(nav.covariance[at, at]), 0.0) * turn_rate * turn_rate
 
 
-def _is_separate(P: Array, at: int) -> bool:
+def is_separate(P: Array, at: int) -> bool:
+    """Return whether fixes separate latency, at index `at`, and heading, by their covariance (n, n)."""
     return bool(P[8, at] ** 2 <= SEPARATE_CORRELATION**2 * P[8, 8] * P[at, at])
 
 

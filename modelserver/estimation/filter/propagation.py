@@ -30,6 +30,11 @@ TURN_TIME: Final = 10.0
 """Seconds of a turn, in which the error of the gyro's scale adds up."""
 
 
+def is_outage(state: Aligned, utime: int) -> bool:
+    """Return whether no fix was used for a while."""
+    return utime - state.gnss.used_utime >= OUTAGE_US
+
+
 def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
     """Return the process noise at an instant of the state."""
     if setup.uses_imu(state.common.mode):
@@ -51,7 +56,7 @@ def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
         return setup.stationary
     noise = setup.interpolated if state.imu.is_interpolated else setup.driving
     rate, nav = state.nav.rate[2], state.nav
-    if abs(rate) < SLOW_TURN or not isinstance(state, Aligned) or nav.utime - state.gnss.used_utime < OUTAGE_US:
+    if abs(rate) < SLOW_TURN or not isinstance(state, Aligned) or not is_outage(state, nav.utime):
         return noise
     if not state.common.measures_wheel_speed(nav.utime):
         return noise  # the non-holonomic constraint would turn the heading by it

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, leveling, propagation
+from modelserver.estimation.filter import eskf, latency_estimator, leveling, propagation
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
@@ -145,6 +145,7 @@ def _fuse_speed(
         if not isinstance(again, str) and again.jacobian.shape == innovation.jacobian.shape:
             innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
+    nav = latency_estimator.hold_latency(context.nav, nav, setup.layout)
     has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
     wheels = state.common.wheels
     if wheels.source != item.source:

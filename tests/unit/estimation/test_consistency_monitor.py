@@ -44,6 +44,7 @@ class Fault(NamedTuple):
     rate: float = 0.0
     scale: float = 0.0
     latency: float = 0.0
+    shows_latency: bool = True
     lever_arm: complex = 0j
 
 
@@ -110,6 +111,7 @@ def drive(
             own_heading=yaw + error,
             latency=0.0,
             latency_variance=0.02**2,
+            shows_latency=fault.shows_latency,
             lost=monitor.lost,
             unmeasured=monitor.unmeasured,
             white=WHITE / CORRELATED * correlated,
@@ -429,6 +431,16 @@ def test_given_fixes_that_hardly_move_then_their_direction_shows_no_heading() ->
         start._replace(latency=0.0), end.node._replace(fix=start.fix + 0.01j, latency=0.0), NOISE, SETTINGS
     )
     assert abs(unmoved.turn) < 0.01
+
+
+def test_given_a_latency_that_changes_then_it_is_the_cause_only_where_fixes_separate_it_from_the_heading() -> None:
+    found = find(Fault(200.0, latency=0.6)).found
+    assert found is not None
+    assert found.cause is Cause.LATENCY
+    assert found.change == pytest.approx(0.6, abs=0.2)
+    hidden = [each.found for each in drive(320.0, Fault(200.0, latency=0.6, shows_latency=False)) if each.found]
+    assert hidden
+    assert all(each.cause is not Cause.LATENCY for each in hidden)
 
 
 @pytest.mark.parametrize("fault", [Fault(200.0, drift=0.5j), Fault(200.0, rate=0.02), Fault(200.0, scale=0.2)])

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from modelserver.estimation.filter import fusion
 from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Leveling
+from modelserver.estimation.filter.state import Aligned, Leveling
 from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
@@ -103,6 +104,29 @@ def test_given_encoders_stuck_at_rest_when_it_starts_without_fixes_then_speed_an
     assert back[0].estimate.heading_protection_level > 0.6
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in back)
     assert found.last.valid
+
+
+def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bias():
+    gps = replace(PLAIN_GPS, outages=((25.0, 60.0),))
+    localizer = drive(simulation(EIGHT, gps_model=gps), 35.0).localizer
+    state, setup = localizer.head, localizer.setup
+    assert isinstance(state, Aligned)
+    x, y, z = state.nav.velocity
+    sliding = state._replace(nav=state.nav._replace(velocity=(x - 0.2 * y, y + 0.2 * x, z)))
+    stuck = sliding._replace(common=state.common._replace(wheels=state.common.wheels.suspect()))
+
+    def constrain(slid: Aligned) -> tuple[float, float]:
+        after, decision = fusion.fuse_non_holonomic(setup, slid, slid.nav.utime + 100_000)
+        assert decision.verdict is Verdict.USED
+        return after.nav.gyro_bias[2] - slid.nav.gyro_bias[2], after.nav.body_velocity(RIG.base)[1]
+
+    slid = abs(sliding.nav.body_velocity(RIG.base)[1])
+    changed, slides = constrain(sliding)
+    held, slides_too = constrain(stuck)
+    assert abs(changed) > 1e-6
+    assert held == pytest.approx(0.0, abs=1e-12)
+    assert slides_too == pytest.approx(slides, abs=0.01)
+    assert abs(slides) < 0.9 * slid
 
 
 def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_covers_the_turn_meanwhile():

@@ -13,6 +13,9 @@ from modelserver.estimation.filter import heading_step, output
 from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import Rotation
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.measurements.gnss import LATENCY
+from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned
 from modelserver.messages import GpsSample, Invalid, Mode, Verdict
 from modelserver.simulation import (
@@ -26,7 +29,7 @@ from modelserver.simulation import (
     figure_eight,
     stop_and_go,
 )
-from tests.support_filter import GPS_TIMING, PLAIN_GPS, RTK_LIKE, drive, rms, simulation
+from tests.support_filter import GPS_TIMING, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, drive, rms, row, simulation
 
 pytestmark = pytest.mark.slow
 
@@ -229,3 +232,31 @@ def test_given_a_vehicle_that_moves_beside_its_own_axis_then_its_pose_is_not_val
     assert not localizer.estimate(localizer.utime).invalid
     assert not find_invalid(Cause.GNSS)  # its bound covers what fixes that drift do
     assert find_invalid(Cause.HEADING) is Invalid.GNSS_INCONSISTENT
+
+
+def test_given_a_steady_circle_then_wheels_correct_the_heading_and_not_the_latency_that_goes_with_it():
+    circle = 1.0 / 8.0
+    phases = (
+        *(DrivePhase(4.0, 0.0), DrivePhase(3.0, 2.5), DrivePhase(8.0, 2.5), DrivePhase(3.0, 2.5, circle)),
+        *(DrivePhase(50.0, 2.5, circle), DrivePhase(3.0, 0.0, 0.0)),
+    )
+    run = simulation(phases, gps_model=replace(PLAIN_GPS, unstated_latency=0.2))
+    localizer = FilterLocalizer.start(Setup(RIG), ORIGIN)
+    silent = run.start_utime + 55_000_000
+    before = 0.0
+    for sample in run.events(58.0):
+        if isinstance(sample, GpsSample) and sample.header.utime > silent:
+            continue
+        localizer, _ = localizer.process(sample)
+        if localizer.utime <= silent + 500_000:  # the last fix has arrived
+            before = get_latency(localizer)
+
+    assert isinstance(localizer.head, Aligned)
+    assert get_latency(localizer) == pytest.approx(before, abs=5e-5)
+    assert abs(row(run, localizer.estimate(localizer.utime)).heading) < math.radians(4.0)
+
+
+def get_latency(localizer: FilterLocalizer) -> float:
+    """The latency of fixes in the state, s."""
+    head = localizer.head
+    return head.nav.extras[localizer.setup.layout.extra_index(LATENCY)] if isinstance(head, Aligned) else 0.0
