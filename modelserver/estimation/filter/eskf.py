@@ -175,6 +175,8 @@ class NavState(NamedTuple):
 
         That is P[:, index] / P[index, index] times the amount; the covariance stays.
         """
+        if not amount:
+            return self  # an element that is certain never changes
         P = self.covariance
         return self.inject(P[:, index] * (amount / P[index, index]), P)
 

@@ -128,10 +128,9 @@ def hold_latency(before: NavState, after: NavState, layout: ErrorLayout) -> NavS
     if LATENCY not in layout:
         return after
     at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
-    change = before.extras[extra] - after.extras[extra]
-    if not change or is_separate(after.covariance, at):
+    if is_separate(after.covariance, at):
         return after
-    return after.change(at, change)
+    return after.change(at, before.extras[extra] - after.extras[extra])
 
 
 def compute_heading_variance(nav: NavState, layout: ErrorLayout) -> float:

@@ -289,3 +289,18 @@ def test_given_an_attitude_error_when_injected_then_the_covariance_is_rotated_wi
     # to first order in the error: a wrong sign is off by twice as much as none
     expected = J @ before[ATTITUDE, ATTITUDE] @ J.T
     assert np.abs(after - expected).max() < 0.25 * np.abs(before[ATTITUDE, ATTITUDE] - expected).max()
+
+
+def test_given_an_element_that_changes_then_others_change_as_is_expected_with_it_and_a_certain_one_not_at_all():
+    size = Setup(RIG).layout.size
+    P = np.eye(size)
+    P[0, 11] = P[11, 0] = 0.5
+    P[10, 10] = 0.0
+    nav = drive(simulation(EIGHT), 12.0).localizer.head.nav._replace(covariance=P)
+
+    changed = nav.change(11, 0.02)
+
+    assert changed.gyro_bias[2] - nav.gyro_bias[2] == pytest.approx(0.02)
+    assert changed.position[0] - nav.position[0] == pytest.approx(0.01)
+    assert changed.covariance is P
+    assert nav.change(10, 0.0) is nav
