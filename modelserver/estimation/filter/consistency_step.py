@@ -25,7 +25,6 @@ from modelserver.estimation.filter.consistency_monitor import (
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.fusion import correct_path, report_event
-from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.latency_estimator import compute_heading_variance, is_separate
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
@@ -207,7 +206,7 @@ def _place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
     """Return the state at a fix, in a new epoch."""
     before = state.nav
     nav = heading_alignment.place(before, newest, 0j, setup.rig.lever_arm(setup.rig.gps_frame), setup.layout)
-    gnss = state.gnss.restart(newest.utime)._replace(offset=OutputOffset(), outlier_allowance=0.0)
+    gnss = state.gnss.place(newest.utime)._replace(outlier_allowance=0.0)
     state = state._replace(nav=nav, gnss=gnss, common=state.common._replace(epoch=state.common.epoch + 1))
     return correct_path(setup, state, before)
 

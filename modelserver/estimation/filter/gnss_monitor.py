@@ -146,8 +146,12 @@ class GnssMonitor(NamedTuple):
         )
 
     def restart(self, utime: int) -> GnssMonitor:
-        """Return the monitor after the position was set from fixes at `utime`."""
+        """Return the monitor of fixes that are trusted again from `utime` on."""
         return self._replace(rejected=(), rejected_since=0, num_rejected=0, used_utime=utime)
+
+    def place(self, utime: int) -> GnssMonitor:
+        """Return the monitor after the position was set at `utime`: the offset was that of the former one."""
+        return self.restart(utime)._replace(offset=OutputOffset())
 
     def learn_inflation(self, decision: Decision, seconds: float, settings: FilterSettings) -> GnssMonitor:
         """Return the monitor with the noise inflation after a fix, `seconds` after the last one."""

@@ -34,7 +34,7 @@ from modelserver.estimation.filter.fusion import (
     report_reset,
     uses_gnss,
 )
-from modelserver.estimation.filter.gnss_monitor import GnssMonitor, OutputOffset
+from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import PathFit, PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.measurements import MeasurementContext
 from modelserver.estimation.filter.measurements.aiding import AbsolutePose
@@ -146,8 +146,7 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
         nav = latency_estimator.reconcile_latency(nav, latency_estimator.fit_latency(known), setup.layout)
         gnss = GnssMonitor(last_fix=state.alignment.last_fix)
     else:
-        # that of the former position
-        gnss = state.gnss._replace(offset=OutputOffset())
+        gnss = state.gnss
     nav = heading_alignment.rotate(nav, rotation, setup.layout)
     nav = heading_alignment.place(nav, newest, displacement, lever, setup.layout)
     assert state.site is not None
@@ -166,7 +165,7 @@ def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor
         state.common._replace(is_clock_stepped=False),
         Earth.at(latitude, height),
         site,
-        gnss.restart(nav.utime),
+        gnss.place(nav.utime),
     )
 
 
