@@ -183,6 +183,9 @@ def _fuse_aligned(
             return state, decisions
     if is_used and since > 1e-6 * propagation.OUTAGE_US and state.common.wheels.is_suspect:
         state = release_heading(state)
+    if is_used and heading_step.is_heading_lost(setup, state):
+        lost, decisions = _fuse_unaligned(setup, heading_step.lose_heading(state), item, sample, fix, is_used)
+        return lost, (report_reset(item, "the heading is lost"), *decisions)
     adds_nothing = _adds_nothing(setup, state, fix)
     decisions = NOTHING
     # a restored heading has its own check

@@ -21,6 +21,7 @@ from modelserver.estimation.filter import (
     latency_estimator,
     leveling,
     propagation,
+    protection_levels,
 )
 from modelserver.estimation.filter.eskf import Earth, NavState
 from modelserver.estimation.filter.fusion import (
@@ -35,7 +36,7 @@ from modelserver.estimation.filter.fusion import (
     uses_gnss,
 )
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
-from modelserver.estimation.filter.heading_alignment import PathFit, PathFix, Rotation, to_horizontal
+from modelserver.estimation.filter.heading_alignment import HeadingAlignment, PathFit, PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.measurements import MeasurementContext
 from modelserver.estimation.filter.measurements.aiding import AbsolutePose
 from modelserver.estimation.filter.measurements.gnss import (
@@ -166,6 +167,34 @@ def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor
         Earth.at(latitude, height),
         site,
         gnss.place(nav.utime),
+    )
+
+
+def is_heading_lost(setup: Setup, state: Aligned) -> bool:
+    """Return whether the heading may be any: then no measurement can be linearized at it."""
+    variance = float(state.nav.covariance[8, 8])
+    return protection_levels.compute_heading(variance, setup.settings) >= math.pi
+
+
+def lose_heading(state: Aligned) -> Unaligned:
+    """Return the state of a vehicle whose heading is lost: from now on N is rotated about up by an unknown angle.
+
+    What else is known is known along the heading as it is, so the covariance is that given an exact one. The pose of a
+    new heading is of a new epoch.
+    """
+    nav = state.nav
+    P = nav.covariance - np.outer(nav.covariance[:, 8], nav.covariance[8]) / nav.covariance[8, 8]
+    P[8, :] = P[:, 8] = 0.0
+    earth = Earth(state.earth.gravity, (0.0, 0.0, state.earth.rotation[2]))
+    return Unaligned(
+        nav._replace(covariance=P),
+        state.imu,
+        state.stationary,
+        HeadingAlignment(last_fix=state.gnss.last_fix),
+        state.constraints,
+        state.common._replace(epoch=state.common.epoch + 1),
+        earth,
+        state.site,
     )
 
 

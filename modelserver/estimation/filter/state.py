@@ -2,8 +2,9 @@
 
     Leveling  -- vertical and gyro biases found -->  Unaligned  -- heading found -->  Aligned
 
-A vehicle without an IMU is taken to be level. A warm start goes from Unaligned to Aligned by the persisted pose. After
-divergence, or a gap in the IMU that loses the vertical, the filter restarts with `Leveling(common.restart())`.
+A vehicle without an IMU is taken to be level. A warm start goes from Unaligned to Aligned by the persisted pose. From
+Aligned a vehicle whose heading is lost goes back to Unaligned. After divergence, or a gap in the IMU that loses the
+vertical, the filter restarts with `Leveling(common.restart())`.
 """
 
 from __future__ import annotations

@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter import fusion
+from modelserver.estimation.filter import fusion, heading_alignment
 from modelserver.estimation.filter.error_layout import ATTITUDE
+from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Leveling
+from modelserver.estimation.filter.timeline import Timeline
 from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
@@ -127,6 +129,30 @@ def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bia
     assert held == pytest.approx(0.0, abs=1e-12)
     assert slides_too == pytest.approx(slides, abs=0.01)
     assert abs(slides) < 0.9 * slid
+
+
+def test_given_a_heading_that_is_lost_and_half_a_turn_wrong_then_it_is_found_as_at_the_start():
+    run = simulation(EIGHT, gps_model=PLAIN_GPS)
+    localizer = drive(run, 12.0).localizer
+    state, setup = localizer.head, localizer.setup
+    assert isinstance(state, Aligned)
+    nav = heading_alignment.rotate(state.nav, Rotation(math.pi, 1.0), setup.layout)
+    lost = state._replace(nav=nav._replace(position=state.nav.position))
+    last = localizer.clocks.newest
+    localizer = localizer._replace(timeline=Timeline(lost), head=lost)
+
+    found = drive(
+        run,
+        40.0,
+        localizer=localizer,
+        transform=lambda events: (event for event in events if event.header.host_utime > last),
+    )
+
+    (reported,) = found.decisions("gps_position", Verdict.RESET, "the heading is lost")
+    assert found.seconds(reported) < 13.0
+    assert {row.estimate.pose_epoch for row in found.rows} == {state.common.epoch, state.common.epoch + 1}
+    assert all(row.valid and abs(row.heading) < row.estimate.heading_protection_level for row in found.between(25.0))
+    assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.rows if row.valid)
 
 
 def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_covers_the_turn_meanwhile():
