@@ -104,15 +104,15 @@ def test_given_100000_random_and_mutated_messages_then_it_serves_counts_them_and
             # wait for an answer: overload is not tested here
             asked = time.monotonic()
             run.wait_until(lambda asked=asked: run.is_answered_since(asked), "an answer")
-            if published % (MESSAGES // 4) == 0:
+            if published % (MESSAGES // 10) == 0:
                 memory.append(memory_kb(run))
         health = run.wait_for_health(
             lambda health: sum(each[2] for each in health.rejected) >= undecodable, "the counts"
         )
         assert health.handler_errors == 0
-        # LCM retains what it once allocated for a waiting channel, up to 4 MiB: a step in one quarter; a leak is in
-        # each
-        assert min(after - before for before, after in itertools.pairwise(memory)) < 1536
+        # LCM retains what it once allocated for a waiting channel, up to 4 MiB, and the filter's windows fill for
+        # minutes, most on a slow machine: a step in some of the ten parts; a leak is in each
+        assert min(after - before for before, after in itertools.pairwise(memory)) < 600
         assert len(health.rejected) <= 257
         since = time.monotonic()
         run.wait_until(lambda: run.is_answered_since(since), "an answer")
