@@ -28,6 +28,10 @@ they agree with the path from there, or when they have moved as the path for two
 offset, a rotation, a scale and a turn rate shows it to be small, which takes turns, and leaves no more than the noise
 of fixes (`fit_drift`).
 
+A gyro whose bias has changed turns the heading before fixes show it, most at a walk: by b T while b |m| is within their
+noise, over the longest such window. The bound of the heading is never below that angle for b = `gyro_bias_step`
+(`hidden`).
+
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
 gyro, as on a ferry (`Cause.HEADING`).
 
@@ -193,6 +197,15 @@ TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, C
 """Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
 
 
+HIDDEN_SIGMAS: Final = 3.0
+"""Standard deviations of fixes within which they hide a turn by a gyro whose bias has changed."""
+
+HIDDEN_LEVEL: Final = 0.4
+"""Share of the covariance's level, beside that turn: about two standard deviations."""
+
+LARGEST_HIDDEN: Final = 0.5
+"""Largest bound of the heading by both, rad: such a change alone makes no pose with wheels invalid."""
+
 LARGEST_FIX_SIGMA: Final = 0.2
 """Standard deviation of fixes, m, that show an error of the lever arm."""
 
@@ -322,6 +335,7 @@ class ConsistencyMonitor(NamedTuple):
     largest: discrepancy of the fixes since then, m.
     agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
     horizontal_allowance, heading_allowance: what is unexplained, m and rad.
+    hidden: angle by which a gyro whose bias has changed may have turned the heading while fixes do not show it, rad.
     held: bound of the heading before the last fix, rad, at `held_utime` and `held_distance`.
     lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
     suspicion: what was taken for an error of gyro or wheels, and may have been one of the fixes, m.
@@ -353,6 +367,7 @@ class ConsistencyMonitor(NamedTuple):
     agreed_since: int = 0
     horizontal_allowance: float = 0.0
     heading_allowance: float = 0.0
+    hidden: float = 0.0
     held: float = 0.0
     held_utime: int = 0
     held_distance: float = 0.0
@@ -479,7 +494,8 @@ class ConsistencyMonitor(NamedTuple):
                 max(utime - self.held_utime, 0) * 1e-6 / SHRINK_TIME, (self.distance - self.held_distance) / SHRINK_PATH
             )
         )
-        return min(max(level + self.heading_allowance, held), math.pi)
+        hidden = min(self.hidden + HIDDEN_LEVEL * level, LARGEST_HIDDEN) if self.hidden else 0.0
+        return min(max(level + self.heading_allowance, held, hidden), math.pi)
 
     def lose(self, heading: float, distance: float) -> ConsistencyMonitor:
         """Return the monitor after a gap of the IMU, with what the path lost: variance, rad2, and distance, m."""
@@ -521,7 +537,8 @@ class ConsistencyMonitor(NamedTuple):
                 # the fixes are as far off as they seem, and as dead reckoning may be
                 horizontal = abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
                 heading = max(heading, abs(found.turn))
-        for each in self._compare_windows(node, noise, settings):
+        windows = self._compare_windows(node, noise, settings)
+        for each in windows:
             if not each.node.is_measured:
                 # without a measured speed the path follows the fixes, but the heading must not
                 sigmas = 0.0
@@ -573,6 +590,7 @@ class ConsistencyMonitor(NamedTuple):
             compared_distance=node.distance,
             horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
+            hidden=_find_hidden_turn(windows, node, noise, settings),
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:
@@ -874,6 +892,27 @@ def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: F
     return Discrepancy(
         start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma
     )
+
+
+def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
+    """Return the angle by which a gyro whose bias has changed may have turned the heading unseen, rad.
+
+    A change by b = `gyro_bias_step` at the start of a window has turned it by b T, and the path has left the fixes by
+    b |m|. `windows`: the shortest first; only wheels show by their path what fixes have not turned.
+    """
+    hidden = 0.0
+    for each in windows:
+        start = each.node
+        if not (start.is_measured and start.has_gyro and end.has_gyro):
+            break
+        turn = settings.gyro_bias_step * (end.seconds - start.seconds)
+        off = settings.gyro_bias_step * abs(_get_moment(start, end))
+        within = HIDDEN_SIGMAS * math.sqrt(_get_fix_variance(start, end, noise, settings))
+        if off > within:
+            # the moment grows with the square of time
+            return max(hidden, turn * math.sqrt(within / off))
+        hidden = turn
+    return hidden
 
 
 def _compare_course(found: Discrepancy, end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:

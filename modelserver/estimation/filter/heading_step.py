@@ -179,11 +179,13 @@ def is_heading_lost(setup: Setup, state: Aligned) -> bool:
 def lose_heading(state: Aligned) -> Unaligned:
     """Return the state of a vehicle whose heading is lost: from now on N is rotated about up by an unknown angle.
 
-    What else is known is known along the heading as it is, so the covariance is that given an exact one. The pose of a
-    new heading is of a new epoch.
+    In that N the yaw has no error, and the velocity that of the body's: its direction is as uncertain as the heading
+    was, unless it was known along the body. The pose of a new heading is of a new epoch.
     """
     nav = state.nav
-    P = nav.covariance - np.outer(nav.covariance[:, 8], nav.covariance[8]) / nav.covariance[8, 8]
+    T = np.eye(len(nav.covariance))
+    T[3, 8], T[4, 8] = nav.velocity[1], -nav.velocity[0]
+    P = T @ nav.covariance @ T.T
     P[8, :] = P[:, 8] = 0.0
     earth = Earth(state.earth.gravity, (0.0, 0.0, state.earth.rotation[2]))
     return Unaligned(

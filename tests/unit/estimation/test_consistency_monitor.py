@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import pytest
 
-from modelserver.estimation.filter import consistency_monitor
+from modelserver.estimation.filter import consistency_monitor, protection_levels
 from modelserver.estimation.filter.consistency_monitor import (
     AGREEMENT_TIME,
+    LARGEST_HIDDEN,
     LARGEST_REST,
     LONGEST_US,
     Cause,
@@ -181,6 +182,33 @@ def test_given_a_gyro_whose_bias_steps_then_it_is_mostly_found_to_be_the_cause_w
     # straight ahead a drift of the fixes explains as much: then it is assumed
     assert len(changes) >= 4
     assert all(each == pytest.approx(rate, rel=0.7) for each in changes)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_given_a_gyro_whose_bias_steps_then_the_bound_covers_the_turn_until_it_is_found(seed: int) -> None:
+    hidden, num_outside = [], 0
+    for each in drive(120.0, Fault(60.0, rate=0.02 if seed % 2 else -0.02), seed):
+        if each.t < 60.0:
+            hidden.append(each.monitor.hidden)
+            continue
+        if each.found is not None:
+            break
+        level = protection_levels.compute_heading(each.node.heading_variance, SETTINGS)
+        num_outside += 0.02 * (each.t - 60.0) > each.monitor.bound_heading(level, each.node.utime)
+    else:
+        pytest.fail("it was not found")
+    assert num_outside <= 2  # 1 s
+    # at 4 m/s a change is hidden for 8 s: 4 t^2 / 2 * 0.02 is three times 0.9 m then
+    assert 0.1 < max(hidden) < 0.3
+    assert hidden[0] == 0.0
+
+
+def test_given_a_turn_that_may_be_hidden_then_it_alone_makes_no_pose_with_wheels_invalid() -> None:
+    slow = FRESH._replace(hidden=2.0)
+
+    assert slow.bound_heading(0.1, 0) == LARGEST_HIDDEN < 0.6
+    assert slow.bound_heading(0.55, 0) == 0.55
+    assert FRESH.bound_heading(0.1, 0) == 0.1
 
 
 @pytest.mark.parametrize("scale", [0.15, -0.1])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter import fusion, heading_alignment
+from modelserver.estimation.filter import fusion, heading_alignment, heading_step
 from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -153,6 +153,30 @@ def test_given_a_heading_that_is_lost_and_half_a_turn_wrong_then_it_is_found_as_
     assert {row.estimate.pose_epoch for row in found.rows} == {state.common.epoch, state.common.epoch + 1}
     assert all(row.valid and abs(row.heading) < row.estimate.heading_protection_level for row in found.between(25.0))
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.rows if row.valid)
+
+
+@pytest.mark.parametrize("is_along_body", [True, False])
+def test_given_a_heading_that_is_lost_then_only_a_velocity_along_the_body_stays_known(is_along_body):
+    localizer = drive(simulation(EIGHT, gps_model=PLAIN_GPS), 12.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    x, y, _ = state.nav.velocity
+    P = 1e-6 * np.eye(len(state.nav.covariance))
+    turned = np.zeros(len(P))
+    turned[8] = 1.0
+    if is_along_body:
+        turned[3:5] = -y, x
+    P += np.outer(turned, turned)
+
+    lost = heading_step.lose_heading(state._replace(nav=state.nav._replace(covariance=P)))
+
+    after = lost.nav.covariance
+    across = np.array((-y, x)) / math.hypot(x, y)
+    sigma = math.sqrt(across @ after[3:5, 3:5] @ across)
+    assert sigma == pytest.approx((1e-3 if is_along_body else 1.0) * math.hypot(x, y), rel=0.1)
+    assert not after[8].any()
+    assert np.linalg.eigvalsh(after).min() > -1e-12
+    assert (lost.earth.rotation[:2], lost.site) == ((0.0, 0.0), state.site)
 
 
 def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_covers_the_turn_meanwhile():
