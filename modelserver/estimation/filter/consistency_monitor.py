@@ -204,7 +204,7 @@ HIDDEN_LEVEL: Final = 0.4
 """Share of the covariance's level, beside that turn: about two standard deviations."""
 
 LARGEST_HIDDEN: Final = 0.5
-"""Largest bound of the heading by both, rad: such a change alone makes no pose with wheels invalid."""
+"""Largest bound of the heading by both, rad: within the usual limit of a vehicle with wheels."""
 
 LARGEST_FIX_SIGMA: Final = 0.2
 """Standard deviation of fixes, m, that show an error of the lever arm."""
