@@ -192,6 +192,10 @@ class Earth(NamedTuple):
         """Return the values of a place where N is east, north, up."""
         return cls(earth_model.gravity(latitude_deg, height), earth_model.earth_rate(latitude_deg))
 
+    def without_heading(self) -> Earth:
+        """Return the values where N is rotated about up by an unknown angle: what is horizontal has no direction."""
+        return Earth(self.gravity, (0.0, 0.0, self.rotation[2]))
+
 
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise: (rad/s)2/Hz, (m/s2)2/Hz, and of the random walks of the biases.

@@ -127,9 +127,7 @@ def _fuse_unaligned(
     if site is None:
         height = 0.0 if math.isnan(fix.height) else fix.height
         site = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, height)
-        found = Earth.at(fix.latitude_deg, height)
-        # before the heading is known the horizontal part of the earth rate has no direction
-        earth = Earth(found.gravity, (0.0, 0.0, found.rotation[2]))
+        earth = Earth.at(fix.latitude_deg, height).without_heading()
     newest = _compare_with_path(setup, state, site, fix, sample.fix_type)
     # a smooth drive at a walk shows in the fixes of some seconds only
     since = newest.utime - MOTION_SPAN_US

@@ -187,7 +187,6 @@ def lose_heading(state: Aligned) -> Unaligned:
     T[3, 8], T[4, 8] = nav.velocity[1], -nav.velocity[0]
     P = T @ nav.covariance @ T.T
     P[8, :] = P[:, 8] = 0.0
-    earth = Earth(state.earth.gravity, (0.0, 0.0, state.earth.rotation[2]))
     return Unaligned(
         nav._replace(covariance=P),
         state.imu,
@@ -195,7 +194,7 @@ def lose_heading(state: Aligned) -> Unaligned:
         HeadingAlignment(last_fix=state.gnss.last_fix),
         state.constraints,
         state.common._replace(epoch=state.common.epoch + 1),
-        earth,
+        state.earth.without_heading(),
         state.site,
     )
 

@@ -54,8 +54,8 @@ CHANGED_SIGMAS: Final = 5.0
 CHANGED_TIME: Final = 2.0
 """Seconds of that mean, at least."""
 
-VAGUE_SPEED: Final = 0.3
-VAGUE_REST_TIME: Final = 5.0
+REST_SPEED_SIGMA: Final = 0.3
+LONG_REST_TIME: Final = 5.0
 """Sigma of the speed, m/s, beyond which only seconds of a quiet IMU show a rest: braking may be as smooth."""
 
 UNNOTICED_TIME: Final = 10.0
@@ -283,6 +283,6 @@ def _may_be_stationary(setup: Setup, state: Navigating, utime: int) -> bool:
         # the speed is unknown: a quiet IMU and fixes that stay in place are all there is
         fix = state.alignment.last_fix
         return fix is not None and (utime - fix.utime) * 1e-6 < MOVING_TIME
-    if sigma > VAGUE_SPEED and state.stationary.get_quiet_time(utime) < VAGUE_REST_TIME:
+    if sigma > REST_SPEED_SIGMA and state.stationary.get_quiet_time(utime) < LONG_REST_TIME:
         return False
     return speed - 2.0 * sigma < settings.stationary_speed and speed < 0.5
