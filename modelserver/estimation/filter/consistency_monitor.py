@@ -33,7 +33,8 @@ noise, over the longest such window. The bound of the heading is never below tha
 (`hidden`).
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
-gyro, as on a ferry (`Cause.HEADING`).
+gyro, as on a ferry (`Cause.HEADING`). It is trusted again when it agrees with the gyro of before (`find_turn`), while
+that is known well enough to contradict it.
 
 Limits: a drift slower than the path is known (2 % of the speed with wheels, for minutes) is found in turns only.
 """
@@ -138,6 +139,9 @@ KNOWN_AGAIN: Final = 2.0
 """Standard deviation of dead reckoning, relative to that of a fix, up to which fixes continue to agree; it is less than
 1 when they begin to."""
 
+KNOWN_HEADING: Final = 0.1
+"""Standard deviation of the gyro's heading, rad, with which a heading must agree to be trusted again, at most."""
+
 NEW_TRUST_TIME: Final = 120.0
 NEW_TRUST_DISTANCE: Final = 20.0
 """Seconds, and meters, for which fixes must move as dead reckoning does to be trusted again wherever they are."""
@@ -237,6 +241,7 @@ class PathNode(NamedTuple):
     heading_variance, rate_variance, scale_variance: of the heading (rad2), and of those.
     has_gyro, is_measured: whether a gyro measures the turns, and wheels the path too.
     own_heading: by the gyro alone, along the path's axes, rad.
+    bias_turn: integral of `rate_bias` since the start of the path, rad.
     latency, latency_variance: of fixes, s and s2; `shows_latency`: whether fixes separate it from the heading.
     lost: variance of the heading that was lost in gaps of the IMU since the start of the path, rad2.
     unmeasured: the part of `distance` whose length nothing measured, m.
@@ -262,6 +267,7 @@ class PathNode(NamedTuple):
     has_gyro: bool
     is_measured: bool
     own_heading: float
+    bias_turn: float
     latency: float
     latency_variance: float
     shows_latency: bool
@@ -323,7 +329,7 @@ class ConsistencyMonitor(NamedTuple):
     utime: of the anchor; 0: the path has not begun.
     anchor: the antenna by the state at the last fix and after what corrected it since, along N, m.
     begin: start of the path.
-    path, moment, rotation, distance, lost, unmeasured: as in `PathNode`.
+    path, moment, rotation, distance, lost, unmeasured, bias_turn: as in `PathNode`.
     older, newest: the nodes, the oldest first.
     num_exceeded: fixes in a row beyond the threshold.
     compared_utime, compared_distance: of the last fix within it, and `distance` then.
@@ -350,6 +356,7 @@ class ConsistencyMonitor(NamedTuple):
     distance: float = 0.0
     lost: float = 0.0
     unmeasured: float = 0.0
+    bias_turn: float = 0.0
     older: tuple[PathNode, ...] = ()
     newest: tuple[PathNode, ...] = ()
     num_exceeded: int = 0
@@ -407,10 +414,10 @@ class ConsistencyMonitor(NamedTuple):
             agreed_since=0,
         )
 
-    def extend(self, utime: int, antenna: complex, *, is_measured: bool) -> ConsistencyMonitor:
+    def extend(self, utime: int, antenna: complex, rate_bias: float, *, is_measured: bool) -> ConsistencyMonitor:
         """Return the monitor with the path continued to the antenna by the state (along N, m) before a fix.
 
-        `is_measured`: whether wheels measure the speed.
+        `rate_bias`: of the yaw gyro, rad/s; `is_measured`: whether wheels measure the speed.
         """
         gap = (utime - self.utime) * 1e-6
         if not self.utime or (gap > MAX_GAP and self.suspect is None):
@@ -434,6 +441,7 @@ class ConsistencyMonitor(NamedTuple):
             moment=self.moment + seconds * step,
             distance=self.distance + abs(step),
             unmeasured=self.unmeasured + (0.0 if is_measured else abs(step)),
+            bias_turn=self.bias_turn + rate_bias * gap,
         )
 
     def restart(self) -> ConsistencyMonitor:
@@ -531,8 +539,10 @@ class ConsistencyMonitor(NamedTuple):
         suspect = None if self.is_jump else self.suspect
         if suspect is not None:
             # the state has followed all of it, or the path has gone wrong by it
-            heading = abs(wrap_angle(self.rotation - suspect.rotation))
-            if self.cause is not Cause.HEADING:
+            if self.cause is Cause.HEADING:
+                heading = abs(find_turn(suspect, node))
+            else:
+                heading = abs(wrap_angle(self.rotation - suspect.rotation))
                 found = compare_window(suspect, node, noise, settings)
                 # the fixes are as far off as they seem, and as dead reckoning may be
                 horizontal = abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
@@ -609,11 +619,12 @@ class ConsistencyMonitor(NamedTuple):
     ) -> tuple[ConsistencyMonitor, bool]:
         """Return the monitor after a fix that is not trusted, and whether fixes agree with dead reckoning again."""
         assert self.suspect is not None
-        is_known = False
+        is_known = is_vague = False
         if self.cause is Cause.HEADING:
-            size = abs(wrap_angle(self.rotation - self.suspect.rotation))
+            size = abs(find_turn(self.suspect, node))
             sigma = get_turn_sigma(self.suspect, node, noise)
             sigmas = size / sigma
+            is_vague = sigma > KNOWN_HEADING
         else:
             found = compare_window(self.suspect, node, noise, settings)
             size, sigma, sigmas = abs(found.error), found.sigma, found.sigmas
@@ -621,7 +632,7 @@ class ConsistencyMonitor(NamedTuple):
             is_known = compute_longest_axis(*found.covariance) < known**2 * (node.white**2 + node.correlated**2)
         largest = max(self.largest, size)
         # where dead reckoning has become so uncertain that it would not contradict them any more, that is no agreement
-        agrees = sigmas <= AGREEMENT and (is_known or largest > THRESHOLD * sigma)
+        agrees = sigmas <= AGREEMENT and not is_vague and (is_known or largest > THRESHOLD * sigma)
         since = (self.agreed_since or node.utime) if agrees else 0
         needed = JUMP_AGREEMENT_TIME if self.is_jump else AGREEMENT_TIME
         return self._replace(agreed_since=since, largest=largest), agrees and (node.utime - since) * 1e-6 >= needed
@@ -688,11 +699,20 @@ class ConsistencyMonitor(NamedTuple):
             return None
 
         def count_sigmas(each: PathNode) -> float:
-            return abs(wrap_angle(self.rotation - each.rotation)) / get_turn_sigma(each, node, noise)
+            return abs(find_turn(each, node)) / get_turn_sigma(each, node, noise)
 
         worst = max(nodes, key=count_sigmas)
-        change = wrap_angle(self.rotation - worst.rotation)
+        change = find_turn(worst, node)
         return Inconsistency(Cause.HEADING, compare_window(worst, node, noise, settings), change)
+
+
+def find_turn(start: PathNode, end: PathNode) -> float:
+    """Return by which fixes have turned the heading between two nodes, rad.
+
+    That is beside a gyro with the bias of the start: a state that follows the fixes changes the bias too.
+    """
+    bias = end.bias_turn - start.bias_turn - start.rate_bias * (end.seconds - start.seconds)
+    return wrap_angle(end.rotation - start.rotation - bias)
 
 
 def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:

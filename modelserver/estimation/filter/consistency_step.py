@@ -20,6 +20,7 @@ from modelserver.estimation.filter.consistency_monitor import (
     Inconsistency,
     PathNode,
     PathNoise,
+    find_turn,
     fit_drift,
 )
 from modelserver.estimation.filter.error_layout import ErrorLayout
@@ -76,6 +77,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
         has_gyro,
         has_gyro and state.common.measures_wheel_speed(nav.utime),
         wrap_angle(nav.yaw - monitor.rotation),
+        monitor.bias_turn,
         nav.extras[layout.extra_index(LATENCY)],
         float(P[layout.index(LATENCY), layout.index(LATENCY)]),
         is_separate(P, layout.index(LATENCY)),
@@ -98,7 +100,7 @@ def compare_path(
     if not math.isfinite(P[0, 0] + P[8, 8] + P[11, 11]):
         return state, ()  # it has diverged
     is_measured = state.common.measures_wheel_speed(newest.utime)
-    monitor = state.consistency.extend(newest.utime, newest.path, is_measured=is_measured)
+    monitor = state.consistency.extend(newest.utime, newest.path, state.nav.gyro_bias[2], is_measured=is_measured)
     is_gap = setup.uses_imu(state.common.mode) and newest.utime - state.imu.used_utime > 1e6 * settings.rate_hold
     if is_gap or not is_compared:
         return state._replace(consistency=monitor), ()
@@ -113,7 +115,7 @@ def compare_path(
         monitor, agrees = monitor.check_trust(node, noise, settings)
         state = state._replace(consistency=monitor)
         if agrees:
-            return _trust(setup, state, newest)
+            return _trust(setup, state, newest, node)
         alike = monitor.select_moved_alike(node)
         if monitor.cause is Cause.HEADING:
             if state.gnss.num_rejected:
@@ -149,20 +151,22 @@ def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 
-def _trust(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
+def _trust(setup: Setup, state: Aligned, newest: PathFix, node: PathNode) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after fixes that agree with dead reckoning since the suspect node again."""
     monitor = state.consistency
     assert monitor.suspect is not None
     text = "fixes are trusted again: they agree with dead reckoning"
+    turned = monitor.rotation - monitor.suspect.rotation
     if monitor.cause is Cause.HEADING:
         text = "the vehicle moves along its own axis again"
+        turned = find_turn(monitor.suspect, node)
     if monitor.excludes_fixes:
         after = state._replace(consistency=monitor.trust(), gnss=state.gnss.restart(newest.utime))
         return after, (report_event(after, KIND, Verdict.USED, text),)
     after = state._replace(consistency=hold_heading(setup, state, state.nav).trust())
     # the fixes have turned the state since
     P = state.nav.covariance.copy()
-    P[8, 8] += (monitor.rotation - monitor.suspect.rotation) ** 2
+    P[8, 8] += turned**2
     after = _start_epoch(setup, after._replace(nav=state.nav._replace(covariance=P)), newest)
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 

@@ -86,8 +86,8 @@ def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Una
     fixes = heading_alignment.select_known_speed(segment) if is_known else segment
     fit = heading_alignment.fit_path(fixes, settings, is_unit_path=not is_known, rate_sigma=rate_sigma)
     if fit is not None and is_known and not state.common.measures_wheel_speed(nav.utime):
-        # a path by accelerations goes wrong with its speed
-        speed = fit.distance / fit.seconds
+        # a path by accelerations goes wrong with its speed: how fast it moved, fixes know
+        speed = fit.distance * fit.factor / fit.seconds
         speed_sigma = math.sqrt(max(nav.covariance[3, 3], nav.covariance[4, 4]))
         rotation = fit.rotation._replace(sigma=math.hypot(fit.rotation.sigma, 0.5 * speed_sigma / speed))
         fit = fit._replace(rotation=rotation)

@@ -90,7 +90,7 @@ def drive(
         arm = fault.lever_arm * cmath.rect(1.0, yaw) if is_wrong else 0j
         fix = truth + arm + wander + white + shift - late + (fault.jump if is_wrong else 0j)
         utime = 1_000_000 + round(t * 1e6)
-        monitor = monitor.extend(utime, antenna, is_measured=is_measured)
+        monitor = monitor.extend(utime, antenna, 0.0, is_measured=is_measured)
         node = PathNode(
             utime=utime,
             fix=fix,
@@ -110,6 +110,7 @@ def drive(
             has_gyro=True,
             is_measured=is_measured,
             own_heading=yaw + error,
+            bias_turn=monitor.bias_turn,
             latency=0.0,
             latency_variance=0.02**2,
             shows_latency=fault.shows_latency,
@@ -277,7 +278,7 @@ def test_given_a_first_path_then_its_heading_is_confirmed_by_the_next_meters() -
     precise = ConsistencyMonitor().start_heading(0.02, 4.0, is_measured=False)
     assert precise.heading_allowance < math.radians(2.0)
     # at rest nothing confirms it
-    assert first.extend(1_000_000, 0j, is_measured=True).heading_allowance == first.heading_allowance
+    assert first.extend(1_000_000, 0j, 0.0, is_measured=True).heading_allowance == first.heading_allowance
     driven = list(drive(60.0, Fault(), start=first))
     assert driven[1].monitor.heading_allowance > 0.9 * first.heading_allowance
     assert driven[-1].monitor.heading_allowance < 0.1
@@ -388,6 +389,26 @@ def test_given_a_path_that_becomes_vague_while_fixes_agree_then_they_are_trusted
     assert not trusts(4.0, 207.0)
 
 
+@pytest.mark.parametrize(
+    ("bias", "rate_sigma", "is_trusted"), [(0.0, 0.0003, True), (0.004, 0.0003, False), (0.0, 0.004, False)]
+)
+def test_given_a_heading_that_fixes_have_turned_then_it_is_trusted_where_the_gyro_of_before_agrees(
+    bias: float, rate_sigma: float, is_trusted: bool
+) -> None:
+    # the heading has come back to what the gyro with its present bias has; with that of before it is 14 deg off
+    start = next(iter(drive(1.0, Fault()))).node._replace(rate_variance=rate_sigma**2)
+    monitor = FRESH._replace(cause=Cause.HEADING, suspect=start, largest=1.2)
+    agrees = False
+    for n in range(31):
+        t = 30.0 + n
+        end = start._replace(
+            utime=start.utime + round(t * 1e6), seconds=start.seconds + t, bias_turn=bias * t, rate_bias=bias
+        )
+        monitor, agrees = monitor.check_trust(end, NOISE, SETTINGS)
+    assert abs(consistency_monitor.find_turn(start, end)) == pytest.approx(60.0 * bias)
+    assert agrees == is_trusted
+
+
 def test_given_one_outlier_then_nothing_is_found() -> None:
     fault = Fault(200.0, 200.9, jump=25.0)
     assert all(each.found is None for each in drive(260.0, fault))
@@ -424,8 +445,12 @@ def test_given_hours_of_driving_then_the_nodes_are_few_and_none_is_too_old() -> 
 
 
 def test_given_a_correction_by_a_fix_then_the_path_does_not_move() -> None:
-    monitor = ConsistencyMonitor().extend(1_000_000, 0j, is_measured=True).extend(2_000_000, 3 + 0j, is_measured=True)
-    moved = monitor.correct(5 - 2j, 0.5).extend(3_000_000, 8 - 2j + cmath.rect(2.0, 0.5), is_measured=True)
+    monitor = (
+        ConsistencyMonitor()
+        .extend(1_000_000, 0j, 0.0, is_measured=True)
+        .extend(2_000_000, 3 + 0j, 0.0, is_measured=True)
+    )
+    moved = monitor.correct(5 - 2j, 0.5).extend(3_000_000, 8 - 2j + cmath.rect(2.0, 0.5), 0.0, is_measured=True)
     assert moved.path == pytest.approx(3 + 2 + 0j)
     assert moved.distance == pytest.approx(5.0)
 
@@ -433,9 +458,9 @@ def test_given_a_correction_by_a_fix_then_the_path_does_not_move() -> None:
 def test_given_a_gap_in_the_fixes_then_the_path_begins_again() -> None:
     monitor = (
         ConsistencyMonitor()
-        .extend(1_000_000, 0j, is_measured=True)
-        .extend(2_000_000, 3 + 0j, is_measured=True)
-        .extend(9_000_000, 50 + 0j, is_measured=True)
+        .extend(1_000_000, 0j, 0.0, is_measured=True)
+        .extend(2_000_000, 3 + 0j, 0.0, is_measured=True)
+        .extend(9_000_000, 50 + 0j, 0.0, is_measured=True)
     )
     assert monitor.begin == 9_000_000
     assert monitor.path == 0j
