@@ -66,7 +66,8 @@ COURSE_SIGMA: Final = 0.05
 """
 
 LARGEST_SPEED_SIGMA: Final = 0.15
-"""Sigma of the speed, as a share of it, beyond which a start by accelerations alone needs the direction confirmed."""
+"""Sigma of the speed, or its distance from that of the fixes, as a share of that, beyond which a start by accelerations
+alone needs the direction confirmed."""
 
 MOVING_SPEED: Final = 0.5
 """Speed of the state, m/s, beyond its uncertainty, that shows that a velocity of 0 is none."""
@@ -91,7 +92,9 @@ def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Una
         speed_sigma = math.sqrt(max(nav.covariance[3, 3], nav.covariance[4, 4]))
         rotation = fit.rotation._replace(sigma=math.hypot(fit.rotation.sigma, 0.5 * speed_sigma / speed))
         fit = fit._replace(rotation=rotation)
-        if speed_sigma > LARGEST_SPEED_SIGMA * speed and _compare_accelerations(setup, state, rotation.angle) <= 0:
+        off = abs(speed - fit.distance / fit.seconds)
+        is_vague = max(speed_sigma, off) > LARGEST_SPEED_SIGMA * speed
+        if is_vague and _compare_accelerations(setup, state, rotation.angle) <= 0:
             return state, None
     if fit is None or fit.rotation.sigma > settings.align_sigma:
         return state, None

@@ -389,17 +389,19 @@ def test_given_an_unknown_speed_then_the_path_at_speed_1_gives_speed_and_heading
     assert fit.factor == pytest.approx(2.0, abs=0.02)
 
 
-@pytest.mark.parametrize(("speed_sigma", "is_found"), [(0.2, True), (0.4, False)])
+@pytest.mark.parametrize(
+    ("factor", "speed_sigma", "is_found"), [(1.0, 0.2, True), (1.1, 0.32, False), (1.5, 0.2, False), (0.7, 0.2, False)]
+)
 def test_given_a_speed_that_the_state_has_made_up_then_it_does_not_vouch_for_the_direction_of_travel(
-    speed_sigma, is_found
+    factor, speed_sigma, is_found
 ):
-    # half as much again as the fixes move: 0.4 m/s are a seventh of that, and a fifth of what the fixes show
-    *fixes, newest = (each._replace(path=1.5 * each.path) for each in create_segment(1.0))
+    # the fixes move at 2 m/s, and nothing accelerates: a speed beside that, or a vague one, may have either sign
+    *fixes, newest = (each._replace(path=factor * each.path) for each in create_segment(1.0))
     state = leveling.start_level(SETUP, Leveling(), newest.utime)
     P = state.nav.covariance.copy()
     P[3, 3] = P[4, 4] = speed_sigma**2
     state = state._replace(
-        nav=state.nav._replace(velocity=(3.0, 0.0, 0.0), covariance=P),
+        nav=state.nav._replace(velocity=(2.0 * factor, 0.0, 0.0), covariance=P),
         alignment=state.alignment._replace(fixes=tuple(fixes)),
     )
     _, fit = heading_step.align_by_fixes(SETUP, state, newest)
