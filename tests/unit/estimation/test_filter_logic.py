@@ -392,9 +392,7 @@ def test_given_an_unknown_speed_then_the_path_at_speed_1_gives_speed_and_heading
 @pytest.mark.parametrize(
     ("factor", "speed_sigma", "is_found"), [(1.0, 0.2, True), (1.1, 0.32, False), (1.5, 0.2, False), (0.7, 0.2, False)]
 )
-def test_given_a_speed_that_the_state_has_made_up_then_it_does_not_vouch_for_the_direction_of_travel(
-    factor, speed_sigma, is_found
-):
+def test_given_a_speed_that_the_state_has_made_up_then_it_shows_no_direction_of_travel(factor, speed_sigma, is_found):
     # the fixes move at 2 m/s, and nothing accelerates: a speed beside that, or a vague one, may have either sign
     *fixes, newest = (each._replace(path=factor * each.path) for each in create_segment(1.0))
     state = leveling.start_level(SETUP, Leveling(), newest.utime)
