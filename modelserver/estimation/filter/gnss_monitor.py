@@ -9,7 +9,9 @@ Drift. The NIS of a fix should be its degrees of freedom on average. `noise_infl
 and multiplies the process noise of the time-correlated error (adaptive estimation: Groves 2013, 3.4.4).
 
 Outliers. One outlier just within the gate moves the position by at most the gain times the gate's radius; that is the
-`outlier_allowance`, added to the horizontal protection level. It decreases as newer fixes correct the outlier.
+`outlier_allowance`, added to the horizontal protection level. It decreases as newer fixes correct the outlier. Without
+a measured speed it is also the distance of fixes that are rejected again and again: a ferry leaves as smoothly as a
+vehicle stays.
 
 Output offset. The published pose is the position that the receiver would report, because way points are surveyed with
 it: the estimate plus the time-correlated error, followed at no more than `position_slew_rate`.
@@ -42,6 +44,9 @@ CONFLICT_TIME: Final = 20.0
 
 MOVING_TIME: Final = 3.0
 """Seconds of fixes that show whether the vehicle moves, if wheels do not."""
+
+OUTLIERS: Final = 3
+"""Fixes rejected in a row that accelerations alone do not contradict: the bound covers both."""
 
 MAX_CONFIRMED: Final = 1000
 
@@ -112,7 +117,8 @@ class GnssMonitor(NamedTuple):
     num_rejected: how many.
     noise_inflation: factor of the process noise of the time-correlated error, at least 1.
     offset: of the published position.
-    outlier_allowance: what one outlier within the gate may have moved the position by, m.
+    outlier_allowance: what one outlier within the gate may have moved the position by, or the distance of fixes that
+        nothing but accelerations contradicts, m.
     conflict_utime: when a fix from beyond its gate was last used.
     """
 
@@ -137,9 +143,13 @@ class GnssMonitor(NamedTuple):
             num_rejected=0,
         )
 
-    def reject(self, utime: int, fix: PathFix, settings: FilterSettings) -> GnssMonitor:
-        """Return the monitor after a rejected fix."""
+    def reject(self, utime: int, fix: PathFix, settings: FilterSettings, *, is_speed_measured: bool) -> GnssMonitor:
+        """Return the monitor after a rejected fix; `is_speed_measured`: whether wheels measure the path beside it."""
+        allowance = self.outlier_allowance
+        if not is_speed_measured and self.num_rejected + 1 >= OUTLIERS:
+            allowance = max(allowance, abs(fix.position - fix.path))
         return self._replace(
+            outlier_allowance=allowance,
             rejected=heading_alignment.append_fix(self.rejected, fix, 2.0 * settings.recovery_time),
             rejected_since=self.rejected_since or utime,
             num_rejected=self.num_rejected + 1,

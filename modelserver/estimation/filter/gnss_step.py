@@ -308,14 +308,12 @@ def _gate_fix(
     if decision.verdict is Verdict.MONITORED:
         decision = decision._replace(verdict=Verdict.REJECTED, reason="gate")
     since = (newest.utime - gnss.rejected[-1].utime) * 1e-6 if gnss.rejected else 0.0
+    is_measured = state.common.measures_wheel_speed(nav.utime)
     nav = latency_estimator.inflate_latency(
-        nav,
-        innovation.residual.tolist(),
-        min(since, 2.0),
-        setup.layout,
-        is_speed_measured=state.common.measures_wheel_speed(nav.utime),
+        nav, innovation.residual.tolist(), min(since, 2.0), setup.layout, is_speed_measured=is_measured
     )
-    state = state._replace(nav=nav, gnss=gnss.reject(utime, newest, settings))
+    gnss = gnss.reject(utime, newest, settings, is_speed_measured=is_measured)
+    state = state._replace(nav=nav, gnss=gnss)
     pending = state.common.pending
     is_due = state.consistency.may_reset and not any(each.resets_position for each in pending)
     if is_due and state.gnss.fit_rejected(nav, settings) is not None:

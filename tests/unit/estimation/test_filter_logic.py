@@ -22,6 +22,7 @@ from modelserver.estimation.filter import (
 )
 from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, level_attitude
+from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation
 from modelserver.estimation.filter.latency_estimator import LatencyFit
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -429,6 +430,19 @@ def test_given_a_long_segment_then_it_is_thinned_and_cut():
     assert fixes[-1].utime == T0 + 499 * 100_000
     assert fixes[0].utime < T0 + 20_000_000
     assert heading_alignment.append_fix(fixes, newest._replace(utime=T0 + 90_000_000), 60.0)[0].utime >= T0 + 30_000_000
+
+
+@pytest.mark.parametrize(("is_measured", "allowances"), [(True, [0.0] * 5), (False, [0.0, 0.0, 6.0, 8.0, 8.0])])
+def test_given_fixes_that_are_rejected_again_and_again_then_the_bound_covers_them_unless_wheels_contradict(
+    is_measured, allowances
+):
+    monitor, found = GnssMonitor(), []
+    fix = create_segment(0.0)[0]
+    for n, distance in enumerate((2.0, 4.0, 6.0, 8.0, 7.0)):
+        away = fix._replace(utime=T0 + n * 500_000, position=fix.path + distance * 1j)
+        monitor = monitor.reject(away.utime, away, SETTINGS, is_speed_measured=is_measured)
+        found.append(monitor.outlier_allowance)
+    assert found == pytest.approx(allowances)
 
 
 # --- initialization in the world ----------------------------------------------------------------------------
