@@ -25,6 +25,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.estimation.filter import heading_alignment
+from modelserver.estimation.filter.consistency_monitor import CONFIRMATIONS
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.heading_alignment import PathFit, PathFix
@@ -44,9 +45,6 @@ CONFLICT_TIME: Final = 20.0
 
 MOVING_TIME: Final = 3.0
 """Seconds of fixes that show whether the vehicle moves, if wheels do not."""
-
-OUTLIERS: Final = 3
-"""Fixes rejected in a row that accelerations alone do not contradict: the bound covers both."""
 
 MAX_CONFIRMED: Final = 1000
 
@@ -146,7 +144,8 @@ class GnssMonitor(NamedTuple):
     def reject(self, utime: int, fix: PathFix, settings: FilterSettings, *, is_speed_measured: bool) -> GnssMonitor:
         """Return the monitor after a rejected fix; `is_speed_measured`: whether wheels measure the path beside it."""
         allowance = self.outlier_allowance
-        if not is_speed_measured and self.num_rejected + 1 >= OUTLIERS:
+        if not is_speed_measured and self.num_rejected + 1 >= CONFIRMATIONS:
+            # they are no outliers, and accelerations alone do not contradict them: the bound covers both
             allowance = max(allowance, abs(fix.position - fix.path))
         return self._replace(
             outlier_allowance=allowance,
