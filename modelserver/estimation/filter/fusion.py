@@ -46,10 +46,6 @@ HELD_RATE: Final = 0.01
 """Sigma of the speed (m/s), the tilt and the turn (rad) and the gyro's bias (rad/s) after a mistaken rest of seconds: a
 tilt explains a speed that did not change."""
 
-LOST_TURN: Final = 0.3
-LOST_RATE: Final = 0.01
-"""Sigma of the turn (rad) and of the gyro's bias (rad/s) after an outage in which wheels were stuck."""
-
 ZUPT_PERIOD: Final = 0.2
 """Seconds between two zero-velocity updates."""
 
@@ -219,8 +215,13 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
     nav = latency_estimator.hold_latency(before, state.nav, setup.layout)
     if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
-        # by a speed that nothing measures the constraint would change the bias for good
+        # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would change
+        # the bias for good, and make bias and heading known that are not
         nav = nav.change(11, before.gyro_bias[2] - nav.gyro_bias[2])
+        P = nav.covariance.copy()
+        for axis in (8, 11):
+            P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
+        nav = nav._replace(covariance=P)
     state = state._replace(nav=nav)
     if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):
         # the constraint turns the heading to the course of the fixes
@@ -255,20 +256,6 @@ def release_motion(state: N) -> N:
         P[axis, axis] += sigma * sigma
     if state.is_stationary:
         P[11, 11] += HELD_RATE * HELD_RATE  # ZARU
-    return state._replace(nav=state.nav._replace(covariance=P))
-
-
-def release_heading(state: N) -> N:
-    """Return the state with the uncertainty of a heading after an outage in which wheels were stuck.
-
-    The non-holonomic constraint shows heading and gyro bias by the speed. One that nothing measured may have been
-    wrong by more than its uncertainty, and so are they then, and stay so.
-    """
-    P = state.nav.covariance.copy()
-    for axis, sigma in ((8, LOST_TURN), (11, LOST_RATE)):
-        variance = P[axis, axis] + sigma * sigma
-        P[axis, :] = P[:, axis] = 0.0
-        P[axis, axis] = variance
     return state._replace(nav=state.nav._replace(covariance=P))
 
 

@@ -33,7 +33,6 @@ from modelserver.estimation.filter.fusion import (
     create_context,
     fuse_measurement,
     reject,
-    release_heading,
     report_reset,
     uses_gnss,
 )
@@ -179,8 +178,6 @@ def _fuse_aligned(
         state, decisions = _check_heading(setup, state, newest)
         if decisions:
             return state, decisions
-    if is_used and since > 1e-6 * propagation.OUTAGE_US and state.common.wheels.is_suspect:
-        state = release_heading(state)
     if is_used and heading_step.is_heading_lost(setup, state):
         lost, decisions = _fuse_unaligned(setup, heading_step.lose_heading(state), item, sample, fix, is_used)
         return lost, (report_reset(item, "the heading is lost"), *decisions)
