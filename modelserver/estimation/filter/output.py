@@ -28,6 +28,11 @@ from modelserver.transforms.so3 import Array, Quaternion, Vector3
 CONVERGENCE_CELL: Final = 200.0
 """Meters within which one meridian convergence is used: it changes by 3e-5 rad times tan(latitude)."""
 
+HEADING_LIMIT: Final = 0.6
+HEADING_LIMIT_WITHOUT_WHEELS: Final = 0.35
+"""Heading protection level of a valid pose at most, rad, if the settings have none: while wheels
+measure the speed, and while they do not."""
+
 FIRST_ORDER_LAG: Final = 0.15
 """Seconds over which the covariance of a pose is propagated to first order."""
 
@@ -79,7 +84,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
     horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
     heading = monitor.bound_heading(heading, utime)
-    if heading > setup.heading_limit:
+    if heading > _get_heading_limit(setup, state):
         invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, PROTECTION_LEVEL_EXCEEDED
     if horizontal > _get_horizontal_limit(setup, state):
         invalid |= 256  # PROTECTION_LEVEL_EXCEEDED
@@ -155,6 +160,14 @@ def _base_buffer(n: int) -> eskf.MatrixBuffer:
     places = [(0, 3), (1, 4), (2, 5), (0, 7), (0, 8), (1, 6), (1, 8), (2, 6), (2, 7)]
     places += [(3 + r, 9 + c) for r in range(3) for c in range(3)]
     return eskf.MatrixBuffer(J, places)
+
+
+def _get_heading_limit(setup: Setup, state: Aligned) -> float:
+    """Return the heading protection level of the least valid pose, rad: configured, or by whether wheels measure."""
+    limit = setup.settings.heading_limit
+    if limit is not None:
+        return limit
+    return HEADING_LIMIT if state.common.measures_wheel_speed(state.nav.utime) else HEADING_LIMIT_WITHOUT_WHEELS
 
 
 def _get_horizontal_limit(setup: Setup, state: Aligned) -> float:

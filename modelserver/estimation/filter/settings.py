@@ -213,8 +213,8 @@ class FilterSettings(FixSettings):
     """Horizontal protection level beyond which a pose is not valid, meters. If not given it is by the receiver's class:
     10 m with carrier corrections, 20 m with code corrections, 36 m without."""
     heading_limit: float | None = None
-    """Heading protection level beyond which a pose is not valid, radians. If not given 0.6; without wheels 0.35, since
-    nothing measures then that the vehicle moves along its own axis, as the heading by fixes assumes."""
+    """Heading protection level beyond which a pose is not valid, radians. If not given 0.6; while no wheels measure the
+    speed 0.35, since nothing shows then that the vehicle moves along its own axis, as the heading by fixes assumes."""
     maximum_tilt: float = 1.05
     """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
     maximum_speed: float = 60.0

@@ -24,10 +24,6 @@ STATIONARY_ANGLE_WALK: Final = 1e-5
 TILT_WALK: Final = 0.05
 """Random walk of roll and pitch without gyros, rad/sqrt(s): 5 deg in 3 s on rough ground."""
 
-HEADING_LIMIT: Final = 0.6
-HEADING_LIMIT_WITHOUT_WHEELS: Final = 0.35
-"""Heading protection level of a valid pose at most, rad, if the settings have none."""
-
 NO_TYPES: Final[Mapping[str, str]] = MappingProxyType({})
 
 
@@ -37,8 +33,7 @@ class Setup:
     `measurements` has the measurements of each type of sample, in the order in which those of one sample are fused. The
     layout holds the error states that they need. `has_imu` is whether the vehicle has an IMU. `findings` has, by mode,
     the configured sensors that cannot be used. `own` has the sources of measurements of installed packages with their
-    types. `horizon_us` is the horizon in microseconds, `heading_limit` the heading protection level (rad) of a valid
-    pose at most. The process noises: `driving` on the IMU, `stationary`,
+    types. `horizon_us` is the horizon in microseconds. The process noises: `driving` on the IMU, `stationary`,
     `coasting` without any measurement of the motion, `interpolated` on made-up IMU samples, `rolling` on wheels alone,
     `turning` on a gyro of the turn rate alone.
     """
@@ -64,9 +59,6 @@ class Setup:
         present = [each for each in created if each is not None]
         self.horizon_us = round(settings.horizon * 1e6)
         self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
-        self.heading_limit = HEADING_LIMIT if self.wheels else HEADING_LIMIT_WITHOUT_WHEELS
-        if settings.heading_limit is not None:
-            self.heading_limit = settings.heading_limit
         extras = [*gnss_states(settings)] if rig.gps_frame else [gnss_states(settings)[0]]
         if self.wheels is not None:
             extras += wheel_states(settings)

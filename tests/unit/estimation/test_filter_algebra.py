@@ -58,11 +58,6 @@ def test_given_a_vehicle_without_wheels_then_its_layout_has_no_wheel_states():
     assert "wheel_scale" not in Setup(rig(wheels=())).layout
 
 
-def test_given_no_wheels_then_a_valid_pose_has_a_narrower_heading():
-    assert Setup(rig(wheels=())).heading_limit < SETUP.heading_limit
-    assert Setup(rig(wheels=()), FilterSettings(heading_limit=1.5)).heading_limit == 1.5
-
-
 # --- algebra ------------------------------------------------------------------------------------------------
 
 

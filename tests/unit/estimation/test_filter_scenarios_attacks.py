@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter import fusion, heading_alignment, heading_step
+from modelserver.estimation.filter import fusion, heading_alignment, heading_step, propagation
 from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -108,7 +108,7 @@ def test_given_encoders_stuck_at_rest_when_it_starts_without_fixes_then_speed_an
     assert found.last.valid
 
 
-def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bias():
+def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bias_and_makes_no_heading_known():
     gps = replace(PLAIN_GPS, outages=((25.0, 60.0),))
     localizer = drive(simulation(EIGHT, gps_model=gps), 35.0).localizer
     state, setup = localizer.head, localizer.setup
@@ -117,16 +117,23 @@ def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bia
     sliding = state._replace(nav=state.nav._replace(velocity=(x - 0.2 * y, y + 0.2 * x, z)))
     stuck = sliding._replace(common=state.common._replace(wheels=state.common.wheels.suspect()))
 
-    def constrain(slid: Aligned) -> tuple[float, float]:
-        after, decision = fusion.fuse_non_holonomic(setup, slid, slid.nav.utime + 100_000)
+    def constrain(slid: Aligned) -> tuple[float, float, np.ndarray]:
+        """Return the change of the bias, the sideways speed, and the change of the variances."""
+        utime = slid.nav.utime + 100_000
+        before = propagation.propagate_covariance(setup, slid).nav.covariance
+        after, decision = fusion.fuse_non_holonomic(setup, slid, utime)
         assert decision.verdict is Verdict.USED
-        return after.nav.gyro_bias[2] - slid.nav.gyro_bias[2], after.nav.body_velocity(RIG.base)[1]
+        learned = after.nav.gyro_bias[2] - slid.nav.gyro_bias[2]
+        return learned, after.nav.body_velocity(RIG.base)[1], np.diagonal(after.nav.covariance - before)
 
     slid = abs(sliding.nav.body_velocity(RIG.base)[1])
-    changed, slides = constrain(sliding)
-    held, slides_too = constrain(stuck)
+    changed, slides, known = constrain(sliding)
+    held, slides_too, known_too = constrain(stuck)
     assert abs(changed) > 1e-6
     assert held == pytest.approx(0.0, abs=1e-12)
+    assert known[8] < 0.0 > known[11]
+    assert known_too[8] == 0.0 == known_too[11]
+    assert known_too[4] == pytest.approx(known[4], rel=0.01)
     assert slides_too == pytest.approx(slides, abs=0.01)
     assert abs(slides) < 0.9 * slid
 

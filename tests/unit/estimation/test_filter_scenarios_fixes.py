@@ -15,6 +15,7 @@ from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
+from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned
 from modelserver.messages import GpsSample, Invalid, Mode, Verdict
@@ -232,6 +233,24 @@ def test_given_a_vehicle_that_moves_beside_its_own_axis_then_its_pose_is_not_val
     assert not localizer.estimate(localizer.utime).invalid
     assert not find_invalid(Cause.GNSS)  # its bound covers what fixes that drift do
     assert find_invalid(Cause.HEADING) is Invalid.GNSS_INCONSISTENT
+
+
+def test_given_a_heading_known_to_half_a_radian_then_a_pose_is_valid_while_wheels_measure_or_where_it_is_configured():
+    localizer = drive(simulation(EIGHT), 30.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    vague = state._replace(consistency=state.consistency._replace(heading_allowance=0.45))
+    stuck = vague._replace(common=vague.common._replace(wheels=vague.common.wheels.suspect()))
+    configured = Setup(RIG, FilterSettings(heading_limit=0.6))
+
+    def find_invalid(setup: Setup, judged: Aligned) -> Invalid:
+        found = output.estimate(setup, judged, localizer.odom, localizer.utime, localizer.utime)
+        assert 0.45 < found.heading_protection_level < 0.6
+        return found.invalid
+
+    assert not find_invalid(localizer.setup, vague)
+    assert find_invalid(localizer.setup, stuck) is Invalid.PROTECTION_LEVEL_EXCEEDED
+    assert not find_invalid(configured, stuck)
 
 
 def test_given_a_steady_circle_then_wheels_correct_the_heading_and_not_the_latency_that_goes_with_it():

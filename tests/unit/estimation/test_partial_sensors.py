@@ -201,11 +201,12 @@ def zero_velocity(sample: GpsSample) -> GpsSample:
 @pytest.mark.slow
 def test_given_a_velocity_that_nobody_fills_then_it_is_not_used_and_reported():
     alone = change(GpsSample, lambda sample: replace(zero_velocity(sample), speed=NAN, course=NAN))
-    for mode in (Mode.FULL, Mode.NO_WHEELS):
+    # without wheels a heading must be known better, and fixes show it later
+    for mode, known in ((Mode.FULL, 12.0), (Mode.NO_WHEELS, 28.0)):
         found = drive(drive_with_wheels(), SECONDS, mode=mode, transform=alone)
         assert {each.reason for each in found.decisions("gps_velocity")} == {"unfilled"}
         assert list_findings(found) == ["unfilled"]
-        assert all(row.valid for row in found.between(12.0))
+        assert all(row.valid for row in found.between(known))
     # the course and speed beside it are used
     found = drive(drive_with_wheels(), SECONDS, transform=change(GpsSample, zero_velocity))
     assert found.decisions("gps_velocity", Verdict.REJECTED) == []
