@@ -30,7 +30,7 @@ of fixes (`fit_drift`).
 
 A gyro whose bias has changed turns the heading before fixes show it, most at a walk: by b T while b |m| is within their
 noise, over the longest such window. The bound of the heading is never below that angle for b = `gyro_bias_step`
-(`hidden`).
+(`hidden`); where wheels stop measuring the path it decays.
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
 gyro, as on a ferry (`Cause.HEADING`). It is trusted again when it agrees with the gyro of before (`find_turn`), while
@@ -203,6 +203,9 @@ TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, C
 
 HIDDEN_SIGMAS: Final = 3.0
 """Standard deviations of fixes within which they hide a turn by a gyro whose bias has changed."""
+
+HIDDEN_TIME: Final = 60.0
+"""Seconds in which that turn decays while no wheels measure the path: fixes show the heading then."""
 
 HIDDEN_LEVEL: Final = 0.4
 """Share of the covariance's level, beside that turn: about two standard deviations."""
@@ -600,7 +603,10 @@ class ConsistencyMonitor(NamedTuple):
             compared_distance=node.distance,
             horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
-            hidden=_find_hidden_turn(windows, node, noise, settings),
+            hidden=max(
+                _find_hidden_turn(windows, node, noise, settings),
+                0.0 if node.is_measured else self.hidden * math.exp(-seconds / HIDDEN_TIME),
+            ),
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:

@@ -212,6 +212,22 @@ def test_given_a_turn_that_may_be_hidden_then_it_alone_makes_no_pose_with_wheels
     assert FRESH.bound_heading(0.1, 0) == 0.1
 
 
+def test_given_wheels_that_no_longer_measure_then_a_turn_that_may_be_hidden_decays_instead_of_being_forgotten() -> None:
+    *_, last = drive(60.0, Fault())
+    hidden = last.monitor.hidden
+    assert hidden > 0.05
+
+    def find_hidden(monitor: ConsistencyMonitor, seconds: float) -> float:
+        node = last.node._replace(
+            utime=last.node.utime + round(seconds * 1e6), seconds=last.node.seconds + seconds, is_measured=False
+        )
+        return monitor._replace(older=(), newest=()).compare(node, NOISE, SETTINGS).hidden
+
+    assert 0.97 * hidden < find_hidden(last.monitor, 1.0) < hidden
+    assert find_hidden(last.monitor, 60.0) == pytest.approx(hidden / math.e, rel=0.05)
+    assert find_hidden(last.monitor._replace(hidden=0.0), 1.0) == 0.0
+
+
 @pytest.mark.parametrize("scale", [0.15, -0.1])
 def test_given_wheels_that_slip_then_they_are_the_cause(scale: float) -> None:
     found = find(Fault(200.0, scale=scale))
