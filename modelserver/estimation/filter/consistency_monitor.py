@@ -91,7 +91,8 @@ SHRINK_PATH: Final = 5.0
 err otherwise than modeled, and at rest fixes show no heading."""
 
 SUSPICION_TIME: Final = 60.0
-"""Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes."""
+"""Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes, or that
+wheels no longer show."""
 
 STRAIGHT: Final = 0.9
 """Length of a path between its ends, relative to that along it, which shows a course."""
@@ -203,9 +204,6 @@ TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, C
 
 HIDDEN_SIGMAS: Final = 3.0
 """Standard deviations of fixes within which they hide a turn by a gyro whose bias has changed."""
-
-HIDDEN_TIME: Final = 60.0
-"""Seconds in which that turn decays while no wheels measure the path: fixes show the heading then."""
 
 HIDDEN_LEVEL: Final = 0.4
 """Share of the covariance's level, beside that turn: about two standard deviations."""
@@ -593,7 +591,8 @@ class ConsistencyMonitor(NamedTuple):
             # what is not used moves nothing, and shows nothing
             horizontal = heading = 0.0
             fade = heading_fade = 1.0
-        suspicion = self.suspicion * math.exp(-seconds / SUSPICION_TIME)
+        suspicion_fade = math.exp(-seconds / SUSPICION_TIME)
+        suspicion = suspicion_fade * self.suspicion
         return self._replace(
             last=node,
             suspicion=suspicion,
@@ -605,7 +604,7 @@ class ConsistencyMonitor(NamedTuple):
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
             hidden=max(
                 _find_hidden_turn(windows, node, noise, settings),
-                0.0 if node.is_measured else self.hidden * math.exp(-seconds / HIDDEN_TIME),
+                0.0 if node.is_measured else suspicion_fade * self.hidden,
             ),
         )
 

@@ -30,8 +30,8 @@ CONVERGENCE_CELL: Final = 200.0
 
 HEADING_LIMIT: Final = 0.6
 HEADING_LIMIT_WITHOUT_WHEELS: Final = 0.35
-"""Heading protection level of a valid pose at most, rad, if the settings have none: while wheels
-measure the speed, and while they do not."""
+"""Heading protection level of a valid pose at most, rad, if the settings have none: while wheels measure the speed, and
+while they do not."""
 
 FIRST_ORDER_LAG: Final = 0.15
 """Seconds over which the covariance of a pose is propagated to first order."""
