@@ -2,24 +2,12 @@
 
 The gate compares one fix with the state, which has followed the fixes before it. An error that grows slowly passes it:
 the state follows. So fixes are compared with what did not follow, the path of dead reckoning (solution separation, as
-in ARAIM: J. Blanch et al., "Baseline advanced RAIM user algorithm", IEEE Trans. AES, 2015). With z_k the fix at the
-start of a window, o the path in its own axes, which no fix corrects, and R_k its rotation to N at that time,
-
-    e = (z - z_k) - R_k (o - o_k),      cov(e) = 2 s_c^2 (1 - exp(-T / tau)) I + white noise + sum u u'              (1)
-
-over a window of T seconds. The vectors u are what one standard deviation of each parameter of dead reckoning at the
-start of the window adds: with d = R_k (o - o_k) as a complex number, i d s_heading, d s_scale, i m s_rate with the
-moment m = integral of (t - t_k) dd, and the noise of slip and of the gyros.
+in ARAIM: J. Blanch et al., "Baseline advanced RAIM user algorithm", IEEE Trans. AES, 2015): `path_windows` has the
+discrepancy e of a window and its covariance (1).
 
 Below the threshold, what is unexplained widens the protection levels: the position may have followed e, and the
 heading turned to explain it (`horizontal_allowance`, `heading_allowance`). Above it, one of the two is wrong, and the
-fits over all windows show which (`Cause`). A gyro whose bias has changed bends the path, e_j = i b m_j; wheels that
-slip scale it, e_j = s d_j; a latency that has changed displaces it, e_j = -l (v_j - v_k); an antenna that is elsewhere
-turns with the vehicle, e_j = (exp(i psi_j) - exp(i psi_k)) a. None explains fixes that drift, e_j = v (t_j - t_k), in
-turns and changes of speed, or that jump. Each fit has the covariance of (1) over the window and the errors u of the
-state as parameters with their sigmas; what it explains is its evidence, so a cause with more parameters does not win by
-that. The path is replayed with bias and scale as they were (`replay_path`), since a state that follows the fixes hides
-what has changed.
+fits over all windows show which (`find_causes` in `path_fits`).
 
 What is corrected leaves an allowance that decays. Fixes that jump are not used, and dead reckoning is right for a
 while. Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of
@@ -44,19 +32,30 @@ from __future__ import annotations
 import cmath
 import itertools
 import math
-from collections.abc import Sequence
-from enum import Enum
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, TypeAlias
-
-import numpy as np
-import numpy.typing as npt
+from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.path_fits import (
+    LARGEST_TURN_SIGMA,
+    TYPICAL_CHANGE,
+    Cause,
+    Inconsistency,
+    find_causes,
+)
+from modelserver.estimation.filter.path_windows import (
+    MIN_TURN_PATH,
+    Discrepancy,
+    PathNode,
+    PathNoise,
+    compare_window,
+    find_turn,
+    get_fix_variance,
+    get_moment,
+    get_turn_sigma,
+)
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.filter.settings import FilterSettings
-
-Vector: TypeAlias = npt.NDArray[Any]
 
 SPACING_US: Final = 900_000
 """Microseconds between two nodes of the newest part of the path."""
@@ -117,18 +116,6 @@ LEAST_JUMP: Final = 6.0
 CONFIRMATIONS: Final = 3
 """Fixes in a row beyond the threshold that are no outliers."""
 
-HEADING_FLOOR: Final = 0.01
-"""Standard deviation of the course, rad, beside the heading: no vehicle drives straighter."""
-
-COURSE_FLOOR: Final = 0.03
-"""The same where only fixes show how the vehicle moves: it slips sideways in turns and crabs in wind and on slopes."""
-
-MIN_TURN_PATH: Final = 3.0
-"""Meters of a path, at least, that fixes show a heading along."""
-
-LEAST_MOVED: Final = 0.5
-"""Way of the fixes relative to that of the path, at least, whose direction shows the heading."""
-
 AGREEMENT: Final = 2.45
 """Standard deviations of (1) within which a fix agrees: 95 % of good ones."""
 
@@ -157,50 +144,12 @@ window: the path turns there, and what it misses then is not an error of the fix
 OWN_TURNS: Final = 3.0
 """Radians that a vehicle turns by, while its heading follows the gyro, that drives by itself again."""
 
-STEADY_SIGMA: Final = 0.03
-"""Largest standard deviation of the drift of fixes, m/s, that are trusted again wherever they are."""
-
-EXCLUDING_SIGMAS: Final = 3.0
-"""Standard deviations by which the drift of fixes that are trusted again is less than the one that was found."""
-
-LARGEST_REST: Final = 2.0
-"""Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes, and so may a
-drift, of those that are trusted again."""
-
-MODEL_ERROR: Final = 0.05
-"""Meters that no cause explains, as slip that comes and goes: with fixes of centimeters."""
-
-LARGEST_TURN_SIGMA: Final = 0.2
-"""Standard deviation of the path's turn since the start of a window, rad, beyond which a fit is no longer linear."""
-
 DECISION_TIME: Final = 90.0
 REPEAT: Final = 4
 """Seconds for which the causes are compared again, and fixes from one comparison to the next."""
 
-MAX_INFLATION: Final = 4.0
-"""Largest inflation, in variance, of the error of fixes here: a drift must not excuse itself."""
-
-
-class Cause(Enum):
-    """What explains fixes that do not agree with the path."""
-
-    GNSS = "gnss"
-    HEADING = "heading"
-    GYRO = "gyro"
-    WHEELS = "wheels"
-    LATENCY = "latency"
-    LEVER_ARM = "lever_arm"
-
-
 MARGIN: Final = MappingProxyType({Cause.GYRO: 8.0, Cause.WHEELS: 8.0, Cause.LATENCY: 5.0, Cause.LEVER_ARM: 5.0})
 """Evidence by which an error must exceed any other cause to be corrected."""
-
-LARGEST_MARGIN: Final = max(MARGIN.values()) + 1e-6
-"""The largest of them, and what rounding may change of one."""
-
-TYPICAL_CHANGE: Final = MappingProxyType({Cause.GYRO: 0.01, Cause.WHEELS: 0.1, Cause.LATENCY: 0.4})
-"""Sigma of a change of the gyro's bias (rad/s), of the wheels' scale, and of the latency (s), that is a fault."""
-
 
 HIDDEN_SIGMAS: Final = 3.0
 """Standard deviations of fixes within which they hide a turn by a gyro whose bias has changed."""
@@ -210,116 +159,6 @@ HIDDEN_LEVEL: Final = 0.4
 
 LARGEST_HIDDEN: Final = 0.5
 """Largest bound of the heading by both, rad: within the usual limit of a vehicle with wheels."""
-
-LARGEST_FIX_SIGMA: Final = 0.2
-"""Standard deviation of fixes, m, that show an error of the lever arm."""
-
-TYPICAL_DRIFT: Final = 0.3
-TYPICAL_JUMP: Final = 10.0
-TYPICAL_LEVER_ARM: Final = 0.5
-"""Sigma of a drift of fixes, m/s, of a jump, m, and of an error of the lever arm, m, that are a fault."""
-
-
-class PathNoise(NamedTuple):
-    """Noise along the path: density of the heading's random walk, rad2/s, and inflation of the fixes' errors."""
-
-    heading: float
-    inflation: float
-
-
-class PathNode(NamedTuple):
-    """Fix, path and state at an instant; vectors of the plane are complex, meters.
-
-    Attributes
-    ----------
-    fix, antenna: the antenna by the fix at its stamp, and by the state after it, along N.
-    velocity, turn_rate: of the antenna along N, m/s, and of the vehicle, rad/s.
-    path: the antenna by dead reckoning, along the path's own axes.
-    moment: integral of time along the path, m s, and `seconds` the time, both since the start of the path.
-    rotation: yaw from the path's axes to N, rad.
-    distance: travelled, m.
-    rate_bias, scale: of the yaw gyro, rad/s, and of the wheels, by the state.
-    heading_variance, rate_variance, scale_variance: of the heading (rad2), and of those.
-    has_gyro, is_measured: whether a gyro measures the turns, and wheels the path too.
-    own_heading: by the gyro alone, along the path's axes, rad.
-    bias_turn: integral of `rate_bias` since the start of the path, rad.
-    latency, latency_variance: of fixes, s and s2; `shows_latency`: whether fixes separate it from the heading.
-    lost: variance of the heading that was lost in gaps of the IMU since the start of the path, rad2.
-    unmeasured: the part of `distance` whose length nothing measured, m.
-    white, correlated: standard deviations of the two errors of the fix, m.
-    position_covariance: of the state's position: east, north, cross, m2.
-    """
-
-    utime: int
-    fix: complex
-    antenna: complex
-    velocity: complex
-    turn_rate: float
-    path: complex
-    moment: complex
-    seconds: float
-    rotation: float
-    distance: float
-    rate_bias: float
-    scale: float
-    heading_variance: float
-    rate_variance: float
-    scale_variance: float
-    has_gyro: bool
-    is_measured: bool
-    own_heading: float
-    bias_turn: float
-    latency: float
-    latency_variance: float
-    shows_latency: bool
-    lost: float
-    unmeasured: float
-    white: float
-    correlated: float
-    position_covariance: tuple[float, float, float]
-
-
-class Discrepancy(NamedTuple):
-    """The newest fix against the path since a node.
-
-    Attributes
-    ----------
-    node: the start of the window.
-    error: e of (1) along N, m.
-    sigmas: its size in standard deviations.
-    sigma: standard deviation of e along its longest axis, m.
-    displacement: of the antenna by dead reckoning, along N, m.
-    covariance: of dead reckoning alone: east, north, cross, m2.
-    turn, turn_sigma: angle from the path to the way of the fixes, which the heading would explain, and its standard
-        deviation, rad.
-    """
-
-    node: PathNode
-    error: complex
-    sigmas: float
-    sigma: float
-    displacement: complex
-    covariance: tuple[float, float, float]
-    turn: float
-    turn_sigma: float
-
-
-class Inconsistency(NamedTuple):
-    """What explains fixes that do not agree with the path, over the window with the largest discrepancy.
-
-    `change` is that of the heading (rad), of the gyro's bias (rad/s), of the wheels' scale, of the latency (s), or the
-    drift (m/s); `explained` is twice the logarithm of its evidence beside that of no cause. `turned`: by which the
-    state has turned beside a gyro of the former bias, rad. `is_jump`: the fixes left the path at once, as no error of
-    dead reckoning does. `lever_arm`: the antenna beside its place in the geometry, forward + i left, m.
-    """
-
-    cause: Cause
-    discrepancy: Discrepancy
-    change: float = 0.0
-    explained: float = 0.0
-    turned: float = 0.0
-    lever_arm: complex = 0j
-    is_jump: bool = False
 
 
 class ConsistencyMonitor(NamedTuple):
@@ -677,25 +516,16 @@ class ConsistencyMonitor(NamedTuple):
             return self._find_turned(node, noise, settings) if self.suspect is None else None
         if len(nodes) < FEWEST_NODES:
             return None
-        worst = max((compare_window(each, node, noise, settings) for each in nodes), key=lambda each: each.sigmas)
-        explained = {Cause.GNSS: Inconsistency(Cause.GNSS, worst)}
-        for k, start in enumerate(nodes):
-            turn = start.heading_variance + start.rate_variance * (node.seconds - start.seconds) ** 2
-            if turn > LARGEST_TURN_SIGMA**2:
-                continue
-            # a window that could explain no more than this changes neither the best cause nor its margin
-            least = max(each.explained for each in explained.values()) - LARGEST_MARGIN
-            for each in _explain(start, (*nodes[k + 1 :], node), noise, settings, least):
-                if each.cause not in explained or each.explained > explained[each.cause].explained:
-                    explained[each.cause] = each
-        best = max(explained.values(), key=lambda each: each.explained)
-        rest = max((each.explained for each in explained.values() if each is not best), default=0.0)
-        if best.cause is not Cause.GNSS and best.explained > rest + MARGIN[best.cause]:
-            return best
+        causes = sorted(find_causes(nodes, node, noise, settings).values(), key=lambda each: -each.explained)
+        if causes and causes[0].cause is not Cause.GNSS:
+            best, rest = causes[0], max((each.explained for each in causes[1:]), default=0.0)
+            if best.explained > max(rest, 0.0) + MARGIN[best.cause]:
+                return best
         if self.suspect is not None:
             return None
+        worst = max((compare_window(each, node, noise, settings) for each in nodes), key=lambda each: each.sigmas)
         is_jump = self.has_jumped and abs(worst.error) > LEAST_JUMP * math.hypot(node.white, node.correlated)
-        return explained[Cause.GNSS]._replace(discrepancy=worst, is_jump=is_jump)
+        return Inconsistency(Cause.GNSS, worst, is_jump=is_jump)
 
     def _find_turned(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
         """Return the window in which the heading has been turned most beside the gyro."""
@@ -711,214 +541,6 @@ class ConsistencyMonitor(NamedTuple):
         return Inconsistency(Cause.HEADING, compare_window(worst, node, noise, settings), change)
 
 
-def find_turn(start: PathNode, end: PathNode) -> float:
-    """Return by which fixes have turned the heading between two nodes, rad.
-
-    That is beside a gyro with the bias of the start: a state that follows the fixes changes the bias too.
-    """
-    bias = end.bias_turn - start.bias_turn - start.rate_bias * (end.seconds - start.seconds)
-    return wrap_angle(end.rotation - start.rotation - bias)
-
-
-def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:
-    """Return the standard deviation of what fixes may turn the heading by between two nodes, rad."""
-    seconds = end.seconds - start.seconds
-    variance = start.heading_variance + noise.heading * seconds + start.rate_variance * seconds**2
-    return math.sqrt(variance + end.lost - start.lost + COURSE_FLOOR**2)
-
-
-def _explain(
-    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings, least: float = -math.inf
-) -> list[Inconsistency]:
-    """Return each cause of the discrepancies since a node, with the squares that it explains.
-
-    Nothing where none could explain more than `least`: parameters do not lower the determinant of the information, so
-    a cause explains no more than the squares that remain without one.
-    """
-    replayed = replay_path(start, window)
-    # error, displacement and moment of each node as `compare_window` has them; it would compute much more
-    turned = cmath.rect(1.0, start.rotation)
-    displacements = [turned * (each.path - start.path) for each in replayed]
-    begin = _shift_fix(start, start.latency)
-    errors = np.array(
-        [_shift_fix(each, start.latency) - begin - d for each, d in zip(window, displacements, strict=True)]
-    )
-    paths = np.array(displacements)
-    seconds = np.array([each.seconds - start.seconds for each in window])
-    even = np.ones(len(window), dtype=complex)
-    moments = np.array(
-        [turned * (each.moment - start.moment - start.seconds * (each.path - start.path)) for each in replayed]
-    )
-    velocities = np.array([each.velocity for each in window])
-    whiten = np.linalg.inv(np.linalg.cholesky(_get_window_covariance(start, window, noise, settings)))
-    # the errors of the path as the state knows them
-    usual = (
-        (1j * paths, math.sqrt(start.heading_variance)),
-        (paths, math.sqrt(start.scale_variance)),
-        (1j * moments, math.sqrt(start.rate_variance)),
-    )
-    fit = _WindowFit(whiten, errors, usual)
-    ((_, squares, none),) = fit.solve(((),))
-    if squares < least:
-        return []
-    end = replayed[-1]
-    last = window[-1]._replace(path=end.path, moment=end.moment, rotation=end.rotation, latency=start.latency)
-    newest = compare_window(start, last, noise, settings)
-    yaws = np.array(
-        [
-            start.rotation + start.own_heading,
-            *(r.rotation + w.own_heading for r, w in zip(replayed, window, strict=True)),
-        ]
-    )
-    turns = np.exp(1j * yaws[1:]) - cmath.rect(1.0, yaws[0])
-    planar = [(Cause.GNSS, seconds, TYPICAL_DRIFT), (Cause.GNSS, even, TYPICAL_JUMP)]
-    if start.correlated < LARGEST_FIX_SIGMA:
-        # other fixes err by more than any lever arm
-        planar.append((Cause.LEVER_ARM, turns, TYPICAL_LEVER_ARM))
-    largest = 2.0 * len(window) * LARGEST_REST
-    found = []
-    fits = fit.solve([((model, sigma), (1j * model, sigma)) for _, model, sigma in planar])
-    for (cause, _, _), ((a, b), left, evidence) in zip(planar, fits, strict=True):
-        if cause is Cause.GNSS or left <= largest:
-            found.append(Inconsistency(cause, newest, math.hypot(a, b), none - evidence, lever_arm=complex(a, b)))
-    single = [(Cause.GYRO, 1j * moments), (Cause.WHEELS, paths)]
-    if window[-1].shows_latency:
-        # before the window too, and from its start on
-        single += [(Cause.LATENCY, start.velocity - velocities), (Cause.LATENCY, -velocities)]
-    fits = fit.solve([((model, TYPICAL_CHANGE[cause]),) for cause, model in single])
-    for (cause, _), ((factor,), left, evidence) in zip(single, fits, strict=True):
-        if left <= largest:
-            found.append(Inconsistency(cause, newest, factor, none - evidence, turned=end.rotation - start.rotation))
-    return found
-
-
-Column: TypeAlias = tuple[Vector, float]
-"""Errors (n) that one unit of a parameter adds along the window, complex, and the parameter's standard deviation."""
-
-
-class _WindowFit:
-    """Least squares of the errors of a window (n) by its usual parameters and one cause, each with its sigma.
-
-    The fits of causes with equally many parameters are solved together: numpy's overhead is most of the work.
-    """
-
-    def __init__(self, whiten: Vector, errors: Vector, usual: Sequence[Column]):
-        e = whiten @ errors
-        self._whiten = whiten.astype(complex)
-        self._measured = np.concatenate((e.real, e.imag))
-        self._usual = usual
-
-    def solve(self, causes: Sequence[Sequence[Column]]) -> list[tuple[list[float], float, float]]:
-        """Return for each cause its factors, the squares that remain, and -2 log of the evidence.
-
-        `causes` are the columns of each, equally many.
-        """
-        fits = [(*self._usual, *columns) for columns in causes]
-        m, k, n = len(fits), len(fits[0]), len(self._whiten)
-        columns = np.array([[vector for vector, _ in fit] for fit in fits], dtype=complex)
-        A = self._whiten @ np.ascontiguousarray(columns.transpose(0, 2, 1))
-        full = np.zeros((m, 2 * n + k, k))
-        full[:, :n], full[:, n : 2 * n] = A.real, A.imag
-        b = np.zeros(2 * n + k)
-        b[: 2 * n] = self._measured
-        for each, fit in zip(full, fits, strict=True):
-            each[2 * n :].flat[:: k + 1] = [1.0 / sigma for _, sigma in fit]
-        transposed = full.transpose(0, 2, 1)
-        information = transposed @ full
-        x = np.linalg.solve(information, (transposed @ b)[..., None])
-        rest = b - (full @ x)[..., 0]
-        sizes = np.linalg.slogdet(information)[1].tolist()
-        solutions = []
-        for fit, factors, row, size in zip(fits, x[:, len(self._usual) :, 0].tolist(), rest, sizes, strict=True):
-            left = float(row @ row)
-            size += 2.0 * sum(math.log(sigma) for _, sigma in fit)
-            solutions.append((factors, left, left + size))
-        return solutions
-
-
-def _get_window_covariance(
-    start: PathNode, window: tuple[PathNode, ...], noise: PathNoise, settings: FilterSettings
-) -> Vector:
-    """Return the covariance of the discrepancies since a node along one axis, m2: of the fixes and of slip."""
-    t = np.array([each.seconds - start.seconds for each in window])
-    tau = settings.gps_correlation_time
-    near = np.exp(-np.abs(t[:, None] - t) / tau)
-    first = np.exp(-t / tau)
-    correlated = min(noise.inflation, MAX_INFLATION) * start.correlated * window[-1].correlated
-    C = correlated * (near - first[:, None] - first + 1.0) + start.white**2
-    speed = (window[-1].distance - start.distance) / t[-1]
-    slip = settings.slip_time * ((settings.slip_ratio * speed) ** 2 + settings.side_sigma**2)
-    C += slip * np.minimum(t[:, None], t)
-    unmeasured = np.array([each.unmeasured - start.unmeasured for each in window])
-    C += np.outer(unmeasured, unmeasured)
-    return np.asarray(C + np.diag([each.white**2 + MODEL_ERROR**2 for each in window]))
-
-
-class ReplayedNode(NamedTuple):
-    """Path, moment and rotation of a node (see `PathNode`), replayed."""
-
-    path: complex
-    moment: complex
-    rotation: float
-
-
-def replay_path(start: PathNode, window: tuple[PathNode, ...]) -> list[ReplayedNode]:
-    """Return the nodes of a window as they are with the gyro's bias and the wheels' scale of its start.
-
-    A state that follows the fixes changes both, and so hides what has changed.
-    """
-    found, before, turned = [], start, 0.0
-    path, moment = start.path, start.moment
-    for each in window:
-        seconds = each.seconds - before.seconds
-        turn = (0.5 * (each.rate_bias + before.rate_bias) - start.rate_bias) * seconds
-        factor = cmath.rect(1.0 + 0.5 * (each.scale + before.scale) - start.scale, turned + 0.5 * turn)
-        turned += turn
-        path += factor * (each.path - before.path)
-        moment += factor * (each.moment - before.moment)
-        found.append(ReplayedNode(path, moment, each.rotation - turned))
-        before = each
-    return found
-
-
-def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: FilterSettings) -> Discrepancy:
-    """Return the discrepancy (1) between two nodes."""
-    seconds = end.seconds - start.seconds
-    d = cmath.rect(1.0, start.rotation) * (end.path - start.path)
-    error = _shift_fix(end, end.latency) - _shift_fix(start, end.latency) - d
-    m = _get_moment(start, end)
-    driven = end.distance - start.distance
-    square = abs(d) ** 2
-    # white noises: slip and side slip that last slip_time, the gyros'
-    even = settings.slip_time * (
-        (settings.slip_ratio * driven) ** 2 / max(seconds, 1e-3) + settings.side_sigma**2 * seconds
-    )
-    even += (end.unmeasured - start.unmeasured) ** 2
-    across = start.heading_variance + noise.heading * seconds / 3.0 + end.lost - start.lost
-    # a turn shortens the path along itself: to the second order, E (1 - cos)^2
-    along = start.scale_variance + 0.75 * across * across
-    x, y = d.real, d.imag
-    east = even + across * y * y + along * x * x + start.rate_variance * m.imag**2
-    north = even + across * x * x + along * y * y + start.rate_variance * m.real**2
-    cross = (along - across) * x * y - start.rate_variance * m.real * m.imag
-    fixes = _get_fix_variance(start, end, noise, settings)
-    fixes += end.latency_variance * abs(end.velocity - start.velocity) ** 2
-    a, b = east + fixes, north + fixes
-    ex, ey = error.real, error.imag
-    square_sum = (b * ex * ex - 2.0 * cross * ex * ey + a * ey * ey) / (a * b - cross * cross)
-    turn = turn_sigma = 0.0
-    if square > MIN_TURN_PATH**2:
-        # the fixes moved by d + e; where they hardly moved, their direction means nothing
-        moved = 1.0 + error * d.conjugate() / square
-        turn = cmath.phase(moved) if abs(moved) > LEAST_MOVED else moved.imag
-        side = (a * y * y - 2.0 * cross * x * y + b * x * x) / square
-        turn_sigma = math.sqrt(side / square) / min(max(abs(moved), LEAST_MOVED), 1.0)
-    longest = math.sqrt(compute_longest_axis(a, b, cross))
-    return Discrepancy(
-        start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma
-    )
-
-
 def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
     """Return the angle by which a gyro whose bias has changed may have turned the heading unseen, rad.
 
@@ -931,8 +553,8 @@ def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNois
         if not (start.is_measured and start.has_gyro and end.has_gyro):
             break
         turn = settings.gyro_bias_step * (end.seconds - start.seconds)
-        off = settings.gyro_bias_step * abs(_get_moment(start, end))
-        within = HIDDEN_SIGMAS * math.sqrt(_get_fix_variance(start, end, noise, settings))
+        off = settings.gyro_bias_step * abs(get_moment(start, end))
+        within = HIDDEN_SIGMAS * math.sqrt(get_fix_variance(start, end, noise, settings))
         if off > within:
             # the moment grows with the square of time
             return max(hidden, turn * math.sqrt(within / off))
@@ -946,97 +568,6 @@ def _compare_course(found: Discrepancy, end: PathNode, noise: PathNoise, setting
     # only its direction means something, and only while it is straight
     if not STRAIGHT * (end.distance - start.distance) < abs(path) or min(abs(path), abs(course)) < MIN_TURN_PATH:
         return 0.0
-    fixes = math.sqrt(_get_fix_variance(start, end, noise, settings)) / abs(course)
+    fixes = math.sqrt(get_fix_variance(start, end, noise, settings)) / abs(course)
     sigma = math.hypot(get_turn_sigma(start, end, noise), fixes)
     return abs(cmath.phase(course / path)) - ALLOWED_TURN * sigma
-
-
-class DriftFit(NamedTuple):
-    """How fixes have moved beside dead reckoning.
-
-    Attributes
-    ----------
-    turn, turn_sigma: rotation of the path to the fixes, rad.
-    drift, drift_sigma: of the fixes from the first to the last, and its largest standard deviation, m.
-    tolerance: standard deviation of the difference of two fixes at that interval, m.
-    seconds: from the first to the last.
-    rest: mean square that the fit leaves, over each axis, relative to the variance of the fixes.
-    """
-
-    turn: float
-    turn_sigma: float
-    drift: float
-    drift_sigma: float
-    tolerance: float
-    seconds: float
-    rest: float
-
-    @property
-    def largest(self) -> float:
-        """Largest drift that is not excluded by the noise, m."""
-        return 2.0 * math.hypot(self.tolerance, self.drift_sigma)
-
-    @property
-    def is_steady(self) -> bool:
-        """Whether fixes are known to have moved as the path, whatever its heading, all the time."""
-        is_known = self.drift_sigma <= STEADY_SIGMA * self.seconds
-        return is_known and self.drift <= self.largest and self.rest <= LARGEST_REST
-
-    def excludes(self, rate: float) -> bool:
-        """Return whether fixes are known not to drift at a rate any more, m/s; 0 needs no proof."""
-        sigma = math.hypot(self.tolerance, self.drift_sigma)
-        return not rate or rate * self.seconds - self.drift > EXCLUDING_SIGMAS * sigma
-
-
-def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, settings: FilterSettings) -> DriftFit:
-    """Fit an offset, a drift, a rotation, a scale and a turn rate to the fixes of some nodes.
-
-    `rotation` is that from the path's axes to N now. A path that is straight does not show a drift: its standard
-    deviation is large then.
-    """
-    first, last = nodes[0], nodes[-1]
-    seconds = last.seconds - first.seconds
-    t = np.array([each.seconds - first.seconds for each in nodes]) / seconds
-    begin = _shift_fix(first, last.latency)
-    fixes = np.array([_shift_fix(each, last.latency) - begin for each in nodes])
-    paths = cmath.rect(1.0, rotation) * np.array([each.path - first.path for each in nodes])
-    moments = cmath.rect(1.0, rotation) * np.array(
-        [each.moment - first.moment - first.seconds * (each.path - first.path) for each in nodes]
-    )
-    # neighboring fixes share their time-correlated error
-    share = min((seconds / settings.gps_correlation_time + 1.0) / len(nodes), 1.0)
-    weights = np.sqrt([share / (each.white**2 + each.correlated**2) for each in nodes])
-    turn = cmath.phase(complex(np.vdot(paths - paths.mean(), fixes - fixes.mean())))
-    for _ in range(3):
-        spin = cmath.rect(1.0, turn)
-        columns = (np.ones(len(nodes)), 1j * np.ones(len(nodes)), t, 1j * t, 1j * spin * paths)
-        A = np.column_stack((*columns, spin * paths, 1j * spin * moments)) * weights[:, None]
-        b = (fixes - spin * paths) * weights
-        prior = np.diag((0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / first.scale_variance, 1.0 / first.rate_variance))
-        information = (A.conj().T @ A).real + prior
-        x = np.linalg.solve(information, (A.conj().T @ b).real)
-        turn += float(x[4])
-    P = np.linalg.inv(information)
-    rest = float(np.mean(np.abs(b - A @ x) ** 2)) / (2.0 * share)
-    longest = 0.5 * (P[2, 2] + P[3, 3]) + math.hypot(0.5 * (P[2, 2] - P[3, 3]), P[2, 3])
-    tolerance = math.sqrt(_get_fix_variance(first, last, noise._replace(inflation=1.0), settings))
-    return DriftFit(turn, math.sqrt(P[4, 4]), math.hypot(x[2], x[3]), math.sqrt(longest), tolerance, seconds, rest)
-
-
-def _shift_fix(node: PathNode, latency: float) -> complex:
-    """Return the antenna by a fix of some latency at its stamp, along N, m: to the second order in turns."""
-    return node.fix + latency * node.velocity * (1.0 - 0.5j * latency * node.turn_rate)
-
-
-def _get_moment(start: PathNode, end: PathNode) -> complex:
-    """Return the integral of the time since a node along the path from there, along N, m s."""
-    turned = cmath.rect(1.0, start.rotation)
-    return turned * (end.moment - start.moment - start.seconds * (end.path - start.path))
-
-
-def _get_fix_variance(start: PathNode, end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
-    """Return the variance, along each axis, of the difference of two fixes, m2."""
-    seconds = end.seconds - start.seconds
-    changed = 2.0 * (1.0 - math.exp(-seconds / settings.gps_correlation_time))
-    variance = min(noise.inflation, MAX_INFLATION) * changed * start.correlated * end.correlated
-    return variance + start.white**2 + end.white**2

@@ -13,16 +13,7 @@ from typing import Final
 import numpy as np
 
 from modelserver.estimation.filter import eskf, heading_alignment, protection_levels
-from modelserver.estimation.filter.consistency_monitor import (
-    CONFIRMATIONS,
-    Cause,
-    ConsistencyMonitor,
-    Inconsistency,
-    PathNode,
-    PathNoise,
-    find_turn,
-    fit_drift,
-)
+from modelserver.estimation.filter.consistency_monitor import CONFIRMATIONS, ConsistencyMonitor
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.fusion import correct_path, report_event
@@ -31,6 +22,8 @@ from modelserver.estimation.filter.latency_estimator import compute_heading_vari
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
+from modelserver.estimation.filter.path_fits import Cause, Inconsistency, fit_drift
+from modelserver.estimation.filter.path_windows import PathNode, PathNoise, find_turn
 from modelserver.estimation.filter.propagation import select_noise
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned

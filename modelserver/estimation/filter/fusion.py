@@ -12,12 +12,12 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, latency_estimator, propagation
-from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.own import OwnMeasurement
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
+from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
 from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix

@@ -8,24 +8,26 @@ import random
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
-from modelserver.estimation.filter import consistency_monitor, protection_levels
+from modelserver.estimation.filter import protection_levels
 from modelserver.estimation.filter.consistency_monitor import (
     AGREEMENT_TIME,
     LARGEST_HIDDEN,
-    LARGEST_REST,
     LONGEST_US,
-    Cause,
     ConsistencyMonitor,
+)
+from modelserver.estimation.filter.path_fits import (
+    LARGEST_REST,
+    Cause,
     DriftFit,
     Inconsistency,
-    PathNode,
-    PathNoise,
-    compare_window,
+    find_causes,
     fit_drift,
-    replay_path,
+    replay_paths,
 )
+from modelserver.estimation.filter.path_windows import PathNode, PathNoise, compare_window, find_turn
 from modelserver.estimation.filter.settings import FilterSettings
 
 SETTINGS = FilterSettings()
@@ -259,11 +261,17 @@ def test_given_a_bias_that_the_state_has_followed_then_the_replayed_path_is_that
         if not n % 10:
             nodes.append(template._replace(path=path, moment=moment, seconds=0.1 * n, rate_bias=bias))
     assert abs(path - 120.0) > 10.0
-    replayed = replay_path(nodes[0], tuple(nodes[1:]))[-1]
-    assert abs(replayed.path - 120.0) < 0.5
-    assert abs(replayed.moment - 4.0 * 0.5 * 30.0**2) < 20.0
+    windows = replay_paths(nodes, np.array([0, 15]))
+    replayed, moved, turned_back = windows.get_last(0)
+    assert abs(replayed - 120.0) < 0.5
+    assert abs(moved - 4.0 * 0.5 * 30.0**2) < 20.0
     # by which the state has turned beside the former bias
-    assert replayed.rotation - nodes[-1].rotation == pytest.approx(turned, abs=0.005)
+    assert turned_back == pytest.approx(-turned, abs=0.005)
+    # half-way the state had half of the new bias, and the heading of then
+    shorter, _, turned_back = windows.get_last(1)
+    assert abs(shorter) == pytest.approx(60.0, abs=0.5)
+    assert cmath.phase(shorter) == pytest.approx(cmath.phase(nodes[-1].path - nodes[15].path) + 0.05, abs=0.05)
+    assert turned_back == pytest.approx(0.5 * 0.01 * 15.0, abs=0.005)
 
 
 def test_given_a_bound_that_shrinks_at_a_fix_then_it_takes_seconds_and_meters() -> None:
@@ -421,7 +429,7 @@ def test_given_a_heading_that_fixes_have_turned_then_it_is_trusted_where_the_gyr
             utime=start.utime + round(t * 1e6), seconds=start.seconds + t, bias_turn=bias * t, rate_bias=bias
         )
         monitor, agrees = monitor.check_trust(end, NOISE, SETTINGS)
-    assert abs(consistency_monitor.find_turn(start, end)) == pytest.approx(60.0 * bias)
+    assert abs(find_turn(start, end)) == pytest.approx(60.0 * bias)
     assert agrees == is_trusted
 
 
@@ -512,11 +520,23 @@ def test_given_a_latency_that_changes_then_it_is_the_cause_only_where_fixes_sepa
     assert all(each.cause is not Cause.LATENCY for each in hidden)
 
 
-@pytest.mark.parametrize("fault", [Fault(200.0, drift=0.5j), Fault(200.0, rate=0.02), Fault(200.0, scale=0.2)])
-def test_given_windows_that_are_left_out_then_the_causes_are_those_of_all_windows(
-    fault: Fault, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = [(each.t, each.found.cause) for each in drive(320.0, fault) if each.found is not None]
-    monkeypatch.setattr(consistency_monitor, "LARGEST_MARGIN", math.inf)
-    assert found
-    assert found == [(each.t, each.found.cause) for each in drive(320.0, fault) if each.found is not None]
+def test_given_windows_that_are_fitted_together_then_each_cause_is_the_best_of_those_fitted_alone() -> None:
+    *_, last = drive(60.0, Fault(50.0, rate=0.002), correlated=0.1)
+    # as those of a state that has followed the fixes
+    nodes = [
+        each._replace(rate_bias=1e-4 * n, scale=1e-4 * n, rotation=1e-3 * n, unmeasured=0.01 * n)
+        for n, each in enumerate((*last.monitor.older, *last.monitor.newest))
+    ]
+    together = find_causes(nodes, last.node, NOISE, SETTINGS)
+    assert set(together) == {Cause.GNSS, Cause.GYRO, Cause.WHEELS, Cause.LATENCY, Cause.LEVER_ARM}
+    alone = []
+    for k in range(len(nodes)):
+        # no window begins where the heading is not known
+        others = [each if n == k else each._replace(heading_variance=1.0) for n, each in enumerate(nodes)]
+        alone.append(find_causes(others, last.node, NOISE, SETTINGS))
+    for cause, best in together.items():
+        same = max((each[cause] for each in alone if cause in each), key=lambda each: each.explained)
+        assert same.explained == pytest.approx(best.explained)
+        assert same.change == pytest.approx(best.change)
+        assert same.discrepancy.error == pytest.approx(best.discrepancy.error)
+    assert find_causes([each._replace(heading_variance=1.0) for each in nodes], last.node, NOISE, SETTINGS) == {}

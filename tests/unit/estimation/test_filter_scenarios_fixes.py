@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from modelserver.estimation.filter import heading_step, output
-from modelserver.estimation.filter.consistency_monitor import Cause
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
+from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned
