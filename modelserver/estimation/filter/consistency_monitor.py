@@ -9,10 +9,12 @@ Below the threshold, what is unexplained widens the protection levels: the posit
 heading turned to explain it (`horizontal_allowance`, `heading_allowance`). Above it, one of the two is wrong, and the
 fits over all windows show which (`find_causes` in `path_fits`).
 
-What is corrected leaves an allowance that decays. Fixes that jump are not used, and dead reckoning is right for a
-while. Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of
-the turn since the window's start, and the pose is invalid only where they are too large. Fixes are trusted again when
-they agree with the path from there, or when they have moved as the path for two minutes: a fit of a drift beside an
+What is corrected leaves an allowance that decays. An antenna that is elsewhere is reported, and the state goes on to
+follow it: in turns it shows a way and a heading that are not the vehicle's (`lever_arm`). Fixes that jump are not used,
+and dead reckoning is right for a while, but for what its heading may be off since before the jump (`_find_stray`).
+Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of the
+turn since the window's start, and the pose is invalid only where they are too large. Fixes are trusted again when they
+agree with the path from there, or when they have moved as the path for two minutes: a fit of a drift beside an
 offset, a rotation, a scale and a turn rate shows it to be small, which takes turns, and leaves no more than the noise
 of fixes (`fit_drift`).
 
@@ -243,7 +245,7 @@ class ConsistencyMonitor(NamedTuple):
             return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
         suspect = found.discrepancy.node
         drifts = found.cause is Cause.GNSS and not found.is_jump
-        return self._replace(
+        after = self._replace(
             num_exceeded=0,
             cause=found.cause,
             since=utime,
@@ -253,6 +255,14 @@ class ConsistencyMonitor(NamedTuple):
             largest=0.0,
             agreed_since=0,
         )
+        if not found.is_jump:
+            return after
+        return after._replace(horizontal_allowance=self.horizontal_allowance + after._find_stray(self.path))
+
+    def _find_stray(self, path: complex) -> float:
+        """Return how far a heading within its allowance may have led dead reckoning since the suspect node, m."""
+        start = path if self.suspect is None else self.suspect.path
+        return math.sin(min(self.heading_allowance, 0.5 * math.pi)) * abs(path - start)
 
     def extend(self, utime: int, antenna: complex, rate_bias: float, *, is_measured: bool) -> ConsistencyMonitor:
         """Return the monitor with the path continued to the antenna by the state (along N, m) before a fix.
@@ -377,6 +387,9 @@ class ConsistencyMonitor(NamedTuple):
         """Return the monitor after the comparison of a fix with the windows."""
         worst = latest = horizontal = heading = 0.0
         suspect = None if self.is_jump else self.suspect
+        if self.is_jump and self.last is not None:
+            more = self._find_stray(node.path) - self._find_stray(self.last.path)
+            self = self._replace(horizontal_allowance=self.horizontal_allowance + max(more, 0.0))
         if suspect is not None:
             # the state has followed all of it, or the path has gone wrong by it
             if self.cause is Cause.HEADING:
@@ -409,6 +422,9 @@ class ConsistencyMonitor(NamedTuple):
             # the heading has changed during the window by twice the mean that the fixes show
             if each.turn_sigma:
                 heading = max(heading, 2.0 * (abs(each.turn) - ALLOWED_TURN * each.turn_sigma))
+                if self.lever_arm:
+                    swung = self.lever_arm * (cmath.rect(1.0, node.own_heading - each.node.own_heading) - 1.0)
+                    heading = max(heading, math.atan2(abs(swung), abs(each.displacement)))
         moved_since = node.utime if latest > THRESHOLD else self.moved_since
         if worst > THRESHOLD and suspect is None and self.num_exceeded < CONFIRMATIONS:
             # outliers do not widen the bounds

@@ -189,9 +189,8 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
     left = max(left, 0.0)
     k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     monitor = state.consistency
-    limit = _get_horizontal_limit(setup, state) - state.gnss.outlier_allowance - abs(monitor.lever_arm)
-    if not monitor.excludes_fixes:
-        limit -= monitor.horizontal_allowance
+    limit = _get_horizontal_limit(setup, state) - state.gnss.outlier_allowance
+    limit -= abs(monitor.lever_arm) + monitor.horizontal_allowance
     C = nav.covariance
     p = protection_levels.compute_longest_variance(C) + settings.lever_arm_sigma**2
     v, c = max(C.item(3, 3), C.item(4, 4)), 2.0 * max(C.item(0, 3), C.item(1, 4), 0.0)

@@ -371,6 +371,36 @@ def test_given_fixes_that_jump_then_what_is_not_used_widens_no_bound() -> None:
     assert later.heading_allowance == monitor.heading_allowance
 
 
+def test_given_fixes_that_jump_then_the_bound_covers_how_far_a_heading_that_may_be_off_leads() -> None:
+    found = next(each for each in drive(230.0, Fault(200.0, 230.0, jump=40.0)) if each.found is not None)
+    assert found.found is not None
+    before = found.monitor._replace(heading_allowance=0.5, horizontal_allowance=1.0)
+    start = found.found.discrepancy.node.path
+    monitor = before.resolve(found.found, found.node.utime)
+    assert monitor.horizontal_allowance == pytest.approx(1.0 + math.sin(0.5) * abs(found.node.path - start))
+    for n in range(1, 11):
+        path = found.node.path + 2.0 * n * (found.node.path - start) / abs(found.node.path - start)
+        node = found.node._replace(utime=found.node.utime + 500_000 * n, path=path)
+        monitor = monitor.compare(node, NOISE, SETTINGS)
+    assert monitor.heading_allowance == 0.5
+    assert monitor.horizontal_allowance == pytest.approx(1.0 + math.sin(0.5) * abs(node.path - start))
+
+
+def test_given_an_antenna_that_was_found_elsewhere_then_the_bound_of_the_heading_covers_how_it_swings_in_turns() -> (
+    None
+):
+    *_, last = drive(60.0, Fault(), correlated=0.03)
+    straight = last.monitor.compare(last.node, NOISE, SETTINGS)._replace(heading_allowance=0.0)
+    turning = last.node._replace(own_heading=last.node.own_heading + 0.4)
+    none, half, one = (
+        straight._replace(lever_arm=arm).compare(turning, NOISE, SETTINGS).heading_allowance for arm in (0j, 0.5j, -1.0)
+    )
+    assert none < 0.01
+    # 0.2 m beside the way of seconds
+    assert 0.015 < half < 0.1
+    assert one == pytest.approx(2.0 * half, rel=0.01)
+
+
 def test_given_fixes_that_were_off_for_seconds_then_they_are_trusted_again_soon() -> None:
     fault = Fault(200.0, 203.0, jump=4.0)
     steps = drive(260.0, fault)
