@@ -92,8 +92,7 @@ SHRINK_PATH: Final = 5.0
 err otherwise than modeled, and at rest fixes show no heading."""
 
 SUSPICION_TIME: Final = 60.0
-"""Seconds in which the suspicion decays about an error of gyro or wheels, which may have been one of the fixes, or that
-wheels no longer show."""
+"""Seconds in which the suspicion decays about fixes that are trusted, and about an error that wheels no longer show."""
 
 STRAIGHT: Final = 0.9
 """Length of a path between its ends, relative to that along it, which shows a course."""
@@ -186,7 +185,7 @@ class ConsistencyMonitor(NamedTuple):
     hidden: angle by which a gyro whose bias has changed may have turned the heading while fixes do not show it, rad.
     held: bound of the heading before the last fix, rad, at `held_utime` and `held_distance`.
     lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
-    suspicion: what was taken for an error of gyro or wheels, and may have been one of the fixes, m.
+    suspicion: what was taken for an error of gyro or wheels, or for agreement, and may have been one of the fixes, m.
     """
 
     utime: int = 0
@@ -303,10 +302,15 @@ class ConsistencyMonitor(NamedTuple):
             lever_arm=self.lever_arm,
         )
 
-    def trust(self) -> ConsistencyMonitor:
-        """Return the monitor after fixes have agreed with the path since the suspect node again: it continues."""
+    def trust(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> ConsistencyMonitor:
+        """Return the monitor after fixes have agreed with the path since the suspect node again: it continues.
+
+        They may be off as far as that agreement does not show.
+        """
         assert self.suspect is not None
-        since = self.suspect.utime
+        since, suspicion = self.suspect.utime, self.suspicion
+        if self.cause is not Cause.HEADING:
+            suspicion = max(suspicion, _bound_error(compare_window(self.suspect, node, noise, settings)))
         return self._replace(
             older=tuple(each for each in self.older if each.utime <= since),
             newest=tuple(each for each in self.newest if each.utime <= since),
@@ -315,6 +319,7 @@ class ConsistencyMonitor(NamedTuple):
             suspect=None,
             is_jump=False,
             agreed_since=0,
+            suspicion=suspicion,
         )
 
     def start_heading(self, fix_sigma: float, distance: float, *, is_measured: bool) -> ConsistencyMonitor:
@@ -397,8 +402,7 @@ class ConsistencyMonitor(NamedTuple):
             else:
                 heading = abs(wrap_angle(self.rotation - suspect.rotation))
                 found = compare_window(suspect, node, noise, settings)
-                # the fixes are as far off as they seem, and as dead reckoning may be
-                horizontal = abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
+                horizontal = _bound_error(found)
                 heading = max(heading, abs(found.turn))
         windows = self._compare_windows(node, noise, settings)
         for each in windows:
@@ -555,6 +559,11 @@ class ConsistencyMonitor(NamedTuple):
         worst = max(nodes, key=count_sigmas)
         change = find_turn(worst, node)
         return Inconsistency(Cause.HEADING, compare_window(worst, node, noise, settings), change)
+
+
+def _bound_error(found: Discrepancy) -> float:
+    """Return how far fixes may be off, m: as far as they seem, and as dead reckoning may be."""
+    return abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
 
 
 def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:

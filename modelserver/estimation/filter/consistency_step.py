@@ -108,7 +108,7 @@ def compare_path(
         monitor, agrees = monitor.check_trust(node, noise, settings)
         state = state._replace(consistency=monitor)
         if agrees:
-            return _trust(setup, state, newest, node)
+            return _trust(setup, state, newest, node, noise)
         alike = monitor.select_moved_alike(node)
         if monitor.cause is Cause.HEADING:
             if state.gnss.num_rejected:
@@ -144,7 +144,9 @@ def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 
-def _trust(setup: Setup, state: Aligned, newest: PathFix, node: PathNode) -> tuple[Aligned, tuple[Decision, ...]]:
+def _trust(
+    setup: Setup, state: Aligned, newest: PathFix, node: PathNode, noise: PathNoise
+) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after fixes that agree with dead reckoning since the suspect node again."""
     monitor = state.consistency
     assert monitor.suspect is not None
@@ -154,9 +156,10 @@ def _trust(setup: Setup, state: Aligned, newest: PathFix, node: PathNode) -> tup
         text = "the vehicle moves along its own axis again"
         turned = find_turn(monitor.suspect, node)
     if monitor.excludes_fixes:
-        after = state._replace(consistency=monitor.trust(), gnss=state.gnss.restart(newest.utime))
+        trusting = monitor.trust(node, noise, setup.settings)
+        after = state._replace(consistency=trusting, gnss=state.gnss.restart(newest.utime))
         return after, (report_event(after, KIND, Verdict.USED, text),)
-    after = state._replace(consistency=hold_heading(setup, state, state.nav).trust())
+    after = state._replace(consistency=hold_heading(setup, state, state.nav).trust(node, noise, setup.settings))
     # the fixes have turned the state since
     P = state.nav.covariance.copy()
     P[8, 8] += turned**2

@@ -416,6 +416,12 @@ def test_given_fixes_that_were_off_for_seconds_then_they_are_trusted_again_soon(
                 break
     assert agrees
     assert each.t < 203.0 + AGREEMENT_TIME + 5.0
+    # what that agreement does not show is allowed for, and decays in a minute
+    trusting = monitor._replace(compared_utime=each.node.utime).trust(each.node, NOISE, SETTINGS)
+    assert monitor.suspect is not None
+    assert trusting.suspicion > abs(compare_window(monitor.suspect, each.node, NOISE, SETTINGS).error)
+    later = each.node._replace(utime=each.node.utime + 60_000_000)
+    assert trusting.compare(later, NOISE, SETTINGS).suspicion == pytest.approx(trusting.suspicion / math.e, rel=0.01)
 
 
 def test_given_a_path_that_becomes_vague_while_fixes_agree_then_they_are_trusted_and_else_not() -> None:
