@@ -20,7 +20,7 @@ of fixes (`fit_drift`).
 
 A gyro whose bias has changed turns the heading before fixes show it, most at a walk: by b T while b |m| is within their
 noise, over the longest such window. The bound of the heading is never below that angle for b = `gyro_bias_step`
-(`hidden`); where wheels stop measuring the path it decays.
+(`hidden`); where wheels stop measuring the path, or it begins again, that angle decays.
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
 gyro, as on a ferry (`Cause.HEADING`). It is trusted again when it agrees with the gyro of before (`find_turn`), while
@@ -92,7 +92,7 @@ SHRINK_PATH: Final = 5.0
 err otherwise than modeled, and at rest fixes show no heading."""
 
 SUSPICION_TIME: Final = 60.0
-"""Seconds in which the suspicion decays about fixes that are trusted, and about an error that wheels no longer show."""
+"""Seconds in which the suspicion decays about fixes that are trusted, and about a turn that no path shows any more."""
 
 STRAIGHT: Final = 0.9
 """Length of a path between its ends, relative to that along it, which shows a course."""
@@ -239,6 +239,8 @@ class ConsistencyMonitor(NamedTuple):
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error))
             path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None)
+            if found.cause is Cause.GYRO:
+                path = path._replace(hidden=0.0)
             if found.cause is Cause.LEVER_ARM:
                 path = path._replace(lever_arm=self.lever_arm + found.lever_arm)
             return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
@@ -452,6 +454,9 @@ class ConsistencyMonitor(NamedTuple):
             fade = heading_fade = 1.0
         suspicion_fade = math.exp(-seconds / SUSPICION_TIME)
         suspicion = suspicion_fade * self.suspicion
+        hidden, is_limited = _find_hidden_turn(windows, node, noise, settings)
+        if not is_limited:
+            hidden = max(hidden, suspicion_fade * self.hidden)
         return self._replace(
             last=node,
             suspicion=suspicion,
@@ -461,10 +466,7 @@ class ConsistencyMonitor(NamedTuple):
             compared_distance=node.distance,
             horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
-            hidden=max(
-                _find_hidden_turn(windows, node, noise, settings),
-                0.0 if node.is_measured else suspicion_fade * self.hidden,
-            ),
+            hidden=hidden,
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:
@@ -566,8 +568,11 @@ def _bound_error(found: Discrepancy) -> float:
     return abs(found.error) + PATH_SIGMAS * math.sqrt(compute_longest_axis(*found.covariance))
 
 
-def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:
-    """Return the angle by which a gyro whose bias has changed may have turned the heading unseen, rad.
+def _find_hidden_turn(
+    windows: list[Discrepancy], end: PathNode, noise: PathNoise, settings: FilterSettings
+) -> tuple[float, bool]:
+    """Return the angle by which a gyro whose bias has changed may have turned the heading unseen, rad; and whether more
+    would be seen.
 
     A change by b = `gyro_bias_step` at the start of a window has turned it by b T, and the path has left the fixes by
     b |m|. `windows`: the shortest first; only wheels show by their path what fixes have not turned.
@@ -582,9 +587,9 @@ def _find_hidden_turn(windows: list[Discrepancy], end: PathNode, noise: PathNois
         within = HIDDEN_SIGMAS * math.sqrt(get_fix_variance(start, end, noise, settings))
         if off > within:
             # the moment grows with the square of time
-            return max(hidden, turn * math.sqrt(within / off))
+            return max(hidden, turn * math.sqrt(within / off)), True
         hidden = turn
-    return hidden
+    return hidden, False
 
 
 def _compare_course(found: Discrepancy, end: PathNode, noise: PathNoise, settings: FilterSettings) -> float:

@@ -230,6 +230,21 @@ def test_given_wheels_that_no_longer_measure_then_a_turn_that_may_be_hidden_deca
     assert find_hidden(last.monitor._replace(hidden=0.0), 1.0) == 0.0
 
 
+@pytest.mark.parametrize(("cause", "is_kept"), [(Cause.WHEELS, True), (Cause.GYRO, False)])
+def test_given_a_path_that_begins_again_then_a_turn_that_may_be_hidden_is_kept_unless_the_gyro_was_corrected(
+    cause: Cause, is_kept: bool
+) -> None:
+    *_, last = drive(60.0, Fault())
+    hidden = last.monitor.hidden
+    assert hidden > 0.05
+    found = Inconsistency(cause, compare_window(last.monitor.newest[-2], last.node, NOISE, SETTINGS))
+    after = last.monitor.resolve(found, last.node.utime).compare(last.node, NOISE, SETTINGS)
+    assert after.hidden == pytest.approx(hidden if is_kept else 0.0)
+    # until the new path shows it
+    known = last.monitor._replace(hidden=1.0).compare(last.node, NOISE, SETTINGS)
+    assert known.hidden == pytest.approx(hidden, rel=0.1)
+
+
 @pytest.mark.parametrize("scale", [0.15, -0.1])
 def test_given_wheels_that_slip_then_they_are_the_cause(scale: float) -> None:
     found = find(Fault(200.0, scale=scale))
