@@ -429,8 +429,8 @@ class ConsistencyMonitor(NamedTuple):
             if each.turn_sigma:
                 heading = max(heading, 2.0 * (abs(each.turn) - ALLOWED_TURN * each.turn_sigma))
                 if self.lever_arm:
-                    swung = self.lever_arm * (cmath.rect(1.0, node.own_heading - each.node.own_heading) - 1.0)
-                    heading = max(heading, math.atan2(abs(swung), abs(each.displacement)))
+                    beside = self.lever_arm * (cmath.rect(1.0, node.own_heading - each.node.own_heading) - 1.0)
+                    heading = max(heading, math.atan2(abs(beside), abs(each.displacement)))
         moved_since = node.utime if latest > THRESHOLD else self.moved_since
         if worst > THRESHOLD and suspect is None and self.num_exceeded < CONFIRMATIONS:
             # outliers do not widen the bounds

@@ -230,16 +230,16 @@ def test_given_wheels_that_no_longer_measure_then_a_turn_that_may_be_hidden_deca
     assert find_hidden(last.monitor._replace(hidden=0.0), 1.0) == 0.0
 
 
-@pytest.mark.parametrize(("cause", "is_kept"), [(Cause.WHEELS, True), (Cause.GYRO, False)])
-def test_given_a_path_that_begins_again_then_a_turn_that_may_be_hidden_is_kept_unless_the_gyro_was_corrected(
-    cause: Cause, is_kept: bool
+@pytest.mark.parametrize(("cause", "lasts"), [(Cause.WHEELS, True), (Cause.GYRO, False)])
+def test_given_a_path_that_begins_again_then_a_turn_that_may_be_hidden_lasts_unless_the_gyro_was_corrected(
+    cause: Cause, lasts: bool
 ) -> None:
     *_, last = drive(60.0, Fault())
     hidden = last.monitor.hidden
     assert hidden > 0.05
     found = Inconsistency(cause, compare_window(last.monitor.newest[-2], last.node, NOISE, SETTINGS))
     after = last.monitor.resolve(found, last.node.utime).compare(last.node, NOISE, SETTINGS)
-    assert after.hidden == pytest.approx(hidden if is_kept else 0.0)
+    assert after.hidden == pytest.approx(hidden if lasts else 0.0)
     # until the new path shows it
     known = last.monitor._replace(hidden=1.0).compare(last.node, NOISE, SETTINGS)
     assert known.hidden == pytest.approx(hidden, rel=0.1)
@@ -401,9 +401,7 @@ def test_given_fixes_that_jump_then_the_bound_covers_how_far_a_heading_that_may_
     assert monitor.horizontal_allowance == pytest.approx(1.0 + math.sin(0.5) * abs(node.path - start))
 
 
-def test_given_an_antenna_that_was_found_elsewhere_then_the_bound_of_the_heading_covers_how_it_swings_in_turns() -> (
-    None
-):
+def test_given_an_antenna_that_was_found_elsewhere_then_the_bound_of_the_heading_covers_how_it_moves_in_turns() -> None:
     *_, last = drive(60.0, Fault(), correlated=0.03)
     straight = last.monitor.compare(last.node, NOISE, SETTINGS)._replace(heading_allowance=0.0)
     turning = last.node._replace(own_heading=last.node.own_heading + 0.4)

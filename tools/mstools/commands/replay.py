@@ -276,11 +276,11 @@ def _track_progress(
 
 @dataclass
 class ReplayCounts:
-    """Number of poses, of valid ones, and of those with each invalid reason; rejected measurements by their kind."""
+    """Number of poses, of valid ones, of invalid ones by the bits of their reasons; rejected measurements by kind."""
 
     written: int = 0
     valid: int = 0
-    reasons: Counter[Invalid] = field(default_factory=Counter)
+    invalid: Counter[int] = field(default_factory=Counter)
     rejected: defaultdict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
     def count_pose(self, row: TrackRow) -> None:
@@ -288,12 +288,19 @@ class ReplayCounts:
         self.written += 1
         self.valid += row.valid
         if not row.valid:
-            self.reasons.update(flag for flag in Invalid if row.invalid & flag)
+            self.invalid[row.invalid] += 1
 
     def count_decision(self, decision: Decision) -> None:
         """Count a rejected measurement."""
         if decision.verdict is Verdict.REJECTED:
             self.rejected[f"sensor:{decision.source}", decision.reason or "rejected"][decision.kind] += 1
+
+    def count_reasons(self) -> list[tuple[Invalid, int]]:
+        """Return the number of poses with each invalid reason, the most frequent one first."""
+        reasons: Counter[Invalid] = Counter()
+        for bits, n in self.invalid.items():
+            reasons.update({flag: n for flag in Invalid if bits & flag})
+        return reasons.most_common()
 
     def as_data(self, run: OfflineRun, wall: float) -> dict[str, Any]:
         """Return the counts as JSON data; `wall`: duration of the run, seconds."""
@@ -301,7 +308,7 @@ class ReplayCounts:
         return {
             "poses": self.written,
             "valid": self.valid,
-            "invalid_reasons": {str(flag.name): n for flag, n in self.reasons.most_common()},
+            "invalid_reasons": {str(flag.name): n for flag, n in self.count_reasons()},
             "events": run.events,
             "samples": run.samples,
             "seconds": span,
@@ -324,7 +331,7 @@ class ReplayCounts:
         if has_poses:
             head = f"{format_count(self.written, 'pose')} of {run.frame}, {self.valid} valid"
             if self.valid < self.written:
-                mostly = "".join(f", mostly {flag.name}" for flag, _ in self.reasons.most_common(1))
+                mostly = "".join(f", mostly {flag.name}" for flag, _ in self.count_reasons()[:1])
                 head += f" (not valid: {self.written - self.valid}{mostly})"
             head += ", from "
         lines = [
