@@ -95,7 +95,7 @@ class Inconsistency(NamedTuple):
     is_jump: bool = False
 
 
-class Model(NamedTuple):
+class CauseModel(NamedTuple):
     """Errors that a cause adds: its columns in `find_causes`, and the standard deviation of their factors."""
 
     cause: Cause
@@ -108,16 +108,16 @@ USUAL: Final = (1, 2, 3)
 """Columns of `find_causes`: errors of the fixes, and errors that the state knows of the path."""
 
 ALONG_BOTH_AXES: Final = (
-    Model(Cause.GNSS, (4, 5), TYPICAL_DRIFT),
-    Model(Cause.GNSS, (6, 7), TYPICAL_JUMP),
-    Model(Cause.LEVER_ARM, (8, 9), TYPICAL_LEVER_ARM),
+    CauseModel(Cause.GNSS, (4, 5), TYPICAL_DRIFT),
+    CauseModel(Cause.GNSS, (6, 7), TYPICAL_JUMP),
+    CauseModel(Cause.LEVER_ARM, (8, 9), TYPICAL_LEVER_ARM),
 )
 OF_THE_PATH: Final = (
-    Model(Cause.GYRO, (3,), TYPICAL_CHANGE[Cause.GYRO]),
-    Model(Cause.WHEELS, (2,), TYPICAL_CHANGE[Cause.WHEELS]),
+    CauseModel(Cause.GYRO, (3,), TYPICAL_CHANGE[Cause.GYRO]),
+    CauseModel(Cause.WHEELS, (2,), TYPICAL_CHANGE[Cause.WHEELS]),
     # a latency that has changed before the window too, and from its start on
-    Model(Cause.LATENCY, (10,), TYPICAL_CHANGE[Cause.LATENCY]),
-    Model(Cause.LATENCY, (11,), TYPICAL_CHANGE[Cause.LATENCY]),
+    CauseModel(Cause.LATENCY, (10,), TYPICAL_CHANGE[Cause.LATENCY]),
+    CauseModel(Cause.LATENCY, (11,), TYPICAL_CHANGE[Cause.LATENCY]),
 )
 """Models with two parameters, and with one."""
 
@@ -144,7 +144,7 @@ def find_causes(
     usual = np.sqrt([(each.heading_variance, each.scale_variance, each.rate_variance) for each in begins])
     is_precise = np.array([each.correlated < LARGEST_FIX_SIGMA for each in begins])
     largest = 2.0 * LARGEST_REST * replayed.is_inside.sum(axis=1)
-    _, _, none = _fit(products, usual, (Model(Cause.GNSS, (), 1.0),))
+    _, _, none = _fit(products, usual, (CauseModel(Cause.GNSS, (), 1.0),))
     found: dict[Cause, Inconsistency] = {}
     for models in (ALONG_BOTH_AXES, OF_THE_PATH):
         factors, rest, evidence = _fit(products, usual, models)
@@ -273,7 +273,7 @@ def _weight(columns: Array, covariances: Array) -> Array:
     return np.asarray(along_x + transposed[:, num_columns:] @ weighted[:, :, num_columns:])
 
 
-def _fit(products: Array, usual: Array, models: Sequence[Model]) -> tuple[Array, Array, Array]:
+def _fit(products: Array, usual: Array, models: Sequence[CauseModel]) -> tuple[Array, Array, Array]:
     """Return least-squares fits of the errors: factors, squares that remain, -2 log of the evidence.
 
     `products` are those of `_weight`, `usual` the standard deviations (K x 3) of the parameters of the path that each
