@@ -13,6 +13,8 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from support_daemon import write_raptor
@@ -113,6 +115,32 @@ def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
     while set(running := list_running(vehicle)) != PROCESSES:
         assert time.monotonic() < deadline, f"missing: {PROCESSES - set(running)}"
     return vehicle, running
+
+
+def test_given_a_pose_that_is_valid_late_then_the_demo_receives_more_until_it_can_ask_for_those_of_seconds_ago() -> (
+    None
+):
+    start_utime = round(time.time() * 1e6) - 60_000_000
+    listener = SimpleNamespace(poses=[])
+
+    def listen(_: float, __: object) -> None:
+        last = listener.received[-1] if listener.received else start_utime + 30_000_000
+        listener.received.append(last + 500_000)
+        listener.poses.append(SimpleNamespace(transformation=SimpleNamespace(utime=last + 500_000)))
+
+    listener.received, listener.listen = [], listen
+    valid: list[Any] = []
+    # the drive of 55 s is over, and its first pose has just become valid
+    poses = demo.iter_poses(
+        cast(demo.PoseListener, listener),
+        start_utime,
+        55.0,
+        cast(ChildProcesses, SimpleNamespace(check=lambda: None)),
+        lambda: bool(valid) and demo.get_span(valid) > demo.PAST_SECONDS,
+    )
+    for pose in poses:
+        valid.append(pose)  # noqa: PERF402 - iter_poses asks how many there are
+    assert demo.get_span(valid) == demo.PAST_SECONDS + 0.5
 
 
 def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_ends_by_itself():

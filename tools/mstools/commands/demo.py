@@ -35,6 +35,8 @@ EXTRA_SECONDS = 60.0
 """Time that the devices run beyond the drive; the demo ends them earlier."""
 LATE_SECONDS = 20.0
 """On a busy machine samples are late, and so is the heading."""
+PAST_SECONDS = 2.0
+"""How far back the demo asks for poses: for so long one must have been known."""
 SETTLING_SECONDS = 2.0
 """Time from the start of the drive until a driver's rate is that of a whole second."""
 
@@ -114,7 +116,11 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         typer.echo("   time      easting     northing       up     yaw   error            protection level state")
         valid: list[PoseAnswer] = []
         received, next_row, alive = 0, 0.0, ""
-        for pose in iter_poses(listener, start_utime, seconds, children, lambda: bool(valid)):
+
+        def has_past() -> bool:
+            return bool(valid) and get_span(valid) > PAST_SECONDS
+
+        for pose in iter_poses(listener, start_utime, seconds, children, has_past):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
             is_first = pose.transformation.is_valid and not valid
@@ -143,7 +149,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
             typer.echo(f"   {text}")
 
         typer.echo("\n5. The camera in the world a second ago, from the history")
-        at = valid[-1].transformation.utime - 1_000_000
+        at = valid[-1].transformation.utime - round(0.5e6 * PAST_SECONDS)
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
         history = platform.get_history(at - 1_000_000, at, 10.0)
         typer.echo(f"get_history returned {len(history)} poses of the second before that")
@@ -234,15 +240,20 @@ def list_missing_devices(drivers: dict[str, DriverHealth], lines: EmulatedConnec
 
 
 def iter_poses(
-    listener: PoseListener, start_utime: int, seconds: float, children: ChildProcesses, has_valid: Callable[[], bool]
+    listener: PoseListener, start_utime: int, seconds: float, children: ChildProcesses, has_enough: Callable[[], bool]
 ) -> Iterator[PoseAnswer]:
-    """Yield the published poses of the drive; until one is valid also those of `LATE_SECONDS` after it."""
+    """Yield the published poses of the drive; until they are enough also those of `LATE_SECONDS` after it."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
-    while (left := end + (0.0 if has_valid() else LATE_SECONDS) - time.monotonic()) > 0.0:
+    while (left := end + (0.0 if has_enough() else LATE_SECONDS) - time.monotonic()) > 0.0:
         listener.listen(left, lambda: bool(listener.poses))
         yield from (pose for pose in listener.poses if pose.transformation.utime >= start_utime)
         listener.poses.clear()
         children.check()
+
+
+def get_span(poses: list[PoseAnswer]) -> float:
+    """Return the seconds from the first pose to the last."""
+    return (poses[-1].transformation.utime - poses[0].transformation.utime) * 1e-6
 
 
 def format_row(pose: PoseAnswer, since: float, truth: Pose, truth_origin: tuple[float, float, float]) -> str:
