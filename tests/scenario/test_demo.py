@@ -136,7 +136,7 @@ def test_given_a_pose_that_is_valid_late_then_the_demo_receives_more_until_it_ca
         start_utime,
         55.0,
         cast(ChildProcesses, SimpleNamespace(check=lambda: None)),
-        lambda: bool(valid) and demo.get_span(valid) > demo.PAST_SECONDS,
+        lambda: demo.get_span(valid) > demo.PAST_SECONDS,
     )
     for pose in poses:
         valid.append(pose)  # noqa: PERF402 - iter_poses asks how many there are

@@ -540,8 +540,8 @@ class ConsistencyMonitor(NamedTuple):
             return None
         causes = sorted(find_causes(nodes, node, noise, settings).values(), key=lambda each: -each.explained)
         if causes and causes[0].cause is not Cause.GNSS:
-            best, rest = causes[0], max((each.explained for each in causes[1:]), default=0.0)
-            if best.explained > max(rest, 0.0) + MARGIN[best.cause]:
+            best, rest = causes[0], max([0.0, *(each.explained for each in causes[1:])])
+            if best.explained > rest + MARGIN[best.cause]:
                 return best
         if self.suspect is not None:
             return None

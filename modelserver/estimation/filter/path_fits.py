@@ -33,6 +33,7 @@ from modelserver.estimation.filter.path_windows import (
     get_fix_variance,
     shift_fix,
 )
+from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.filter.settings import FilterSettings
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -139,11 +140,13 @@ def find_causes(
     nodes = (*nodes[starts[0] :], newest)
     first = np.array(starts) - starts[0]
     replayed = replay_paths(nodes, first)
-    products = _weight(_find_errors(nodes, first, replayed), _get_covariances(nodes, first, replayed, noise, settings))
+    inside = replayed.is_inside
+    products = _weight(_find_errors(nodes, first, replayed), _get_covariances(nodes, first, inside, noise, settings))
     begins = [nodes[k] for k in first]
     usual = np.sqrt([(each.heading_variance, each.scale_variance, each.rate_variance) for each in begins])
     is_precise = np.array([each.correlated < LARGEST_FIX_SIGMA for each in begins])
-    largest = 2.0 * LARGEST_REST * replayed.is_inside.sum(axis=1)
+    largest = 2.0 * LARGEST_REST * inside.sum(axis=1)
+    # by the errors that the state knows alone
     _, _, none = _fit(products, usual, (CauseModel(Cause.GNSS, (), 1.0),))
     found: dict[Cause, Inconsistency] = {}
     for models in (ALONG_BOTH_AXES, OF_THE_PATH):
@@ -236,10 +239,9 @@ def _find_errors(nodes: Sequence[PathNode], first: Array, replayed: WindowPaths)
 
 
 def _get_covariances(
-    nodes: Sequence[PathNode], first: Array, replayed: WindowPaths, noise: PathNoise, settings: FilterSettings
+    nodes: Sequence[PathNode], first: Array, inside: Array, noise: PathNoise, settings: FilterSettings
 ) -> Array:
     """Return the covariances (K x N x N) of the errors of fixes along one axis, m2: of the fixes and of slip."""
-    inside = replayed.is_inside
     seconds, distances, unmeasured, white, correlated = np.array(
         [(n.seconds, n.distance, n.unmeasured, n.white, n.correlated) for n in nodes]
     ).T
@@ -360,6 +362,6 @@ def fit_drift(nodes: tuple[PathNode, ...], rotation: float, noise: PathNoise, se
         turn += float(x[4])
     P = np.linalg.inv(information)
     rest = float(np.mean(np.abs(b - A @ x) ** 2)) / (2.0 * share)
-    longest = 0.5 * (P[2, 2] + P[3, 3]) + math.hypot(0.5 * (P[2, 2] - P[3, 3]), P[2, 3])
+    longest = compute_longest_axis(P[2, 2], P[3, 3], P[2, 3])
     tolerance = math.sqrt(get_fix_variance(first, last, noise._replace(inflation=1.0), settings))
     return DriftFit(turn, math.sqrt(P[4, 4]), math.hypot(x[2], x[3]), math.sqrt(longest), tolerance, seconds, rest)

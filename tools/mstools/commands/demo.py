@@ -116,11 +116,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         typer.echo("   time      easting     northing       up     yaw   error            protection level state")
         valid: list[PoseAnswer] = []
         received, next_row, alive = 0, 0.0, ""
-
-        def has_past() -> bool:
-            return bool(valid) and get_span(valid) > PAST_SECONDS
-
-        for pose in iter_poses(listener, start_utime, seconds, children, has_past):
+        for pose in iter_poses(listener, start_utime, seconds, children, lambda: get_span(valid) > PAST_SECONDS):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
             is_first = pose.transformation.is_valid and not valid
@@ -149,7 +145,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
             typer.echo(f"   {text}")
 
         typer.echo("\n5. The camera in the world a second ago, from the history")
-        at = valid[-1].transformation.utime - round(0.5e6 * PAST_SECONDS)
+        at = valid[-1].transformation.utime - 1_000_000
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
         history = platform.get_history(at - 1_000_000, at, 10.0)
         typer.echo(f"get_history returned {len(history)} poses of the second before that")
@@ -252,7 +248,9 @@ def iter_poses(
 
 
 def get_span(poses: list[PoseAnswer]) -> float:
-    """Return the seconds from the first pose to the last."""
+    """Return the seconds from the first pose to the last; 0 of none."""
+    if not poses:
+        return 0.0
     return (poses[-1].transformation.utime - poses[0].transformation.utime) * 1e-6
 
 
