@@ -238,7 +238,7 @@ class ConsistencyMonitor(NamedTuple):
             # the uncertainty of a latency that was corrected covers what is left
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error))
-            path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None)
+            path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None, is_jump=False)
             if found.cause is Cause.GYRO:
                 path = path._replace(hidden=0.0)
             if found.cause is Cause.LEVER_ARM:

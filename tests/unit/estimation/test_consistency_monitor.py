@@ -401,6 +401,19 @@ def test_given_fixes_that_jump_then_the_bound_covers_how_far_a_heading_that_may_
     assert monitor.horizontal_allowance == pytest.approx(1.0 + math.sin(0.5) * abs(node.path - start))
 
 
+@pytest.mark.parametrize("cause", [Cause.GYRO, Cause.WHEELS, Cause.LATENCY, Cause.LEVER_ARM])
+def test_given_fixes_that_jumped_then_another_cause_that_is_corrected_ends_their_exclusion(cause: Cause) -> None:
+    found = next(each for each in drive(230.0, Fault(200.0, 230.0, jump=40.0)) if each.found is not None)
+    assert found.found is not None
+    monitor = found.monitor.resolve(found.found, found.node.utime)
+    assert monitor.excludes_fixes
+    corrected = monitor.resolve(found.found._replace(cause=cause), found.node.utime)
+    assert not corrected.excludes_fixes
+    # allowances fade again
+    later = found.node._replace(utime=found.node.utime + 20_000_000)
+    assert 0.0 < corrected.compare(later, NOISE, SETTINGS).horizontal_allowance < 0.75 * corrected.horizontal_allowance
+
+
 def test_given_an_antenna_that_was_found_elsewhere_then_the_bound_of_the_heading_covers_how_it_moves_in_turns() -> None:
     *_, last = drive(60.0, Fault(), correlated=0.03)
     straight = last.monitor.compare(last.node, NOISE, SETTINGS)._replace(heading_allowance=0.0)
