@@ -9,7 +9,8 @@ Below the threshold, what is unexplained widens the protection levels: the posit
 heading turned to explain it (`horizontal_allowance`, `heading_allowance`). Above it, one of the two is wrong, and the
 fits over all windows show which (`find_causes` in `path_fits`).
 
-What is corrected leaves an allowance that decays. An antenna that is elsewhere is reported, and the state goes on to
+What is corrected leaves an allowance that decays (`suspicion`), beside what windows show since: if the fixes drifted
+after all, the path has begun again beside them. An antenna that is elsewhere is reported, and the state goes on to
 follow it: in turns it shows a way and a heading that are not the vehicle's (`lever_arm`). Fixes that jump are not used,
 and dead reckoning is right for a while, but for what its heading may be off since before the jump (`_find_stray`).
 Fixes that drift are used on, since the fault may be that of the heading: the allowances are then all of e and of the
@@ -464,7 +465,7 @@ class ConsistencyMonitor(NamedTuple):
             num_exceeded=self.num_exceeded + 1 if worst > THRESHOLD else 0,
             compared_utime=node.utime,
             compared_distance=node.distance,
-            horizontal_allowance=max(horizontal, suspicion, fade * self.horizontal_allowance),
+            horizontal_allowance=max(horizontal + suspicion, fade * self.horizontal_allowance),
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
             hidden=hidden,
         )

@@ -414,6 +414,18 @@ def test_given_fixes_that_jumped_then_another_cause_that_is_corrected_ends_their
     assert 0.0 < corrected.compare(later, NOISE, SETTINGS).horizontal_allowance < 0.75 * corrected.horizontal_allowance
 
 
+def test_given_a_gyro_that_was_corrected_then_what_windows_show_since_widens_the_bound_beside_the_suspicion() -> None:
+    *_, last = drive(60.0, Fault(40.0, drift=0.4))
+    shown, both = (
+        last.monitor._replace(suspicion=suspicion, horizontal_allowance=0.0, compared_utime=last.node.utime).compare(
+            last.node, NOISE, SETTINGS
+        )
+        for suspicion in (0.0, 5.0)
+    )
+    assert shown.horizontal_allowance > 1.0
+    assert both.horizontal_allowance == pytest.approx(shown.horizontal_allowance + 5.0)
+
+
 def test_given_an_antenna_that_was_found_elsewhere_then_the_bound_of_the_heading_covers_how_it_moves_in_turns() -> None:
     *_, last = drive(60.0, Fault(), correlated=0.03)
     straight = last.monitor.compare(last.node, NOISE, SETTINGS)._replace(heading_allowance=0.0)
