@@ -153,6 +153,9 @@ REPEAT: Final = 4
 MARGIN: Final = MappingProxyType({Cause.GYRO: 8.0, Cause.WHEELS: 8.0, Cause.LATENCY: 5.0, Cause.LEVER_ARM: 5.0})
 """Evidence by which an error must exceed any other cause to be corrected."""
 
+KNOWN_BIAS: Final = 3.0
+"""Standard deviations by which the bias of a gyro is another one than before fixes became suspect, at least."""
+
 HIDDEN_SIGMAS: Final = 3.0
 """Standard deviations of fixes within which they hide a turn by a gyro whose bias has changed."""
 
@@ -335,13 +338,17 @@ class ConsistencyMonitor(NamedTuple):
         allowance = math.atan2(error * fix_sigma, distance)
         return self._replace(heading_allowance=max(self.heading_allowance, allowance))
 
-    def relearn(self, change: float, utime: int) -> ConsistencyMonitor:
-        """Return the monitor after a stationary vehicle has shown that the gyro's bias has changed, rad/s.
+    def relearn(self, bias: float, utime: int) -> ConsistencyMonitor:
+        """Return the monitor after a stationary vehicle has shown that the bias of the yaw gyro is another one, rad/s.
 
-        Fixes that did not agree with the path since may have been right.
+        Where it is that of before fixes became suspect, they have turned the state's; where it is not, they may have
+        been right beside a path that was wrong.
         """
-        if self.suspect is not None and abs(change) < 0.5 * TYPICAL_CHANGE[Cause.GYRO]:
-            return self
+        if self.suspect is not None:
+            change = abs(bias - self.suspect.rate_bias)
+            least = max(0.5 * TYPICAL_CHANGE[Cause.GYRO], KNOWN_BIAS * math.sqrt(self.suspect.rate_variance))
+            if change < least:
+                return self
         path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False)
         return path._replace(cause=Cause.GYRO, since=utime, suspect=None, is_jump=False)
 

@@ -174,7 +174,12 @@ def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor
 
 
 def is_heading_lost(setup: Setup, state: Aligned) -> bool:
-    """Return whether the heading may be any: then no measurement can be linearized at it."""
+    """Return whether the heading may be any: then no measurement can be linearized at it.
+
+    It is not lost while fixes are suspect: those that would show another one are the same.
+    """
+    if state.consistency.suspect is not None:
+        return False
     variance = float(state.nav.covariance[8, 8])
     return protection_levels.compute_heading(variance, setup.settings) >= math.pi
 

@@ -246,9 +246,10 @@ def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float
     # the mean may be from before it too
     P[[9, 10, 11], [9, 10, 11]] = change**2 + variance
     if isinstance(state, Aligned):
-        monitor = state.consistency
-        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), monitor.heading_allowance) ** 2
-        state = state._replace(consistency=monitor.relearn(float(change[2]), nav.utime))
+        monitor = state.consistency.relearn(float(turn[2]) / time, nav.utime)
+        allowance = state.consistency.heading_allowance if monitor.suspect is None else 0.0
+        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), allowance) ** 2
+        state = state._replace(consistency=monitor)
     nav = nav._replace(gyro_bias=to_vector3(turn / time), covariance=P)
     state = state._replace(nav=nav, constraints=rest._replace(rest_turn=ZERO, rest_time=0.0))
     text = f"the bias of a gyro has changed by {math.degrees(np.abs(change).max()):.2f} deg/s"

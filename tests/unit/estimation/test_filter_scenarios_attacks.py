@@ -13,8 +13,9 @@ from modelserver.estimation.filter import fusion, heading_alignment, heading_ste
 from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Leveling
+from modelserver.estimation.filter.state import Aligned, Leveling, Unaligned
 from modelserver.estimation.filter.timeline import Timeline
 from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
@@ -160,6 +161,47 @@ def test_given_a_heading_that_is_lost_and_half_a_turn_wrong_then_it_is_found_as_
     assert {row.estimate.pose_epoch for row in found.rows} == {state.common.epoch, state.common.epoch + 1}
     assert all(row.valid and abs(row.heading) < row.estimate.heading_protection_level for row in found.between(25.0))
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.rows if row.valid)
+
+
+@pytest.mark.parametrize("bias_before", [0.0, 0.02])
+def test_given_suspect_fixes_that_have_turned_the_bias_then_a_rest_that_shows_it_exonerates_them_only_if_it_is_new(
+    bias_before,
+):
+    phases = (*EIGHT, *stationary(20.0))
+    driven = sum(phase.duration for phase in EIGHT)
+    localizer = drive(simulation(phases), driven + 1.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    x, y, z = state.nav.gyro_bias
+    suspect = state.consistency.newest[0]._replace(rate_bias=z + bias_before)
+    monitor = state.consistency._replace(
+        suspect=suspect, cause=Cause.GNSS, since=state.nav.utime, horizontal_allowance=30.0, heading_allowance=math.pi
+    )
+    turned = state._replace(nav=state.nav._replace(gyro_bias=(x, y, z + 0.02)), consistency=monitor)
+    last = localizer.clocks.newest
+    localizer = localizer._replace(timeline=Timeline(turned), head=turned)
+
+    def drift(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if event.header.host_utime <= last:
+                continue
+            if isinstance(event, GpsSample):
+                event = replace(event, latitude_deg=event.latitude_deg + 30.0 / 111e3)
+            yield event
+
+    found = drive(simulation(phases), driven + 15.0, localizer=localizer, transform=drift)
+
+    assert any("bias of a gyro has changed" in each.reason for each in found.decisions("zero_rate", Verdict.RESET))
+    after = found.localizer.head
+    was_lost = bool(found.decisions("gps_position", Verdict.RESET, "the heading is lost"))
+    if bias_before:
+        assert was_lost
+        assert isinstance(after, Unaligned)
+    else:
+        assert not was_lost
+        assert isinstance(after, Aligned)
+        assert after.consistency.suspect == suspect
+        assert not any(row.valid for row in found.between(driven + 2.0))
 
 
 @pytest.mark.parametrize("is_along_body", [True, False])
