@@ -23,6 +23,9 @@ A gyro whose bias has changed turns the heading before fixes show it, most at a 
 noise, over the longest such window. The bound of the heading is never below that angle for b = `gyro_bias_step`
 (`hidden`); where wheels stop measuring the path, or it begins again, that angle decays.
 
+The receiver's velocity moves the state's, and may drift with the fixes: the path is then that of wheels and gyro, the
+state's and what they measure beside it (`follow_wheels`).
+
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
 gyro, as on a ferry (`Cause.HEADING`). It is trusted again when it agrees with the gyro of before (`find_turn`), while
 that is known well enough to contradict it.
@@ -59,6 +62,9 @@ from modelserver.estimation.filter.path_windows import (
 )
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.filter.settings import FilterSettings
+
+VELOCITY_TIME: Final = 2.0
+"""Seconds in which wheels and constraint return the state's velocity to theirs, after one of the receiver."""
 
 SPACING_US: Final = 900_000
 """Microseconds between two nodes of the newest part of the path."""
@@ -190,6 +196,7 @@ class ConsistencyMonitor(NamedTuple):
     held: bound of the heading before the last fix, rad, at `held_utime` and `held_distance`.
     lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
     suspicion: what was taken for an error of gyro or wheels, or for agreement, and may have been one of the fixes, m.
+    velocity_utime: of the last velocity of the receiver that the state has followed.
     """
 
     utime: int = 0
@@ -225,6 +232,7 @@ class ConsistencyMonitor(NamedTuple):
     held_distance: float = 0.0
     lever_arm: complex = 0j
     suspicion: float = 0.0
+    velocity_utime: int = 0
 
     @property
     def excludes_fixes(self) -> bool:
@@ -299,6 +307,17 @@ class ConsistencyMonitor(NamedTuple):
             bias_turn=self.bias_turn + rate_bias * gap,
         )
 
+    def follow_wheels(self, shift: complex, utime: int) -> ConsistencyMonitor:
+        """Return the monitor after wheels and constraint measured `shift` more than the way of the state, along N, m.
+
+        The path is theirs where the receiver's velocity has moved the state's: fixes that drift move it alike.
+        """
+        if (utime - self.velocity_utime) * 1e-6 > VELOCITY_TIME:
+            return self
+        step = shift * cmath.rect(1.0, -self.rotation)
+        seconds = (self.utime - self.begin) * 1e-6
+        return self._replace(path=self.path + step, moment=self.moment + seconds * step)
+
     def restart(self) -> ConsistencyMonitor:
         """Return the monitor before a new path, with what lasts."""
         return ConsistencyMonitor(
@@ -306,6 +325,7 @@ class ConsistencyMonitor(NamedTuple):
             held_utime=self.held_utime,
             held_distance=self.held_distance - self.distance,
             lever_arm=self.lever_arm,
+            velocity_utime=self.velocity_utime,
         )
 
     def trust(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> ConsistencyMonitor:

@@ -6,6 +6,7 @@ decisions); `fuse_measurement` is the one for every kind that needs no logic of 
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -38,6 +39,9 @@ from modelserver.named_tuples import new_tuple
 
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
+
+LONGEST_MEAN: Final = 1.0
+"""Seconds for which a residual of the speed is that of its mean, at most."""
 
 HELD_SPEED: Final = 1.5
 HELD_TILT: Final = 0.05
@@ -227,6 +231,9 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
         # the constraint turns the heading to the course of the fixes
         turn = wrap_angle(state.nav.yaw - before.yaw)
         state = state._replace(consistency=state.consistency.correct(0j, turn))
+    elif isinstance(state, Aligned) and decision.verdict is Verdict.USED:
+        aside = float(innovation.residual[0]) * min(dt, LONGEST_MEAN)
+        state = state._replace(consistency=state.consistency.follow_wheels(cmath.rect(aside, before.yaw) * 1j, utime))
     return state, decision
 
 
@@ -283,6 +290,8 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     state = state._replace(nav=nav)
     if is_gnss and isinstance(state, Aligned) and decision.verdict is Verdict.USED:
         state = correct_path(setup, state, context.nav)
+        if item.kind == "gps_velocity":
+            state = state._replace(consistency=state.consistency._replace(velocity_utime=item.utime))
     if isinstance(state, Aligned) and decision.verdict is Verdict.USED and not is_gnss:
         measures = innovation.jacobian[:, :3] != 0.0
         offset = state.gnss.offset

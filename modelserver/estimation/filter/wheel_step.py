@@ -16,6 +16,7 @@ from modelserver.estimation.filter import eskf, latency_estimator, leveling, pro
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
+    LONGEST_MEAN,
     NOTHING,
     ZUPT_PERIOD,
     Fused,
@@ -37,7 +38,7 @@ from modelserver.estimation.filter.measurements.wheels import (
 )
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState, Leveling, N, PreviousSample
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, PreviousSample
 from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
 from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
 from modelserver.transforms import so3
@@ -158,6 +159,10 @@ def _fuse_speed(
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
+        if isinstance(state, Aligned) and age < math.inf and not is_first_speed:
+            missed = float(innovation.residual.mean()) * min(age, LONGEST_MEAN)
+            monitor = state.consistency.follow_wheels(cmath.rect(missed, context.nav.yaw), item.utime)
+            state = state._replace(consistency=monitor)
     common = state.common._replace(wheels=wheels, mount=mount)
     return state._replace(nav=nav, common=common), (decision,), is_first_speed
 

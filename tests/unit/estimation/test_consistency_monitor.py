@@ -553,6 +553,19 @@ def test_given_a_correction_by_a_fix_then_the_path_does_not_move() -> None:
     assert moved.distance == pytest.approx(5.0)
 
 
+def test_given_a_velocity_of_the_receiver_then_the_path_follows_the_wheels_for_a_while_and_else_the_state() -> None:
+    *_, last = drive(60.0, Fault())
+    monitor = last.monitor._replace(rotation=0.5, velocity_utime=last.node.utime)
+    shift = cmath.rect(3.0, 0.5)
+    longer = monitor.follow_wheels(shift, last.node.utime + 400_000)
+    assert longer.path - monitor.path == pytest.approx(3.0)
+    assert longer.moment - monitor.moment == pytest.approx(3.0 * last.node.seconds)
+    # the fixes have not moved by it
+    assert longer.anchor == monitor.anchor
+    assert monitor.follow_wheels(shift, last.node.utime + 3_000_000) is monitor
+    assert longer.restart().velocity_utime == last.node.utime
+
+
 def test_given_a_gap_in_the_fixes_then_the_path_begins_again() -> None:
     monitor = (
         ConsistencyMonitor()

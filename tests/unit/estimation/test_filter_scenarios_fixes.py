@@ -170,6 +170,32 @@ def test_given_fixes_that_drift_with_their_velocity_then_it_does_not_bend_the_pa
     assert len(outside) <= 2
 
 
+def test_given_fixes_that_drift_ahead_with_their_velocity_then_the_path_that_judges_them_is_that_of_the_wheels():
+    phases = (DrivePhase(3.0, 0.0), DrivePhase(6.0, 12.0), DrivePhase(50.0, 12.0), DrivePhase(9.0, 0.0))
+    run = simulation(phases, gps_model=PLAIN_GPS, yaw=0.0)
+    begin, rate = run.start_utime + 20_000_000, 0.3
+
+    def drift(events: Iterable[Event]) -> Iterable[Event]:
+        for event in events:
+            since = (event.header.utime - begin) * 1e-6
+            if isinstance(event, GpsSample) and since > 0.0 and event.velocity is not None:
+                x, y, z = event.velocity
+                east = math.degrees(rate * since / 6.37e6) / math.cos(math.radians(event.latitude_deg))
+                event = replace(event, longitude_deg=event.longitude_deg + east, velocity=(x + rate, y, z))
+            yield event
+
+    found = drive(run, 50.0, transform=drift)
+
+    monitor = found.localizer.head.consistency
+    nodes = [each for each in (*monitor.older, *monitor.newest) if each.utime >= begin]
+    way = abs(nodes[-1].path - nodes[0].path)
+    driven = math.dist(*(run.truth(nodes[k].utime).enu.xyz for k in (0, -1)))
+    seconds = (nodes[-1].utime - nodes[0].utime) * 1e-6
+    # the wheels' scale has followed by the rest
+    assert abs(way - driven) < 0.7 * rate * seconds
+    assert monitor.cause is Cause.GNSS
+
+
 def test_given_no_fixes_but_a_pose_then_it_is_used_and_ranges_to_beacons_maintain_it():
     phases = figure_eight(speed=2.0, radius=8.0, laps=2)
     once = AbsolutePoseModel(outages=((6.0, 200.0),))
