@@ -159,7 +159,7 @@ def _fuse_speed(
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
-        # not where some of them are refused, or weighed less
+        # not where the gate has rejected some of them, or inflated their noise
         if isinstance(state, Aligned) and not decision.reason and age < math.inf and not is_first_speed:
             missed = float(innovation.residual.mean()) * min(age, LONGEST_MEAN)
             monitor = state.consistency.follow_wheels(cmath.rect(missed, context.nav.yaw), item.utime)

@@ -146,20 +146,30 @@ def _drop_latency(events):
         yield replace(event, velocity_latency=0.0) if event.header.source == "gps" else event
 
 
-def test_given_fixes_that_drift_with_their_velocity_then_it_does_not_bend_the_path_that_judges_them():
-    run = simulation(EIGHT)
-    begin, rate = run.start_utime + 40_000_000, 0.8
+def _drift_with_velocity(begin, *, east=0.0, north=0.0):
+    """Return a transform that moves fixes at a rate from `begin` on, and their velocity by it, m/s."""
 
     def drift(events: Iterable[Event]) -> Iterable[Event]:
         for event in events:
             since = (event.header.utime - begin) * 1e-6
             if isinstance(event, GpsSample) and since > 0.0 and event.velocity is not None:
                 x, y, z = event.velocity
-                north = math.degrees(rate * since / 6.37e6)
-                event = replace(event, latitude_deg=event.latitude_deg + north, velocity=(x, y + rate, z))
+                latitude, longitude = event.latitude_deg, event.longitude_deg
+                event = replace(
+                    event,
+                    latitude_deg=latitude + math.degrees(north * since / 6.37e6),
+                    longitude_deg=longitude + math.degrees(east * since / 6.37e6) / math.cos(math.radians(latitude)),
+                    velocity=(x + east, y + north, z),
+                )
             yield event
 
-    found = drive(run, 75.0, transform=drift)
+    return drift
+
+
+def test_given_fixes_that_drift_with_their_velocity_then_it_does_not_bend_the_path_that_judges_them():
+    run = simulation(EIGHT)
+
+    found = drive(run, 75.0, transform=_drift_with_velocity(run.start_utime + 40_000_000, north=0.8))
 
     suspect = [each for each in found.decisions("consistency", Verdict.RESET) if found.seconds(each) > 40.0]
     assert suspect
@@ -175,16 +185,7 @@ def test_given_fixes_that_drift_ahead_with_their_velocity_then_the_path_that_jud
     run = simulation(phases, gps_model=PLAIN_GPS, yaw=0.0)
     begin, rate = run.start_utime + 20_000_000, 0.3
 
-    def drift(events: Iterable[Event]) -> Iterable[Event]:
-        for event in events:
-            since = (event.header.utime - begin) * 1e-6
-            if isinstance(event, GpsSample) and since > 0.0 and event.velocity is not None:
-                x, y, z = event.velocity
-                east = math.degrees(rate * since / 6.37e6) / math.cos(math.radians(event.latitude_deg))
-                event = replace(event, longitude_deg=event.longitude_deg + east, velocity=(x + rate, y, z))
-            yield event
-
-    found = drive(run, 50.0, transform=drift)
+    found = drive(run, 50.0, transform=_drift_with_velocity(begin, east=rate))
 
     monitor = found.localizer.head.consistency
     nodes = [each for each in (*monitor.older, *monitor.newest) if each.utime >= begin]
