@@ -98,12 +98,23 @@ MAX_COUNTERS = 200
 """Largest number of the endpoint's counters in a health report; the runner's own come on top."""
 
 
+MAX_READ_NS, READ_ATTEMPTS = 20_000, 5
+"""Both clocks are read within this time, unless the process is interrupted in each attempt."""
+
+
 class SystemTimeSource:
     """The host's clocks."""
 
     def now(self) -> HostTime:
-        """Return the instant."""
-        return HostTime(time.monotonic_ns(), time.time_ns() // 1000)
+        """Return the instant: both clocks again, where the process was interrupted between them.
+
+        Otherwise the stamps made from the device's clock would be later than their samples by the interruption.
+        """
+        for _ in range(READ_ATTEMPTS):
+            monotonic_ns, time_ns = time.monotonic_ns(), time.time_ns()
+            if time.monotonic_ns() - monotonic_ns <= MAX_READ_NS:
+                break
+        return HostTime(monotonic_ns, time_ns // 1000)
 
     def sleep(self, seconds: float) -> None:
         """Wait."""

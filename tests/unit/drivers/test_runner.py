@@ -15,7 +15,7 @@ from modelserver.messages import DriverHealth, DriverPhase, ImuSample, Sample, S
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.links import EndOfRecordingError, LinkError
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.runner import Runner, RunnerSettings
+from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
 
 PERIOD_S = 0.1
 
@@ -313,3 +313,19 @@ def test_given_the_time_of_day_steps_then_nothing_waits_for_it() -> None:
     bench.until(10.0)
     assert len(bench.samples) == pytest.approx(99, abs=2)
     assert bench.reports[-1].phase is DriverPhase.STREAMING
+
+
+def test_given_an_interruption_between_the_clocks_then_both_are_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    ns = itertools.chain([0, 900_000, 901_000], itertools.count(902_000, 1_000))
+    monkeypatch.setattr("msdrivers.runner.time.monotonic_ns", lambda: next(ns))
+    monkeypatch.setattr("msdrivers.runner.time.time_ns", lambda: next(ns))
+    now = SystemTimeSource().now()
+    assert now.utime - now.monotonic_ns // 1000 <= 1
+    assert now.monotonic_ns == 902_000
+
+
+def test_given_an_interruption_at_each_reading_then_the_last_one_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    ns = itertools.count(0, 500_000)
+    monkeypatch.setattr("msdrivers.runner.time.monotonic_ns", lambda: next(ns))
+    monkeypatch.setattr("msdrivers.runner.time.time_ns", lambda: next(ns))
+    assert SystemTimeSource().now() == HostTime(6_000_000, 6_500)
