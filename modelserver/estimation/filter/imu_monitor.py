@@ -81,6 +81,11 @@ class ImuMonitor(NamedTuple):
         """Whether the numbers stay or follow a line, as no noise allows."""
         return self.num_collinear >= INTERPOLATED_SAMPLES
 
+    @property
+    def fills_gap(self) -> bool:
+        """Whether the numbers follow a line between two real samples: a driver fills a gap."""
+        return self.is_interpolated and bool(self.slope)
+
     def get_frozen_time(self, utime: int) -> float:
         """Return for how long the numbers have not changed, seconds."""
         return (utime - self.changed_utime) * 1e-6

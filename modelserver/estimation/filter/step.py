@@ -17,6 +17,7 @@ from modelserver.estimation.filter.fusion import (
     Handler,
     Item,
     fuse_measurement,
+    reject,
     report_reset,
 )
 from modelserver.estimation.filter.setup import Setup
@@ -75,15 +76,31 @@ def _switch_mode(setup: Setup, state: FilterState, item: Item) -> Fused:
     return state, (report_reset(item, f"mode {sample.mode.name.lower()}"),)
 
 
+def _fuse_gnss(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after a measurement of the receiver.
+
+    It is not used while a driver fills a gap of the IMU: of a unit that measures both, it may have filled that of the
+    receiver too, and a straight line between two fixes is off the path by meters in a turn.
+    """
+    imu, is_imu_used = state.imu, setup.uses_imu(state.common.mode)
+    if imu.fills_gap and is_imu_used and (item.utime - imu.used_utime) * 1e-6 <= setup.settings.rate_hold:
+        return state, (reject(item, "interpolated"),)
+    return _GNSS_HANDLERS[item.kind](setup, state, item)
+
+
+_GNSS_HANDLERS: dict[str, Handler] = {
+    "gps_position": gnss_step.fuse_fix,
+    "gps_height": gnss_step.fuse_height,
+    "gps_velocity": heading_step.fuse_velocity,
+    "gps_baseline": heading_step.fuse_baseline,
+}
+
 _HANDLERS: dict[str, Handler] = {
     IMU: imu_step.fuse_imu,
     MODE: _switch_mode,
     STEERING: wheel_step.fuse_steering,
     "wheel_speed": wheel_step.fuse_wheels,
-    "gps_position": gnss_step.fuse_fix,
-    "gps_height": gnss_step.fuse_height,
-    "gps_velocity": heading_step.fuse_velocity,
-    "gps_baseline": heading_step.fuse_baseline,
+    **dict.fromkeys(_GNSS_HANDLERS, _fuse_gnss),
     "imu_yaw": heading_step.fuse_imu_yaw,
     "absolute_pose": heading_step.fuse_absolute_pose,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -243,6 +244,45 @@ def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_
 
     assert found.decisions("inertial", Verdict.MONITORED, "interpolated")
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.between(20.0) if row.valid)
+
+
+def fill_gap(events: Iterable[Event], begin: float, end: float) -> Iterator[Event]:
+    """Replace what IMU and receiver measured between two times by straight lines, and drop the wheels."""
+    rows = [event for event in events if not isinstance(event, WheelsSample)]
+
+    def seconds(event: Event) -> float:
+        return (event.header.utime - START_UTIME) * 1e-6
+
+    for event in rows:
+        if not begin <= seconds(event) < end:
+            yield event
+            continue
+        same = [each for each in rows if type(each) is type(event)]
+        first = max((each for each in same if seconds(each) < begin), key=seconds)
+        last = min((each for each in same if seconds(each) >= end), key=seconds)
+        share = (seconds(event) - seconds(first)) / (seconds(last) - seconds(first))
+
+        def between(name: str, share: float = share, first: Event = first, last: Event = last) -> Any:
+            mixed = np.asarray(getattr(first, name)) * (1.0 - share) + np.asarray(getattr(last, name)) * share
+            return tuple(mixed.tolist()) if mixed.shape else float(mixed)
+
+        if isinstance(event, ImuSample):
+            yield replace(event, angular_velocity=between("angular_velocity"), specific_force=between("specific_force"))
+        else:
+            assert isinstance(event, GpsSample)
+            yield replace(event, latitude_deg=between("latitude_deg"), longitude_deg=between("longitude_deg"))
+
+
+@pytest.mark.parametrize("begin", [14.2, 24.2])
+def test_given_a_unit_whose_gap_was_filled_by_straight_lines_in_a_turn_then_its_fixes_do_not_turn_the_heading(begin):
+    eight = figure_eight(speed=5.0, radius=10.0, stationary=4.0, laps=2)
+    gone = simulation(eight, gps_model=replace(RTK_LIKE, has_velocity=False))
+
+    found = drive(gone, 40.0, transform=lambda events: fill_gap(events, begin, begin + 2.0))
+
+    assert found.decisions("gps_position", Verdict.REJECTED, "interpolated")
+    assert all(abs(row.heading) < math.radians(1.3) for row in found.between(begin + 3.5))
+    assert all(row.valid for row in found.between(begin + 7.0))
 
 
 def test_given_a_long_gap_of_the_imu_on_a_vehicle_without_wheels_then_it_is_leveled_again():
