@@ -60,8 +60,8 @@ RECORDINGS = (
         husky.convert,
         ROOT / "config" / "husky" / "vehicle.yaml",
         {
-            "half": AccuracyTarget(0.45, 0.33, "robot_localization 0.37 (UKF 0.34), 6-state EKF 1.65, FusionCore 0.45"),
-            "p2x": AccuracyTarget(3.4, 3.0, "robot_localization 3.4 (UKF 4.1), 6-state EKF 3.9, FusionCore 4.8 to 5.6"),
+            "half": AccuracyTarget(0.36, 0.33, "robot_localization 0.37 (UKF 0.34), 6-state EKF 1.65, FusionCore 0.45"),
+            "p2x": AccuracyTarget(3.3, 3.0, "robot_localization 3.4 (UKF 4.1), 6-state EKF 3.9, FusionCore 4.8 to 5.6"),
         },
     ),
     Recording(
@@ -70,8 +70,8 @@ RECORDINGS = (
         kitti.convert,
         ROOT / "benchmarks" / "vehicles" / "kitti" / "vehicle.yaml",
         {
-            "half": AccuracyTarget(0.35, 0.27, "robot_localization 0.25, 6-state EKF 0.32, KF-GINS 0.93, pyins 0.91"),
-            "p2x": AccuracyTarget(25.0, 15.0, "robot_localization 25, 6-state EKF 25, KF-GINS 90, pyins 74 (4 gaps)"),
+            "half": AccuracyTarget(0.27, 0.25, "robot_localization 0.25, 6-state EKF 0.32, KF-GINS 0.93, pyins 0.91"),
+            "p2x": AccuracyTarget(6.5, 6.0, "robot_localization 25, 6-state EKF 25, KF-GINS 90, pyins 74 (4 gaps)"),
         },
     ),
     Recording(
@@ -79,7 +79,7 @@ RECORDINGS = (
         dresden.file,
         dresden.convert,
         ROOT / "benchmarks" / "vehicles" / "dresden" / "vehicle.yaml",
-        {"half": AccuracyTarget()},
+        {"half": AccuracyTarget(1.58)},
     ),
 )
 PLAZA = ("plaza1", "plaza2")
