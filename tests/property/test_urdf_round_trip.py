@@ -134,7 +134,8 @@ def test_another_loader_reads_what_is_written_and_agrees_on_every_pair_of_links(
         wanted = other.get_transform(frame_to=a, frame_from=b)
         for one in (model, read(text)):
             found = pose_at(one, f"{a}:Origin", f"{b}:Origin", values).matrix
-            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
+            # the other loader leaves out each transformation that is within 1e-8 of none
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
 
 
 def test_the_support_file_itself_comes_back():
