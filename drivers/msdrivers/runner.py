@@ -97,7 +97,6 @@ U = TypeVar("U")
 MAX_COUNTERS = 200
 """Largest number of the endpoint's counters in a health report; the runner's own come on top."""
 
-
 MAX_READ_NS, READ_ATTEMPTS = 20_000, 5
 """Both clocks are read within this time, unless the process is interrupted in each attempt."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -246,6 +245,10 @@ def test_given_an_imu_that_repeats_a_sample_in_a_turn_then_the_protection_level_
     assert all(abs(row.heading) < row.estimate.heading_protection_level for row in found.between(20.0) if row.valid)
 
 
+IMU_VALUES = ("angular_velocity", "specific_force")
+FIX_VALUES = ("latitude_deg", "longitude_deg")
+
+
 def fill_gap(events: Iterable[Event], begin: float, end: float) -> Iterator[Event]:
     """Replace what IMU and receiver measured between two times by straight lines, and drop the wheels."""
     rows = [event for event in events if not isinstance(event, WheelsSample)]
@@ -261,16 +264,11 @@ def fill_gap(events: Iterable[Event], begin: float, end: float) -> Iterator[Even
         first = max((each for each in same if seconds(each) < begin), key=seconds)
         last = min((each for each in same if seconds(each) >= end), key=seconds)
         share = (seconds(event) - seconds(first)) / (seconds(last) - seconds(first))
-
-        def between(name: str, share: float = share, first: Event = first, last: Event = last) -> Any:
-            mixed = np.asarray(getattr(first, name)) * (1.0 - share) + np.asarray(getattr(last, name)) * share
-            return tuple(mixed.tolist()) if mixed.shape else float(mixed)
-
-        if isinstance(event, ImuSample):
-            yield replace(event, angular_velocity=between("angular_velocity"), specific_force=between("specific_force"))
-        else:
-            assert isinstance(event, GpsSample)
-            yield replace(event, latitude_deg=between("latitude_deg"), longitude_deg=between("longitude_deg"))
+        names = IMU_VALUES if isinstance(event, ImuSample) else FIX_VALUES
+        ends = [np.array([getattr(each, name) for name in names]) for each in (first, last)]
+        values = (ends[0] + share * (ends[1] - ends[0])).tolist()
+        numbers = [tuple(each) if isinstance(each, list) else each for each in values]
+        yield replace(event, **dict(zip(names, numbers, strict=True)))
 
 
 @pytest.mark.parametrize("begin", [14.2, 24.2])
