@@ -27,8 +27,8 @@ The receiver's velocity moves the state's, and may drift with the fixes: the pat
 state's and what they measure beside it (`follow_wheels`).
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
-gyro, as on a ferry (`Cause.HEADING`). It is trusted again when it agrees with the gyro of before (`find_turn`), while
-that is known well enough to contradict it.
+gyro with its bias of before (`find_turn`), as on a ferry (`Cause.HEADING`). Then it is lost until the vehicle turns by
+itself.
 
 Limits: a drift slower than the path is known (2 % of the speed with wheels, for minutes) is found in turns only.
 """
@@ -36,7 +36,6 @@ Limits: a drift slower than the path is known (2 % of the speed with wheels, for
 from __future__ import annotations
 
 import cmath
-import itertools
 import math
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -135,9 +134,6 @@ KNOWN_AGAIN: Final = 2.0
 """Standard deviation of dead reckoning, relative to that of a fix, up to which fixes continue to agree; it is less than
 1 when they begin to."""
 
-KNOWN_HEADING: Final = 0.1
-"""Standard deviation of the gyro's heading, rad, with which a heading must agree to be trusted again, at most."""
-
 NEW_TRUST_TIME: Final = 120.0
 NEW_TRUST_DISTANCE: Final = 20.0
 """Seconds, and meters, for which fixes must move as dead reckoning does to be trusted again wherever they are."""
@@ -148,9 +144,6 @@ LARGEST_UNMEASURED: Final = 1.0
 LARGEST_LOST: Final = 0.05
 """Standard deviation of the heading, rad, that gaps of the IMU may have cost in that time, and one of them in any
 window: the path turns there, and what it misses then is not an error of the fixes."""
-
-OWN_TURNS: Final = 3.0
-"""Radians that a vehicle turns by, while its heading follows the gyro, that drives by itself again."""
 
 DECISION_TIME: Final = 90.0
 REPEAT: Final = 4
@@ -239,14 +232,9 @@ class ConsistencyMonitor(NamedTuple):
         """Whether fixes are not used: they have jumped away from dead reckoning."""
         return self.suspect is not None and self.is_jump
 
-    @property
-    def may_reset(self) -> bool:
-        """Whether rejected fixes may show where the vehicle is: they are not suspect themselves."""
-        return self.suspect is None or self.cause is Cause.HEADING
-
     def resolve(self, found: Inconsistency, utime: int) -> ConsistencyMonitor:
         """Return the monitor after an inconsistency was found at `utime`: what is corrected begins again."""
-        if found.cause not in (Cause.GNSS, Cause.HEADING):
+        if found.cause is not Cause.GNSS:
             # the uncertainty of a latency that was corrected covers what is left
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error))
@@ -334,9 +322,8 @@ class ConsistencyMonitor(NamedTuple):
         They may be off as far as that agreement does not show.
         """
         assert self.suspect is not None
-        since, suspicion = self.suspect.utime, self.suspicion
-        if self.cause is not Cause.HEADING:
-            suspicion = max(suspicion, _bound_error(compare_window(self.suspect, node, noise, settings)))
+        since = self.suspect.utime
+        suspicion = max(self.suspicion, _bound_error(compare_window(self.suspect, node, noise, settings)))
         return self._replace(
             older=tuple(each for each in self.older if each.utime <= since),
             newest=tuple(each for each in self.newest if each.utime <= since),
@@ -427,20 +414,16 @@ class ConsistencyMonitor(NamedTuple):
             self = self._replace(horizontal_allowance=self.horizontal_allowance + max(more, 0.0))
         if suspect is not None:
             # the state has followed all of it, or the path has gone wrong by it
-            if self.cause is Cause.HEADING:
-                heading = abs(find_turn(suspect, node))
-            else:
-                heading = abs(wrap_angle(self.rotation - suspect.rotation))
-                found = compare_window(suspect, node, noise, settings)
-                horizontal = _bound_error(found)
-                heading = max(heading, abs(found.turn))
+            found = compare_window(suspect, node, noise, settings)
+            horizontal = _bound_error(found)
+            heading = max(abs(wrap_angle(self.rotation - suspect.rotation)), abs(found.turn))
         windows = self._compare_windows(node, noise, settings)
         for each in windows:
             if not each.node.is_measured:
                 # without a measured speed the path follows the fixes, but the heading must not
                 sigmas = 0.0
                 if each.node.has_gyro and node.has_gyro:
-                    turned = abs(wrap_angle(self.rotation - each.node.rotation))
+                    turned = abs(find_turn(each.node, node))
                     sigma = get_turn_sigma(each.node, node, noise)
                     sigmas = turned / sigma
                     heading = max(heading, turned - ALLOWED_TURN * sigma, _compare_course(each, node, noise, settings))
@@ -513,20 +496,12 @@ class ConsistencyMonitor(NamedTuple):
     ) -> tuple[ConsistencyMonitor, bool]:
         """Return the monitor after a fix that is not trusted, and whether fixes agree with dead reckoning again."""
         assert self.suspect is not None
-        is_known = is_vague = False
-        if self.cause is Cause.HEADING:
-            size = abs(find_turn(self.suspect, node))
-            sigma = get_turn_sigma(self.suspect, node, noise)
-            sigmas = size / sigma
-            is_vague = sigma > KNOWN_HEADING
-        else:
-            found = compare_window(self.suspect, node, noise, settings)
-            size, sigma, sigmas = abs(found.error), found.sigma, found.sigmas
-            known = KNOWN_AGAIN if self.agreed_since else 1.0
-            is_known = compute_longest_axis(*found.covariance) < known**2 * (node.white**2 + node.correlated**2)
-        largest = max(self.largest, size)
+        found = compare_window(self.suspect, node, noise, settings)
+        known = KNOWN_AGAIN if self.agreed_since else 1.0
+        is_known = compute_longest_axis(*found.covariance) < known**2 * (node.white**2 + node.correlated**2)
+        largest = max(self.largest, abs(found.error))
         # where dead reckoning has become so uncertain that it would not contradict them any more, that is no agreement
-        agrees = sigmas <= AGREEMENT and not is_vague and (is_known or largest > THRESHOLD * sigma)
+        agrees = found.sigmas <= AGREEMENT and (is_known or largest > THRESHOLD * found.sigma)
         since = (self.agreed_since or node.utime) if agrees else 0
         needed = JUMP_AGREEMENT_TIME if self.is_jump else AGREEMENT_TIME
         return self._replace(agreed_since=since, largest=largest), agrees and (node.utime - since) * 1e-6 >= needed
@@ -543,12 +518,6 @@ class ConsistencyMonitor(NamedTuple):
         if not nodes or node.seconds - nodes[0].seconds < NEW_TRUST_TIME:
             return ()
         return nodes if node.distance - nodes[0].distance > NEW_TRUST_DISTANCE else ()
-
-    @property
-    def has_turned(self) -> bool:
-        """Whether the vehicle has turned, since the heading has followed the gyro again, as one that drives does."""
-        own = [each.own_heading for each in (*self.older, *self.newest) if each.utime >= self.moved_since]
-        return sum(abs(wrap_angle(b - a)) for a, b in itertools.pairwise(own)) > OWN_TURNS
 
     def find_cause(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
         """Return what explains the discrepancies best, once enough fixes have exceeded the threshold.

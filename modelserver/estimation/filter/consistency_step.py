@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, heading_alignment, protection_levels
+from modelserver.estimation.filter import eskf, heading_alignment, heading_step, protection_levels
 from modelserver.estimation.filter.consistency_monitor import CONFIRMATIONS, ConsistencyMonitor
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import NavState
@@ -23,10 +23,10 @@ from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LA
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
 from modelserver.estimation.filter.path_fits import Cause, Inconsistency, fit_drift
-from modelserver.estimation.filter.path_windows import PathNode, PathNoise, find_turn
+from modelserver.estimation.filter.path_windows import PathNode, PathNoise
 from modelserver.estimation.filter.propagation import select_noise
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned
+from modelserver.estimation.filter.state import Aligned, Navigating, Unaligned
 from modelserver.messages import Decision, Verdict
 
 KIND: Final = "consistency"
@@ -84,7 +84,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
 
 def compare_path(
     setup: Setup, state: Aligned, newest: PathFix, *, is_compared: bool
-) -> tuple[Aligned, tuple[Decision, ...]]:
+) -> tuple[Navigating, tuple[Decision, ...]]:
     """Return the state after the comparison of a fix with the path until then, and what follows from it.
 
     Where the state does not follow the fix (`is_compared` is false), only the path continues.
@@ -98,10 +98,12 @@ def compare_path(
     if is_gap or not is_compared:
         return state._replace(consistency=monitor), ()
     node = _create_node(setup, state._replace(consistency=monitor), newest)
-    noise = PathNoise(select_noise(setup, state, state.nav).yaw, state.gnss.noise_inflation)
+    noise = PathNoise(select_noise(setup, state, state.nav).yaw, settings.gyro_bias_walk**2, state.gnss.noise_inflation)
     monitor = monitor.compare(node, noise, settings)
     found = monitor.find_cause(node, noise, settings)
     monitor = monitor.append(node)
+    if found is not None and found.cause is Cause.HEADING:
+        return _lose_heading(setup, state, found)
     if found is not None:
         return _handle(setup, state._replace(consistency=monitor), found)
     if monitor.suspect is not None:
@@ -110,14 +112,6 @@ def compare_path(
         if agrees:
             return _trust(setup, state, newest, node, noise)
         alike = monitor.select_moved_alike(node)
-        if monitor.cause is Cause.HEADING:
-            if state.gnss.num_rejected:
-                # what is rejected cannot turn the heading
-                return state._replace(consistency=monitor._replace(moved_since=node.utime)), ()
-            if alike and monitor.has_turned:
-                state = state._replace(consistency=monitor.restart())
-                return state, (report_event(state, KIND, Verdict.USED, "the vehicle moves as its heading turns again"),)
-            return state, ()
         if alike and (realigned := _realign(setup, state, newest, alike, noise)) is not None:
             text = "fixes are trusted again: they move as dead reckoning does"
             return realigned, (report_event(realigned, KIND, Verdict.RESET, text),)
@@ -129,6 +123,23 @@ def compare_path(
     if monitor.cause is not None and (node.utime - monitor.since) * 1e-6 > HEALING_TIME:
         monitor = monitor._replace(cause=None)
     return state._replace(consistency=monitor), ()
+
+
+def _lose_heading(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Unaligned, tuple[Decision, ...]]:
+    """Return the state of a vehicle that is transported, with the bias of the gyro at the start of the window."""
+    nav, start, settings = state.nav, found.discrepancy.node, setup.settings
+    seconds = (nav.utime - start.utime) * 1e-6
+    x, y, z = nav.gyro_bias
+    P = nav.covariance.copy()
+    P[11, :] = P[:, 11] = 0.0
+    # either bias may be wrong
+    P[11, 11] = start.rate_variance + settings.gyro_bias_walk**2 * seconds + (z - start.rate_bias) ** 2
+    nav = nav._replace(gyro_bias=(x, y, start.rate_bias), covariance=P)
+    lost = heading_step.lose_transported_heading(setup, state._replace(nav=nav))
+    text = (
+        f"fixes have turned the heading by {math.degrees(abs(found.change)):.0f} deg in {seconds:.0f} s: the vehicle "
+    )
+    return lost, (report_event(lost, KIND, Verdict.RESET, text + "moves beside its own axis"),)
 
 
 def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned, tuple[Decision, ...]]:
@@ -152,9 +163,6 @@ def _trust(
     assert monitor.suspect is not None
     text = "fixes are trusted again: they agree with dead reckoning"
     turned = monitor.rotation - monitor.suspect.rotation
-    if monitor.cause is Cause.HEADING:
-        text = "the vehicle moves along its own axis again"
-        turned = find_turn(monitor.suspect, node)
     if monitor.excludes_fixes:
         trusting = monitor.trust(node, noise, setup.settings)
         after = state._replace(consistency=trusting, gnss=state.gnss.restart(newest.utime))
@@ -233,8 +241,6 @@ def _resolve(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[NavSta
     if found.cause is Cause.LEVER_ARM:
         x, y = found.lever_arm.real, found.lever_arm.imag
         return nav, text + f"the antenna is {x:.2f} m forward and {y:.2f} m left of where the geometry states it"
-    if found.cause is Cause.HEADING:
-        return nav, f"the vehicle moves {math.degrees(abs(found.change)):.0f} deg beside its own axis"
     if found.is_jump:
         # where the gate has rejected them the state has not followed
         has_followed = state.gnss.num_rejected < CONFIRMATIONS - 1

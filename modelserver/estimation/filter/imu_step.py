@@ -32,7 +32,7 @@ from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
+from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating, Unaligned
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Decision, ImuSample, Mode, Verdict
 from modelserver.transforms.so3 import to_vector3
@@ -183,6 +183,8 @@ def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Deci
     wheels_utime = state.common.wheels.used_utime
     if wheels_utime and (utime - wheels_utime) * 1e-6 < settings.wheel_period + CONSTRAINT_PERIOD:
         return state, NOTHING  # the next wheel sample brings it
+    if isinstance(state, Unaligned) and state.alignment.was_transported:
+        return state, NOTHING  # it moved beside its own axis
     state, decision = fuse_non_holonomic(setup, state, utime)
     return state, (decision,)
 

@@ -35,9 +35,16 @@ MAX_INFLATION: Final = 4.0
 
 
 class PathNoise(NamedTuple):
-    """Noise along the path: density of the heading's random walk, rad2/s, and inflation of the fixes' errors."""
+    """Noise along the path.
+
+    Attributes
+    ----------
+    heading, bias: densities of the random walks of the heading, rad2/s, and of the yaw gyro's bias, rad2/s3.
+    inflation: of the fixes' errors, in variance.
+    """
 
     heading: float
+    bias: float
     inflation: float
 
 
@@ -168,7 +175,8 @@ def find_turn(start: PathNode, end: PathNode) -> float:
 def get_turn_sigma(start: PathNode, end: PathNode, noise: PathNoise) -> float:
     """Return the standard deviation of what fixes may turn the heading by between two nodes, rad."""
     seconds = end.seconds - start.seconds
-    variance = start.heading_variance + noise.heading * seconds + start.rate_variance * seconds**2
+    variance = start.heading_variance + noise.heading * seconds
+    variance += start.rate_variance * seconds**2 + noise.bias * seconds**3 / 3.0
     return math.sqrt(variance + end.lost - start.lost + COURSE_FLOOR**2)
 
 

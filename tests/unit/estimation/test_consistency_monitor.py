@@ -31,7 +31,7 @@ from modelserver.estimation.filter.path_windows import PathNode, PathNoise, comp
 from modelserver.estimation.filter.settings import FilterSettings
 
 SETTINGS = FilterSettings()
-NOISE = PathNoise(SETTINGS.gyro_noise**2, 1.0)
+NOISE = PathNoise(SETTINGS.gyro_noise**2, SETTINGS.gyro_bias_walk**2, 1.0)
 PERIOD = 0.5
 WHITE, CORRELATED = 0.13, 0.9
 FRESH = ConsistencyMonitor()
@@ -488,23 +488,26 @@ def test_given_a_path_that_becomes_vague_while_fixes_agree_then_they_are_trusted
 
 
 @pytest.mark.parametrize(
-    ("bias", "rate_sigma", "is_trusted"), [(0.0, 0.0003, True), (0.004, 0.0003, False), (0.0, 0.004, False)]
+    ("bias", "rate_sigma", "is_found"), [(0.0, 0.0003, False), (0.004, 0.0003, True), (0.004, 0.004, False)]
 )
-def test_given_a_heading_that_fixes_have_turned_then_it_is_trusted_where_the_gyro_of_before_agrees(
-    bias: float, rate_sigma: float, is_trusted: bool
+def test_given_fixes_that_turn_the_heading_by_the_bias_then_the_gyro_of_before_shows_it_where_it_was_known(
+    bias: float, rate_sigma: float, is_found: bool
 ) -> None:
-    # the heading has come back to what the gyro with its present bias has; with that of before it is 14 deg off
-    start = next(iter(drive(1.0, Fault()))).node._replace(rate_variance=rate_sigma**2)
-    monitor = FRESH._replace(cause=Cause.HEADING, suspect=start, largest=1.2)
-    agrees = False
-    for n in range(31):
-        t = 30.0 + n
+    # the heading is what the gyro with its present bias has; with that of before it is 14 deg off after a minute
+    first = next(iter(drive(1.0, Fault()))).node
+    start = first._replace(rate_variance=rate_sigma**2, is_measured=False, has_gyro=True)
+    monitor, causes, end = FRESH, set(), start
+    for n in range(61):
+        t = float(n)
         end = start._replace(
-            utime=start.utime + round(t * 1e6), seconds=start.seconds + t, bias_turn=bias * t, rate_bias=bias
+            utime=start.utime + round(t * 1e6), seconds=start.seconds + t, bias_turn=bias * t, rate_bias=bias * (n > 0)
         )
-        monitor, agrees = monitor.check_trust(end, NOISE, SETTINGS)
+        monitor = monitor.compare(end, NOISE, SETTINGS)
+        found = monitor.find_cause(end, NOISE, SETTINGS)
+        causes |= set() if found is None else {found.cause}
+        monitor = monitor.append(end)
     assert abs(find_turn(start, end)) == pytest.approx(60.0 * bias)
-    assert agrees == is_trusted
+    assert causes == ({Cause.HEADING} if is_found else set())
 
 
 def test_given_one_outlier_then_nothing_is_found() -> None:

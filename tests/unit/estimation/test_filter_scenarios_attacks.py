@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -21,7 +22,7 @@ from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, 
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
-from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, WHEELS_TIMING, drive, simulation
+from tests.support_filter import IMU, MOUNT, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, WHEELS_TIMING, drive, simulation
 
 pytestmark = pytest.mark.slow
 
@@ -281,6 +282,55 @@ def test_given_a_unit_whose_gap_was_filled_by_straight_lines_in_a_turn_then_its_
     assert found.decisions("gps_position", Verdict.REJECTED, "interpolated")
     assert all(abs(row.heading) < math.radians(1.3) for row in found.between(begin + 3.5))
     assert all(row.valid for row in found.between(begin + 7.0))
+
+
+EIGHTS_WITH_A_RIDE = (*EIGHT, *drive_straight(4.0, 0.4, 40.0, 10.0), DrivePhase(20.0, 0.0), *EIGHT)
+RIDE = (sum(each.duration for each in EIGHT) + 5.0, sum(each.duration for each in EIGHTS_WITH_A_RIDE[: -len(EIGHT)]))
+
+
+def transport(events: Iterable[Event], angle: float) -> Iterator[Event]:
+    """Turn the way of a vehicle by an angle during the ride, but not the vehicle, and drop the wheels."""
+    turn = np.array(so3.matrix_rows(so3.from_rpy(0.0, 0.0, angle)))
+    mount = np.array(so3.matrix_rows(MOUNT.wxyz))
+    start: complex | None = None
+    left = 0j
+    for event in events:
+        if isinstance(event, WheelsSample):
+            continue
+        t = (event.header.utime - START_UTIME) * 1e-6
+        if isinstance(event, ImuSample) and RIDE[0] <= t < RIDE[1]:
+            force = mount.T @ turn @ mount @ np.array(event.specific_force)
+            yield replace(event, specific_force=tuple(force.tolist()))
+        elif isinstance(event, GpsSample) and t >= RIDE[0]:
+            narrow = math.cos(math.radians(event.latitude_deg))
+            at = complex(event.longitude_deg * narrow, event.latitude_deg)
+            start = at if start is None else start
+            if t < RIDE[1]:
+                left = (at - start) * (cmath.rect(1.0, angle) - 1.0)
+            at += left
+            yield replace(event, longitude_deg=at.real / narrow, latitude_deg=at.imag)
+        else:
+            yield event
+
+
+@pytest.mark.parametrize(("angle", "has_velocity"), [(25.0, False), (25.0, True), (50.0, True)])
+def test_given_a_vehicle_that_is_transported_beside_its_own_axis_then_its_heading_is_lost_until_it_turns_by_itself(
+    angle, has_velocity
+):
+    gone = simulation(EIGHTS_WITH_A_RIDE, gps_model=replace(PLAIN_GPS, has_velocity=has_velocity))
+    seconds = sum(each.duration for each in EIGHTS_WITH_A_RIDE)
+
+    found = drive(gone, seconds, transform=lambda events: transport(events, math.radians(angle)))
+
+    assert any("own axis" in each.reason for each in found.ledger if each.verdict is Verdict.RESET)
+    assert not any(row.valid for row in found.between(RIDE[0] + 15.0, RIDE[1]))
+    lost = [row for row in found.rows if row.estimate.enu is None and row.t > RIDE[0]]
+    assert lost
+    assert all(Invalid.GNSS_INCONSISTENT in row.estimate.invalid for row in lost)
+    valid = [row for row in found.rows if row.valid]
+    assert all(abs(row.heading) < row.estimate.heading_protection_level for row in valid)
+    assert found.last.valid
+    assert abs(found.last.heading) < math.radians(3.0)
 
 
 def test_given_a_long_gap_of_the_imu_on_a_vehicle_without_wheels_then_it_is_leveled_again():
