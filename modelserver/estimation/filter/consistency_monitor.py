@@ -27,8 +27,8 @@ The receiver's velocity moves the state's, and may drift with the fixes: the pat
 state's and what they measure beside it (`follow_wheels`).
 
 Without a measured speed the path follows the fixes. Then only the heading is compared: what fixes turn it by beside the
-gyro with its bias of before (`find_turn`), as on a ferry (`Cause.HEADING`). Then it is lost until the vehicle turns by
-itself.
+gyro with its bias of before (`find_turn`), as on a ferry (`Cause.HEADING`). It is found again when the course turns as
+the gyro does, quicker than a ship (`find_own_course`): then the vehicle drives by itself.
 
 Limits: a drift slower than the path is known (2 % of the speed with wheels, for minutes) is found in turns only.
 """
@@ -49,6 +49,7 @@ from modelserver.estimation.filter.path_fits import (
     find_causes,
 )
 from modelserver.estimation.filter.path_windows import (
+    COURSE_FLOOR,
     MIN_TURN_PATH,
     Discrepancy,
     PathNode,
@@ -145,6 +146,22 @@ LARGEST_LOST: Final = 0.05
 """Standard deviation of the heading, rad, that gaps of the IMU may have cost in that time, and one of them in any
 window: the path turns there, and what it misses then is not an error of the fixes."""
 
+OWN_TURN: Final = 1.5
+SLOWEST_TURN: Final = 0.06
+"""Radians that a vehicle turns by, while its course follows the gyro, that drives by itself; and the turn rate, rad/s,
+at least, of turns that count: twice that of a ship."""
+
+OWN_TURN_US: Final = 45_000_000
+LARGEST_SLIP: Final = 0.15
+FEWEST_COURSES: Final = 6
+"""Microseconds within which it does, standard deviation of the course beside the gyro, rad, at most, and how many
+courses show it, at least."""
+
+COURSE_SIGMAS: Final = 5.0
+LONGEST_WAY: Final = 6.0
+"""Length of a way between two fixes, relative to their white error, that shows a course, and its longest duration, s.
+"""
+
 DECISION_TIME: Final = 90.0
 REPEAT: Final = 4
 """Seconds for which the causes are compared again, and fixes from one comparison to the next."""
@@ -232,9 +249,14 @@ class ConsistencyMonitor(NamedTuple):
         """Whether fixes are not used: they have jumped away from dead reckoning."""
         return self.suspect is not None and self.is_jump
 
+    @property
+    def may_reset(self) -> bool:
+        """Whether rejected fixes may show where the vehicle is: they are not suspect themselves."""
+        return self.suspect is None or self.cause is Cause.HEADING
+
     def resolve(self, found: Inconsistency, utime: int) -> ConsistencyMonitor:
         """Return the monitor after an inconsistency was found at `utime`: what is corrected begins again."""
-        if found.cause is not Cause.GNSS:
+        if found.cause not in (Cause.GNSS, Cause.HEADING):
             # the uncertainty of a latency that was corrected covers what is left
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error))
@@ -414,9 +436,13 @@ class ConsistencyMonitor(NamedTuple):
             self = self._replace(horizontal_allowance=self.horizontal_allowance + max(more, 0.0))
         if suspect is not None:
             # the state has followed all of it, or the path has gone wrong by it
-            found = compare_window(suspect, node, noise, settings)
-            horizontal = _bound_error(found)
-            heading = max(abs(wrap_angle(self.rotation - suspect.rotation)), abs(found.turn))
+            if self.cause is Cause.HEADING:
+                heading = abs(find_turn(suspect, node))
+            else:
+                heading = abs(wrap_angle(self.rotation - suspect.rotation))
+                found = compare_window(suspect, node, noise, settings)
+                horizontal = _bound_error(found)
+                heading = max(heading, abs(found.turn))
         windows = self._compare_windows(node, noise, settings)
         for each in windows:
             if not each.node.is_measured:
@@ -518,6 +544,37 @@ class ConsistencyMonitor(NamedTuple):
         if not nodes or node.seconds - nodes[0].seconds < NEW_TRUST_TIME:
             return ()
         return nodes if node.distance - nodes[0].distance > NEW_TRUST_DISTANCE else ()
+
+    def find_own_course(self) -> tuple[float, float] | None:
+        """Return the rotation of the path to the courses of a vehicle that drives by itself, and its sigma, rad.
+
+        None: the courses do not turn as the gyro does, or it has not turned enough.
+        """
+        last = self.last
+        if last is None:
+            return None
+        nodes = [each for each in (*self.older, *self.newest) if last.utime - each.utime <= OWN_TURN_US]
+        turned, beside = 0.0, []
+        begin = 0
+        for n in range(1, len(nodes)):
+            a, b = nodes[n - 1 : n + 1]
+            turn, seconds = wrap_angle(b.own_heading - a.own_heading), b.seconds - a.seconds
+            turned += abs(turn) if abs(turn) > SLOWEST_TURN * seconds else 0.0
+            start = nodes[begin]
+            way = b.fix - start.fix
+            if abs(way) > COURSE_SIGMAS * math.hypot(start.white, b.white) + MIN_TURN_PATH:
+                ahead = sum(cmath.rect(1.0, each.own_heading) for each in nodes[begin : n + 1])
+                beside.append(cmath.rect(1.0, cmath.phase(way / ahead)))
+                begin = n
+            elif b.seconds - start.seconds > LONGEST_WAY:
+                begin = n
+        if turned < OWN_TURN or len(beside) < FEWEST_COURSES:
+            return None
+        mean = sum(beside)
+        slip = math.sqrt(sum(cmath.phase(each / mean) ** 2 for each in beside) / len(beside))
+        if slip > LARGEST_SLIP:
+            return None
+        return cmath.phase(mean), math.hypot(slip, COURSE_FLOOR)
 
     def find_cause(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> Inconsistency | None:
         """Return what explains the discrepancies best, once enough fixes have exceeded the threshold.

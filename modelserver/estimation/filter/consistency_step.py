@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, heading_alignment, heading_step, protection_levels
+from modelserver.estimation.filter import eskf, heading_alignment, protection_levels
 from modelserver.estimation.filter.consistency_monitor import CONFIRMATIONS, ConsistencyMonitor
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import NavState
@@ -26,7 +26,7 @@ from modelserver.estimation.filter.path_fits import Cause, Inconsistency, fit_dr
 from modelserver.estimation.filter.path_windows import PathNode, PathNoise
 from modelserver.estimation.filter.propagation import select_noise
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Navigating, Unaligned
+from modelserver.estimation.filter.state import Aligned
 from modelserver.messages import Decision, Verdict
 
 KIND: Final = "consistency"
@@ -84,7 +84,7 @@ def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
 
 def compare_path(
     setup: Setup, state: Aligned, newest: PathFix, *, is_compared: bool
-) -> tuple[Navigating, tuple[Decision, ...]]:
+) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after the comparison of a fix with the path until then, and what follows from it.
 
     Where the state does not follow the fix (`is_compared` is false), only the path continues.
@@ -102,10 +102,10 @@ def compare_path(
     monitor = monitor.compare(node, noise, settings)
     found = monitor.find_cause(node, noise, settings)
     monitor = monitor.append(node)
-    if found is not None and found.cause is Cause.HEADING:
-        return _lose_heading(setup, state, found)
     if found is not None:
         return _handle(setup, state._replace(consistency=monitor), found)
+    if monitor.cause is Cause.HEADING and monitor.suspect is not None:
+        return _drive_by_itself(setup, state._replace(consistency=monitor))
     if monitor.suspect is not None:
         monitor, agrees = monitor.check_trust(node, noise, settings)
         state = state._replace(consistency=monitor)
@@ -123,23 +123,6 @@ def compare_path(
     if monitor.cause is not None and (node.utime - monitor.since) * 1e-6 > HEALING_TIME:
         monitor = monitor._replace(cause=None)
     return state._replace(consistency=monitor), ()
-
-
-def _lose_heading(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Unaligned, tuple[Decision, ...]]:
-    """Return the state of a vehicle that is transported, with the bias of the gyro at the start of the window."""
-    nav, start, settings = state.nav, found.discrepancy.node, setup.settings
-    seconds = (nav.utime - start.utime) * 1e-6
-    x, y, z = nav.gyro_bias
-    P = nav.covariance.copy()
-    P[11, :] = P[:, 11] = 0.0
-    # either bias may be wrong
-    P[11, 11] = start.rate_variance + settings.gyro_bias_walk**2 * seconds + (z - start.rate_bias) ** 2
-    nav = nav._replace(gyro_bias=(x, y, start.rate_bias), covariance=P)
-    lost = heading_step.lose_transported_heading(setup, state._replace(nav=nav))
-    text = (
-        f"fixes have turned the heading by {math.degrees(abs(found.change)):.0f} deg in {seconds:.0f} s: the vehicle "
-    )
-    return lost, (report_event(lost, KIND, Verdict.RESET, text + "moves beside its own axis"),)
 
 
 def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned, tuple[Decision, ...]]:
@@ -201,6 +184,34 @@ def _realign(
     return _start_epoch(setup, state._replace(nav=nav), newest)._replace(consistency=monitor)
 
 
+def _drive_by_itself(setup: Setup, state: Aligned) -> tuple[Aligned, tuple[Decision, ...]]:
+    """Return the state of a vehicle that was transported, with the heading that its own turns show, if they do."""
+    monitor, nav = state.consistency, state.nav
+    shown = monitor.find_own_course()
+    if shown is None:
+        return state, ()
+    rotation, sigma = shown
+    turn, turned = wrap_angle(rotation - monitor.rotation), nav
+    if abs(turn) > 2.0 * math.hypot(sigma, math.sqrt(float(nav.covariance[8, 8]))):
+        P = nav.covariance.copy()
+        P[8, :] = P[:, 8] = 0.0
+        # fixes show the velocity, whatever the heading
+        turned = _turn(nav._replace(covariance=P), turn, sigma, setup.layout)._replace(velocity=nav.velocity)
+    common = state.common._replace(epoch=state.common.epoch + 1)
+    state = state._replace(nav=turned, common=common, consistency=hold_heading(setup, state, turned).restart())
+    return state, (
+        report_event(state, KIND, Verdict.RESET, "the vehicle drives by itself: its course turns as it does"),
+    )
+
+
+def follow_transport(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state at a fix that moves beside the vehicle's own axis, with its heading, which is not trusted."""
+    monitor = state.consistency
+    if monitor.suspect is None:
+        monitor = monitor._replace(cause=Cause.HEADING, since=state.nav.utime, suspect=monitor.last, num_exceeded=0)
+    return _place(setup, state._replace(consistency=monitor), newest)
+
+
 def _start_epoch(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
     """Return the state in a new epoch; at the fix, if the state has not followed the fixes."""
     at = setup.layout.extra_index(CORRELATED_ERROR[0])
@@ -241,6 +252,8 @@ def _resolve(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[NavSta
     if found.cause is Cause.LEVER_ARM:
         x, y = found.lever_arm.real, found.lever_arm.imag
         return nav, text + f"the antenna is {x:.2f} m forward and {y:.2f} m left of where the geometry states it"
+    if found.cause is Cause.HEADING:
+        return nav, f"the vehicle moves {math.degrees(abs(found.change)):.0f} deg beside its own axis"
     if found.is_jump:
         # where the gate has rejected them the state has not followed
         has_followed = state.gnss.num_rejected < CONFIRMATIONS - 1

@@ -187,10 +187,7 @@ def _fuse_aligned(
     if is_used and state.heading_check is None:
         # a stationary vehicle does not follow the fixes
         is_compared = not adds_nothing or state.consistency.suspect is not None
-        compared, decisions = consistency_step.compare_path(setup, state, newest, is_compared=is_compared)
-        if isinstance(compared, Unaligned):
-            return compared, decisions
-        state = compared
+        state, decisions = consistency_step.compare_path(setup, state, newest, is_compared=is_compared)
         if state.consistency.excludes_fixes:
             return state, (*decisions, reject(item, "inconsistent"))
     nav = state.nav
@@ -315,7 +312,7 @@ def _gate_fix(
     gnss = gnss.reject(utime, newest, settings, is_speed_measured=is_measured)
     state = state._replace(nav=nav, gnss=gnss)
     pending = state.common.pending
-    is_due = state.consistency.suspect is None and not any(each.resets_position for each in pending)
+    is_due = state.consistency.may_reset and not any(each.resets_position for each in pending)
     if is_due and state.gnss.fit_rejected(nav, settings) is not None:
         state = _wait_horizon(setup, state, PendingDecision(utime, resets_position=True))
     return state, decision
@@ -376,10 +373,10 @@ def _check_heading(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     return state, () if decision is None else (decision,)
 
 
-def reset_position(setup: Setup, state: Aligned) -> tuple[Navigating, Decision | None]:
+def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | None]:
     """Return the state with its position, and if it was wrong its heading, re-initialized from the rejected fixes.
 
-    Without a measured speed they show a course alone, which is not the heading of a vehicle that is transported.
+    A heading that only a course contradicts is not trusted any more, nor is the course.
     """
     nav = state.nav
     fit = state.gnss.fit_rejected(nav, setup.settings)
@@ -387,11 +384,12 @@ def reset_position(setup: Setup, state: Aligned) -> tuple[Navigating, Decision |
         return state, None
     sigma = math.hypot(fit.rotation.sigma, math.sqrt(nav.covariance[8, 8]))
     rotation = fit.rotation if abs(fit.rotation.angle) > 3.0 * sigma else Rotation(0.0, 0.0)
-    if rotation is fit.rotation and not state.common.measures_wheel_speed(nav.utime):
-        text = f"fixes move {math.degrees(abs(fit.rotation.angle)):.0f} deg beside the vehicle's own axis"
-        decision = Decision(nav.utime, "filter", 0, "gps_position", Verdict.RESET, text)
-        return heading_step.lose_transported_heading(setup, state), decision
     newest = state.gnss.rejected[-1]
+    if rotation is fit.rotation and not state.common.measures_wheel_speed(nav.utime) and state.consistency.last:
+        # fixes show a course alone, which is not the heading of a vehicle that is transported
+        text = f"fixes move {math.degrees(abs(rotation.angle)):.0f} deg beside the vehicle's own axis"
+        decision = Decision(nav.utime, "filter", 0, "gps_position", Verdict.RESET, text)
+        return consistency_step.follow_transport(setup, state, newest), decision
     state = heading_step.initialize(setup, state, nav, rotation, newest)
     if rotation is fit.rotation:
         state = _allow_start(state, newest, fit.distance)

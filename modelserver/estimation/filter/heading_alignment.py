@@ -20,16 +20,12 @@ where v_0 is the unknown velocity at the start, q the tilt error (times g) and r
 here assumes a direction of travel, so the linear fit of the complex p_0, v_0, q, r, c separates c = +1 along the course
 from c = -1, once the vehicle has braked, accelerated or turned enough.
 
-A vehicle that was transported, as on a ferry, may be so still, at any angle to its course. Then only a path counts
-along which it has turned by itself (`measure_own_turn`), quicker than ships do.
-
 Initialization in the world rotates N by the angle found (`rotate`) and puts the antenna on the newest fix (`place`).
 """
 
 from __future__ import annotations
 
 import cmath
-import itertools
 import math
 from typing import Final, NamedTuple
 
@@ -61,10 +57,6 @@ TYPICAL_SECONDS: Final = 10.0
 
 CUBIC_VARIANCE_RATIO: Final = 40.0
 """Ratio by which a cubic reduces the variance of a random walk over its segment."""
-
-
-SLOWEST_TURN: Final = 0.06
-"""Turn rate, rad/s, at least, of a vehicle that turns by itself: twice that of a ship."""
 
 
 class PathFix(NamedTuple):
@@ -140,7 +132,6 @@ class HeadingAlignment(NamedTuple):
     accelerated_velocity, accelerated_path: first and second integral of the IMU's horizontal acceleration along N,
         m/s and m.
     is_direction_unknown: whether the heading lacks only the direction of travel, forward or backward.
-    was_transported: whether the vehicle has moved beside its own axis: it must turn by itself to show its heading.
     """
 
     fixes: tuple[PathFix, ...] = ()
@@ -149,7 +140,6 @@ class HeadingAlignment(NamedTuple):
     accelerated_velocity: complex = 0j
     accelerated_path: complex = 0j
     is_direction_unknown: bool = False
-    was_transported: bool = False
 
     def update(self, before: NavState, after: NavState) -> HeadingAlignment:
         """Return the alignment after propagation from one state to a later one; propagation alone changes velocity."""
@@ -164,7 +154,6 @@ class HeadingAlignment(NamedTuple):
             self.accelerated_velocity + change,
             self.accelerated_path + step * (self.accelerated_velocity + 0.5 * change),
             self.is_direction_unknown,
-            self.was_transported,
         )
 
     def estimate_distance(self, settings: FilterSettings) -> float:
@@ -283,17 +272,6 @@ def compute_velocities(segment: tuple[PathFix, ...], paths: list[complex]) -> li
 def is_consistent(fit: PathFit, newest: PathFix) -> bool:
     """Return whether the fixes of a fit lie along the path as closely as their noise allows."""
     return fit.scatter <= 3.0 * (newest.white + 0.5 * newest.correlated) + 0.05 * fit.distance
-
-
-def measure_own_turn(segment: tuple[PathFix, ...]) -> float:
-    """Return the sum of the turns of a segment that are quicker than `SLOWEST_TURN`, rad."""
-    steps = [(b.unit_path - a.unit_path, (b.utime - a.utime) * 1e-6) for a, b in itertools.pairwise(segment)]
-    turned = 0.0
-    for (first, before), (second, after) in itertools.pairwise(steps):
-        angle = abs(cmath.phase(second * first.conjugate()))
-        if angle > SLOWEST_TURN * 0.5 * (before + after):
-            turned += angle
-    return turned
 
 
 def select_known_speed(segment: tuple[PathFix, ...]) -> tuple[PathFix, ...]:

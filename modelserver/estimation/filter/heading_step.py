@@ -69,9 +69,6 @@ LARGEST_SPEED_SIGMA: Final = 0.15
 """Sigma of the speed, or its distance from that of the fixes, as a share of that, beyond which a start by accelerations
 alone needs the direction confirmed."""
 
-OWN_TURN: Final = 1.0
-"""Radians that a vehicle that was transported turns by itself, at least, along the path that shows its heading."""
-
 MOVING_SPEED: Final = 0.5
 """Speed of the state, m/s, beyond its uncertainty, that shows that a velocity of 0 is none."""
 
@@ -102,9 +99,6 @@ def align_by_fixes(setup: Setup, state: Unaligned, newest: PathFix) -> tuple[Una
     if fit is None or fit.rotation.sigma > settings.align_sigma:
         return state, None
     if not heading_alignment.is_consistent(fit, newest):
-        return state, None
-    was_transported = alignment.was_transported and not state.common.measures_wheel_speed(nav.utime)
-    if was_transported and heading_alignment.measure_own_turn(fixes) < OWN_TURN:
         return state, None
     if is_known and not 0.6 < fit.factor < 1.6:
         # not the distance that was driven: fixes that drift, or wheels that spin
@@ -213,17 +207,6 @@ def lose_heading(state: Aligned) -> Unaligned:
     )
 
 
-def lose_transported_heading(setup: Setup, state: Aligned) -> Unaligned:
-    """Return the state of a vehicle that is transported: its motion shows neither its heading nor its speed."""
-    nav = state.nav
-    P = nav.covariance.copy()
-    P[3:5, :] = 0.0
-    P[:, 3:5] = 0.0
-    P[3, 3] = P[4, 4] = (0.5 * setup.settings.maximum_speed) ** 2
-    lost = lose_heading(state._replace(nav=nav._replace(velocity=(0.0, 0.0, nav.velocity[2]), covariance=P)))
-    return lost._replace(alignment=lost.alignment._replace(was_transported=True))
-
-
 def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
     """Return the state after the receiver's velocity, which gives the heading if it is unknown."""
     sample = item.sample
@@ -241,7 +224,7 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
         item = item._replace(sample=sample)
     if isinstance(state, Aligned):
         return fuse_measurement(setup, state, item)
-    if isinstance(accept_fix(setup, state, sample), str) or state.alignment.was_transported:
+    if isinstance(accept_fix(setup, state, sample), str):
         return state, NOTHING
     state = propagation.advance(setup, state, item.utime)
     newest = state.alignment.last_fix

@@ -31,8 +31,9 @@ from modelserver.estimation.filter.fusion import (
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
+from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating, Unaligned
+from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Decision, ImuSample, Mode, Verdict
 from modelserver.transforms.so3 import to_vector3
@@ -116,6 +117,9 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
             )
             state = state._replace(consistency=state.consistency.lose(turned, moved))
         decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
+    elif isinstance(state, Aligned) and imu.is_interpolated:
+        turned = setup.interpolated.yaw * (utime - used_utime) * 1e-6
+        state = state._replace(consistency=state.consistency.lose(turned, 0.0))
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
     state, more = _fuse_constraints(setup, state, utime)
     return state, decisions + more if more else decisions
@@ -183,8 +187,8 @@ def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Deci
     wheels_utime = state.common.wheels.used_utime
     if wheels_utime and (utime - wheels_utime) * 1e-6 < settings.wheel_period + CONSTRAINT_PERIOD:
         return state, NOTHING  # the next wheel sample brings it
-    if isinstance(state, Unaligned) and state.alignment.was_transported:
-        return state, NOTHING  # it moved beside its own axis
+    if isinstance(state, Aligned) and state.consistency.cause is Cause.HEADING:
+        return state, NOTHING  # it moves beside its own axis
     state, decision = fuse_non_holonomic(setup, state, utime)
     return state, (decision,)
 

@@ -14,7 +14,6 @@ from modelserver.earth.geodesy import Geodesy
 from modelserver.estimation.filter import imu_monitor, leveling, output, persistence, propagation
 from modelserver.estimation.filter.clock_monitor import IMU_RANK, ClockMonitor, StampVerdict
 from modelserver.estimation.filter.fusion import IMU, Item, reject, split_sample
-from modelserver.estimation.filter.heading_step import OWN_TURN
 from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Navigating, Unaligned
@@ -314,12 +313,6 @@ class FilterLocalizer(NamedTuple):
                 "it brakes, turns or stops, or wheels measure it"
             )
             findings += (SensorFinding("gps", "direction", "sensors.gps", text),)
-        if isinstance(head, Unaligned) and head.alignment.was_transported:
-            text = (
-                "the vehicle moved beside its own axis, as aboard a ferry: the heading waits until it has turned by "
-                f"{math.degrees(OWN_TURN):.0f} deg in a minute by itself"
-            )
-            findings += (SensorFinding("gps", "transported", "sensors.gps", text),)
         return findings
 
 

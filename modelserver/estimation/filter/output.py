@@ -17,6 +17,7 @@ from modelserver.estimation.filter.measurements.constraints import compute_tilt
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
 from modelserver.estimation.filter.odometry import Odometry
+from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, Navigating
 from modelserver.messages import NAN, Estimate, Invalid, NavigationState, Quality, VehicleMotion
@@ -267,8 +268,9 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
         if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
             invalid |= 128  # GPS_REJECTED
         monitor = state.consistency
-        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do
-        is_covered = monitor.suspect is not None
+        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do, and
+        # not the heading of a vehicle that moves beside its own axis
+        is_covered = monitor.suspect is not None and monitor.cause is not Cause.HEADING
         if monitor.is_jump and (utime - monitor.since) * 1e-6 > JUMP_TIME:
             is_covered = False
         if monitor.cause is not None and not is_covered:
@@ -277,8 +279,6 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
         invalid |= 8  # NOT_MOVED_YET
         if isinstance(state, Leveling) or state.alignment.last_fix is None:
             invalid |= 1  # NO_FIX
-        elif state.alignment.was_transported:
-            invalid |= 8192  # GNSS_INCONSISTENT
     if setup.uses_imu(common.mode):
         imu_utime = state.imu.used_utime
         if not imu_utime:

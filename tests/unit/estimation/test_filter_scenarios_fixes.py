@@ -247,6 +247,21 @@ def test_given_a_position_set_from_fixes_then_the_offset_of_the_former_one_is_no
     assert math.dist(found.enu.xyz[:2], before.enu.xyz[:2]) < 2.0
 
 
+def test_given_a_vehicle_that_moves_beside_its_own_axis_then_its_pose_is_not_valid_however_small_the_bound():
+    localizer = drive(simulation(EIGHT), 30.0).localizer
+    state = localizer.head
+    assert isinstance(state, Aligned)
+    monitor = state.consistency
+
+    def find_invalid(cause: Cause) -> Invalid:
+        judged = state._replace(consistency=monitor._replace(cause=cause, since=monitor.utime, suspect=monitor.last))
+        return output.estimate(localizer.setup, judged, localizer.odom, localizer.utime, localizer.utime).invalid
+
+    assert not localizer.estimate(localizer.utime).invalid
+    assert not find_invalid(Cause.GNSS)  # its bound covers what fixes that drift do
+    assert find_invalid(Cause.HEADING) is Invalid.GNSS_INCONSISTENT
+
+
 def test_given_a_heading_known_to_half_a_radian_then_a_pose_is_valid_while_wheels_measure_or_where_it_is_configured():
     localizer = drive(simulation(EIGHT), 30.0).localizer
     state = localizer.head
