@@ -192,6 +192,8 @@ def _drive_by_itself(setup: Setup, state: Aligned) -> tuple[Aligned, tuple[Decis
         return state, ()
     rotation, sigma = shown
     turn, turned = wrap_angle(rotation - monitor.rotation), nav
+    if abs(turn) > 0.5 * math.pi:
+        return state, ()  # it may drive in reverse
     if abs(turn) > 2.0 * math.hypot(sigma, math.sqrt(float(nav.covariance[8, 8]))):
         P = nav.covariance.copy()
         P[8, :] = P[:, 8] = 0.0
