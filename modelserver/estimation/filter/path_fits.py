@@ -106,7 +106,9 @@ class CauseModel(NamedTuple):
 
 MEASURED: Final = 0
 USUAL: Final = (1, 2, 3)
-"""Columns of `find_causes`: errors of the fixes, and errors that the state knows of the path."""
+RATE: Final = 2
+"""Columns of `find_causes`: errors of the fixes, and errors that the state knows of the path; which of them is that of
+its turn rate."""
 
 ALONG_BOTH_AXES: Final = (
     CauseModel(Cause.GNSS, (4, 5), TYPICAL_DRIFT),
@@ -114,13 +116,18 @@ ALONG_BOTH_AXES: Final = (
     CauseModel(Cause.LEVER_ARM, (8, 9), TYPICAL_LEVER_ARM),
 )
 OF_THE_PATH: Final = (
-    CauseModel(Cause.GYRO, (3,), TYPICAL_CHANGE[Cause.GYRO]),
     CauseModel(Cause.WHEELS, (2,), TYPICAL_CHANGE[Cause.WHEELS]),
     # a latency that has changed before the window too, and from its start on
     CauseModel(Cause.LATENCY, (10,), TYPICAL_CHANGE[Cause.LATENCY]),
     CauseModel(Cause.LATENCY, (11,), TYPICAL_CHANGE[Cause.LATENCY]),
 )
 """Models with two parameters, and with one."""
+
+NO_CAUSE: Final = (CauseModel(Cause.GNSS, (), 1.0),)
+OF_THE_GYRO: Final = (CauseModel(Cause.GYRO, (3,), TYPICAL_CHANGE[Cause.GYRO]),)
+BENDS: Final = 3
+"""Models of no fault and of a gyro's bias, and how often their fits are repeated about the path that the last one bent:
+a turn of half a radian is not linear."""
 
 
 def find_causes(
@@ -141,15 +148,25 @@ def find_causes(
     first = np.array(starts) - starts[0]
     replayed = replay_paths(nodes, first)
     inside = replayed.is_inside
-    products = _weight(_find_errors(nodes, first, replayed), _get_covariances(nodes, first, inside, noise, settings))
+    weights = np.linalg.inv(_get_covariances(nodes, first, inside, noise, settings))
     begins = [nodes[k] for k in first]
     usual = np.sqrt([(each.heading_variance, each.scale_variance, each.rate_variance) for each in begins])
     is_precise = np.array([each.correlated < LARGEST_FIX_SIGMA for each in begins])
     largest = 2.0 * LARGEST_REST * inside.sum(axis=1)
+
+    def bend(models: Sequence[CauseModel]) -> Array:
+        """Return the products about the paths that the fit of one model turns."""
+        rates = np.zeros(len(first))
+        for _ in range(BENDS):
+            factors, _, _ = _fit(_weight(_find_errors(nodes, first, rates), weights), usual, models)
+            rates = factors[:, 0, RATE] + factors[:, 0, len(USUAL) :].sum(axis=1)
+        return _weight(_find_errors(nodes, first, rates), weights)
+
     # by the errors that the state knows alone
-    _, _, none = _fit(products, usual, (CauseModel(Cause.GNSS, (), 1.0),))
+    bent = bend(NO_CAUSE)
+    _, _, none = _fit(bent, usual, NO_CAUSE)
     found: dict[Cause, Inconsistency] = {}
-    for models in (ALONG_BOTH_AXES, OF_THE_PATH):
+    for models, products in ((ALONG_BOTH_AXES, bent), (OF_THE_PATH, bent), (OF_THE_GYRO, bend(OF_THE_GYRO))):
         factors, rest, evidence = _fit(products, usual, models)
         explained = none - evidence
         for n, (cause, _, _) in enumerate(models):
@@ -202,12 +219,19 @@ class WindowPaths(NamedTuple):
         return complex(self.paths[k, -1]), complex(self.moments[k, -1]), float(self.turned[k, -1])
 
 
-def replay_paths(nodes: Sequence[PathNode], first: Array) -> WindowPaths:
-    """Return the paths since the nodes with the indices `first`, with the gyro's bias and the wheels' scale of then."""
+def replay_paths(nodes: Sequence[PathNode], first: Array, turn_rates: Array | float = 0.0) -> WindowPaths:
+    """Return the paths since the nodes with the indices `first`, with the gyro's bias and the wheels' scale of then.
+
+    `turn_rates` (K): at which they turn besides, rad/s.
+    """
     seconds, biases, scales = np.array([(each.seconds, each.rate_bias, each.scale) for each in nodes]).T
     path, moment = np.array([(each.path, each.moment) for each in nodes]).T
     is_inside = np.arange(1, len(nodes)) > first[:, None]
-    turns = is_inside * (0.5 * (biases[1:] + biases[:-1]) - biases[first, None]) * np.diff(seconds)
+    turns = (
+        is_inside
+        * (0.5 * (biases[1:] + biases[:-1]) - biases[first, None] + np.reshape(turn_rates, (-1, 1)))
+        * np.diff(seconds)
+    )
     turned = np.cumsum(turns, axis=1)
     lengths = is_inside * (1.0 + 0.5 * (scales[1:] + scales[:-1]) - scales[first, None])
     factors = lengths * np.exp(1j * (turned - 0.5 * turns))
@@ -215,8 +239,12 @@ def replay_paths(nodes: Sequence[PathNode], first: Array) -> WindowPaths:
     return WindowPaths(is_inside, paths, np.cumsum(factors * np.diff(moment), axis=1), turned)
 
 
-def _find_errors(nodes: Sequence[PathNode], first: Array, replayed: WindowPaths) -> Array:
-    """Return the columns of the fits (K x N x C): the errors of the fixes, and what one unit of each parameter adds."""
+def _find_errors(nodes: Sequence[PathNode], first: Array, turn_rates: Array) -> Array:
+    """Return the columns of the fits (K x N x C): the errors of the fixes, and what one unit of each parameter adds.
+
+    They are linear about paths that turn by `turn_rates` (K), rad/s.
+    """
+    replayed = replay_paths(nodes, first, turn_rates)
     seconds, rotations, yaws, rates, latencies = np.array(
         [(n.seconds, n.rotation, n.rotation + n.own_heading, n.turn_rate, n.latency) for n in nodes]
     ).T
@@ -233,6 +261,7 @@ def _find_errors(nodes: Sequence[PathNode], first: Array, replayed: WindowPaths)
     arms = np.exp(1j * (yaws[1:] - replayed.turned)) - np.exp(1j * yaws[first, None])
     late = -velocities[1:] * ones
     usual = (1j * paths, paths, 1j * moments)
+    errors += turn_rates[:, None] * usual[RATE]
     planar = (t, 1j * t, ones, 1j * ones, arms, 1j * arms)
     columns = np.stack((errors, *usual, *planar, velocities[first, None] + late, late), axis=2)
     return np.asarray(columns * replayed.is_inside[:, :, None])
@@ -262,14 +291,14 @@ def _get_covariances(
     return np.asarray(C)
 
 
-def _weight(columns: Array, covariances: Array) -> Array:
-    """Return the products (K x C x C) of all columns with each other, weighted by the inverse of the covariances.
+def _weight(columns: Array, weights: Array) -> Array:
+    """Return the products (K x C x C) of all columns with each other, weighted by the inverse covariances (K x N x N).
 
     They are real: a parameter is real, and adds its complex column along both axes.
     """
     num_columns = columns.shape[2]
     parts = np.concatenate((columns.real, columns.imag), axis=2)
-    weighted = np.linalg.solve(covariances, parts)
+    weighted = weights @ parts
     transposed = parts.transpose(0, 2, 1)
     along_x = transposed[:, :num_columns] @ weighted[:, :, :num_columns]
     return np.asarray(along_x + transposed[:, num_columns:] @ weighted[:, :, num_columns:])

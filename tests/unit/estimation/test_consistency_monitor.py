@@ -176,15 +176,13 @@ def test_given_fixes_that_jump_then_it_is_a_jump_of_gnss_within_seconds(jump: co
 
 
 @pytest.mark.parametrize("rate", [0.02, -0.02])
-def test_given_a_gyro_whose_bias_steps_then_it_is_mostly_found_to_be_the_cause_with_about_that_step(
-    rate: float,
-) -> None:
-    steps = [find(Fault(200.0, rate=rate), seed) for seed in range(6)]
-    assert all(each.t < 230.0 for each in steps)
-    changes = [each.found.change for each in steps if each.found and each.found.cause is Cause.GYRO]
-    # straight ahead a drift of the fixes explains as much: then it is assumed
-    assert len(changes) >= 4
-    assert all(each == pytest.approx(rate, rel=0.7) for each in changes)
+def test_given_a_gyro_whose_bias_steps_then_it_is_found_to_be_the_cause_with_about_that_step(rate: float) -> None:
+    steps = [find(Fault(200.0, rate=rate), seed) for seed in range(12)]
+    assert all(each.t < 223.0 for each in steps)
+    assert all(each.found and each.found.cause is Cause.GYRO for each in steps)
+    # one that has turned the heading before its window begins is taken for a larger one
+    off = sorted(abs(each.found.change / rate - 1.0) for each in steps if each.found)
+    assert off[-2] < 0.4
 
 
 @pytest.mark.parametrize("seed", range(6))
