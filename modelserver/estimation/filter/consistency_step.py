@@ -241,6 +241,7 @@ def _resolve(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[NavSta
     if found.cause is Cause.GYRO:
         whole = found.change * seconds
         nav = _turn(nav, whole - found.turned, FIT_SHARE * abs(whole), layout)
+        nav = _release_roll(nav, found.change)
         nav = _correct(nav, 11, start.rate_bias - found.change - nav.gyro_bias[2], layout)
         return nav, text + f"the gyro's bias has changed by {math.degrees(found.change):.2f} deg/s"
     if found.cause is Cause.WHEELS and SCALE in layout:
@@ -272,6 +273,18 @@ def _correct(nav: NavState, index: int, change: float, layout: ErrorLayout) -> N
     H[0, index] = 1.0
     error, P = eskf.correct(P, np.array((change,)), H, np.array(((variance,),)))
     return nav.inject(error, P)
+
+
+def _release_roll(nav: NavState, change: float) -> NavState:
+    """Return the state with the uncertainty of a roll that has explained a change of the gyro's bias, rad/s.
+
+    The constraint has tilted the vehicle until gravity alone explained an acceleration sideways, speed times `change`.
+    """
+    x, y, _ = nav.velocity
+    ahead = math.hypot(x, y) * change / eskf.STANDARD_GRAVITY * np.array((math.cos(nav.yaw), math.sin(nav.yaw)))
+    P = nav.covariance.copy()
+    P[6:8, 6:8] += np.outer(ahead, ahead)
+    return nav._replace(covariance=P)
 
 
 def _turn(nav: NavState, angle: float, sigma: float, layout: ErrorLayout) -> NavState:
