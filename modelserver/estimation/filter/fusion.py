@@ -221,11 +221,7 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
     if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
         # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would change
         # the bias for good, and make bias and heading known that are not
-        nav = nav.change(11, before.gyro_bias[2] - nav.gyro_bias[2])
-        P = nav.covariance.copy()
-        for axis in (8, 11):
-            P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
-        nav = nav._replace(covariance=P)
+        nav = hold_bias(before, nav, (8, 11))
     state = state._replace(nav=nav)
     if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):
         # the constraint turns the heading to the course of the fixes
@@ -235,6 +231,14 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
         aside = float(innovation.residual[0]) * min(dt, LONGEST_MEAN)
         state = state._replace(consistency=state.consistency.follow_wheels(cmath.rect(aside, before.yaw) * 1j, utime))
     return state, decision
+
+
+def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) -> NavState:
+    """Return the state `after` an update with the yaw gyro's bias of `before`, and no less variance along `axes`."""
+    P = after.covariance.copy()
+    for axis in axes:
+        P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
+    return after.change(11, before.gyro_bias[2] - after.gyro_bias[2])._replace(covariance=P)
 
 
 def _excludes(state: Aligned, item: Item) -> bool:
