@@ -42,7 +42,6 @@ from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.path_fits import (
-    LARGEST_TURN_SIGMA,
     TYPICAL_CHANGE,
     Cause,
     Inconsistency,
@@ -50,6 +49,7 @@ from modelserver.estimation.filter.path_fits import (
 )
 from modelserver.estimation.filter.path_windows import (
     COURSE_FLOOR,
+    LARGEST_TURN_SIGMA,
     MIN_TURN_PATH,
     Discrepancy,
     PathNode,
@@ -59,6 +59,7 @@ from modelserver.estimation.filter.path_windows import (
     get_fix_variance,
     get_moment,
     get_turn_sigma,
+    is_direction_known,
 )
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.filter.settings import FilterSettings
@@ -507,7 +508,7 @@ class ConsistencyMonitor(NamedTuple):
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:
-        nodes = (*self.older, *self.newest)
+        nodes = [each for each in (*self.older, *self.newest) if not each.is_measured or is_direction_known(each, node)]
         # windows of about 1, 2, 4, 8 ... seconds are enough: each is half of the next
         found, seconds = [], 1.0
         for each in reversed(nodes):

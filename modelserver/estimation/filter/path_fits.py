@@ -6,7 +6,9 @@ e_j = (exp(i psi_j) - exp(i psi_k)) a. None explains fixes that drift, e_j = v (
 speed, or that jump. Each fit has the covariance of (1) in `path_windows` over the window, and the errors u of the state
 as parameters with their sigmas; what it explains is its evidence, so a cause with more parameters does not win by that.
 The path is replayed with bias and scale as they were at the start of the window, since a state that follows the fixes
-hides what has changed.
+hides what has changed. A turn by half a radian is not linear, so fits are repeated about the path that they have turned
+(Gauss-Newton). Evidence is comparable over the same fixes only: a drift that began within the window of another cause
+has to explain all of that window.
 
 All windows end at the newest node. They are fitted together, as arrays over windows and nodes, since most of the work
 for one would be overhead: shorter windows are filled up in front by nodes without error and of unit variance.
@@ -31,6 +33,7 @@ from modelserver.estimation.filter.path_windows import (
     PathNoise,
     compare_window,
     get_fix_variance,
+    is_direction_known,
     shift_fix,
 )
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
@@ -40,9 +43,6 @@ Array: TypeAlias = npt.NDArray[Any]
 
 MODEL_ERROR: Final = 0.05
 """Meters that no cause explains, as slip that comes and goes: with fixes of centimeters."""
-
-LARGEST_TURN_SIGMA: Final = 0.2
-"""Standard deviation of the path's turn since the start of a window, rad, beyond which a fit is no longer linear."""
 
 LARGEST_REST: Final = 2.0
 """Mean square, over each axis, that a cause may leave unexplained, relative to the variance of the fixes, and so may a
@@ -127,7 +127,7 @@ NO_CAUSE: Final = (CauseModel(Cause.GNSS, (), 1.0),)
 OF_THE_GYRO: Final = (CauseModel(Cause.GYRO, (3,), TYPICAL_CHANGE[Cause.GYRO]),)
 BENDS: Final = 3
 """Models of no fault and of a gyro's bias, and how often their fits are repeated about the path that the last one bent:
-a turn of half a radian is not linear."""
+see the module's theory."""
 
 
 def find_causes(
@@ -137,11 +137,7 @@ def find_causes(
 
     Only windows in which the path's direction is known, and causes other than GNSS that leave about the noise of fixes.
     """
-    starts = [
-        k
-        for k, start in enumerate(nodes)
-        if start.heading_variance + start.rate_variance * (newest.seconds - start.seconds) ** 2 <= LARGEST_TURN_SIGMA**2
-    ]
+    starts = [k for k, start in enumerate(nodes) if is_direction_known(start, newest)]
     if not starts:
         return {}
     nodes = (*nodes[starts[0] :], newest)
@@ -154,25 +150,29 @@ def find_causes(
     is_precise = np.array([each.correlated < LARGEST_FIX_SIGMA for each in begins])
     largest = 2.0 * LARGEST_REST * inside.sum(axis=1)
 
-    def bend(models: Sequence[CauseModel]) -> Array:
-        """Return the products about the paths that the fit of one model turns."""
+    def bend(models: Sequence[CauseModel]) -> tuple[Array, Array]:
+        """Return the turn rates of the fits of one model, and the products about the paths that they turn."""
         rates = np.zeros(len(first))
         for _ in range(BENDS):
             factors, _, _ = _fit(_weight(_find_errors(nodes, first, rates), weights), usual, models)
             rates = factors[:, 0, RATE] + factors[:, 0, len(USUAL) :].sum(axis=1)
-        return _weight(_find_errors(nodes, first, rates), weights)
+        return rates, _weight(_find_errors(nodes, first, rates), weights)
 
     # by the errors that the state knows alone
-    bent = bend(NO_CAUSE)
+    rates, bent = bend(NO_CAUSE)
     _, _, none = _fit(bent, usual, NO_CAUSE)
+    _, of_the_gyro = bend(OF_THE_GYRO)
+    drifts = np.full(len(first), -math.inf)
     found: dict[Cause, Inconsistency] = {}
-    for models, products in ((ALONG_BOTH_AXES, bent), (OF_THE_PATH, bent), (OF_THE_GYRO, bend(OF_THE_GYRO))):
+    for models, products in ((ALONG_BOTH_AXES, bent), (OF_THE_PATH, bent), (OF_THE_GYRO, of_the_gyro)):
         factors, rest, evidence = _fit(products, usual, models)
         explained = none - evidence
         for n, (cause, _, _) in enumerate(models):
             if cause is Cause.LATENCY and not newest.shows_latency:
                 continue
-            if cause is not Cause.GNSS:
+            if cause is Cause.GNSS:
+                drifts = np.maximum(drifts, explained[:, n])
+            else:
                 explained[rest[:, n] > largest, n] = -math.inf
             if cause is Cause.LEVER_ARM:
                 explained[~is_precise, n] = -math.inf
@@ -196,6 +196,12 @@ def find_causes(
                 end.rotation - start.rotation,
                 complex(change, *more),
             )
+    if others := [each for cause, each in found.items() if cause is not Cause.GNSS]:
+        k = begins.index(max(others, key=lambda each: each.explained).discrepancy.node)
+        columns = _delay(_find_errors(nodes, first[k : k + 1], rates[k : k + 1])[0], nodes, first[k:])
+        _, _, evidence = _fit(_weight(columns, weights[k]), usual[k : k + 1], ALONG_BOTH_AXES[:2])
+        drifted = max(float(drifts[:k].max(initial=-math.inf)), float(none[k, 0] - evidence.min()))
+        found[Cause.GNSS] = found[Cause.GNSS]._replace(explained=drifted)
     return found
 
 
@@ -265,6 +271,16 @@ def _find_errors(nodes: Sequence[PathNode], first: Array, turn_rates: Array) -> 
     planar = (t, 1j * t, ones, 1j * ones, arms, 1j * arms)
     columns = np.stack((errors, *usual, *planar, velocities[first, None] + late, late), axis=2)
     return np.asarray(columns * replayed.is_inside[:, :, None])
+
+
+def _delay(columns: Array, nodes: Sequence[PathNode], begins: Array) -> Array:
+    """Return the columns of a window (N x C) with errors of the fixes that begin at the nodes `begins` (K x N x 8)."""
+    seconds = np.array([each.seconds for each in nodes])
+    t = seconds[1:] - seconds[begins, None]
+    since = np.maximum(t, 0.0), (t > 0.0).astype(float)
+    delayed = np.repeat(columns[None, :, :8], len(begins), axis=0)
+    delayed[:, :, 4:] = np.stack([axis * each for each in since for axis in (1.0, 1j)], axis=2)
+    return delayed
 
 
 def _get_covariances(

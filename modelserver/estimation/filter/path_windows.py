@@ -34,6 +34,10 @@ MAX_INFLATION: Final = 4.0
 """Largest inflation, in variance, of the error of fixes here: a drift must not excuse itself."""
 
 
+LARGEST_TURN_SIGMA: Final = 0.2
+"""Standard deviation of the path's turn since the start of a window, rad, beyond which its errors are not linear."""
+
+
 class PathNoise(NamedTuple):
     """Noise along the path.
 
@@ -161,6 +165,12 @@ def compare_window(start: PathNode, end: PathNode, noise: PathNoise, settings: F
     return Discrepancy(
         start, error, math.sqrt(max(square_sum, 0.0)), longest, d, (east, north, cross), turn, turn_sigma
     )
+
+
+def is_direction_known(start: PathNode, end: PathNode) -> bool:
+    """Return whether the path's turn between two nodes is known well enough for (1), which is linear in its error."""
+    seconds = end.seconds - start.seconds
+    return start.heading_variance + start.rate_variance * seconds**2 <= LARGEST_TURN_SIGMA**2
 
 
 def find_turn(start: PathNode, end: PathNode) -> float:
