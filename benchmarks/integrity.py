@@ -343,6 +343,7 @@ FAULTS: Final = (
     Fault(
         "steady_circle", _circle, "132 s/h, longest 9", COVERED, session=450.0, quick=("car", 15.0), has_velocity=None
     ),
+    Fault("gyro_bias_step_02_velocity", _step_gyro(0.02), "not measured", STEP, quick=("car", 15.0), has_velocity=True),
 )
 BY_NAME: Final = {fault.name: fault for fault in FAULTS}
 

@@ -227,7 +227,7 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
         # the constraint turns the heading to the course of the fixes
         turn = wrap_angle(state.nav.yaw - before.yaw)
         state = state._replace(consistency=state.consistency.correct(0j, turn))
-    elif isinstance(state, Aligned) and not decision.reason:
+    elif isinstance(state, Aligned):
         aside = float(innovation.residual[0]) * min(dt, LONGEST_MEAN)
         state = state._replace(consistency=state.consistency.follow_wheels(cmath.rect(aside, before.yaw) * 1j, utime))
     return state, decision

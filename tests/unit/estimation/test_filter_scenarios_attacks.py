@@ -333,6 +333,33 @@ def test_given_a_vehicle_that_is_transported_beside_its_own_axis_then_it_is_inva
     assert abs(found.last.heading) < math.radians(3.0)
 
 
+@pytest.mark.parametrize("step", [0.02, -0.02])
+def test_given_a_gyro_whose_bias_changes_at_speed_then_it_is_corrected_for_good_by_wheels_of_unequal_size(step):
+    phases = (*EIGHT[:-1], DrivePhase(6.0, 8.0), DrivePhase(70.0, 8.0), DrivePhase(6.0, 0.0))
+    begin = sum(each.duration for each in EIGHT[:-1]) + 16.0
+
+    def change(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, ImuSample) and event.header.utime >= START_UTIME + round(1e6 * begin):
+                turn = so3.rotate(so3.conjugate(MOUNT.wxyz), (0.0, 0.0, step))
+                event = replace(event, angular_velocity=so3.add(event.angular_velocity, turn))
+            elif isinstance(event, WheelsSample):
+                wheels = (replace(each, travel=each.travel * (1.0 + 0.005 * n)) for n, each in enumerate(event.wheels))
+                event = replace(event, wheels=tuple(wheels))
+            yield event
+
+    found = drive(simulation(phases), begin + 60.0, transform=change)
+
+    resets = found.decisions("consistency", Verdict.RESET)
+    assert any("gyro's bias" in each.reason for each in resets)
+    assert found.seconds(resets[-1]) < begin + 15.0
+    healed = found.between(begin + 25.0)
+    assert all(row.valid for row in healed)
+    assert all(abs(row.heading) < math.radians(3.0) for row in healed)
+    # the sensor's own bias is 0.002
+    assert found.localizer.head.nav.gyro_bias[2] == pytest.approx(step, abs=0.004)
+
+
 def test_given_a_long_gap_of_the_imu_on_a_vehicle_without_wheels_then_it_is_leveled_again():
     fixes = replace(PLAIN_GPS, has_velocity=False)
     gone = simulation(EIGHT * 2, imu_model=replace(IMU, outages=((25.0, 60.0),)), gps_model=fixes)
