@@ -199,7 +199,7 @@ class ConsistencyMonitor(NamedTuple):
     moved_since: since when no window has exceeded it.
     cause: of an inconsistency that lasts, since `since`; None: fixes and path agree.
     suspect: the last node before it, while fixes are not trusted; `is_jump`: whether they have jumped then.
-    drift_rate: at which they drifted away from the path until then, m/s; 0 for a jump.
+    drift_rate: at which they drifted away from the path until then, at least, m/s; 0 for a jump.
     largest: discrepancy of the fixes since then, m.
     agreed_since: since when the fixes have agreed with the path from there again; 0: they do not.
     horizontal_allowance, heading_allowance: what is unexplained, m and rad.
@@ -260,7 +260,8 @@ class ConsistencyMonitor(NamedTuple):
         if found.cause not in (Cause.GNSS, Cause.HEADING):
             # the uncertainty of a latency that was corrected covers what is left
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
-            suspicion = max(self.suspicion, abs(found.discrepancy.error))
+            # fixes that were not used may have jumped after all
+            suspicion = max(self.suspicion, abs(found.discrepancy.error), self.largest if self.excludes_fixes else 0.0)
             path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None, is_jump=False)
             if found.cause is Cause.GYRO:
                 path = path._replace(hidden=0.0)
@@ -269,13 +270,14 @@ class ConsistencyMonitor(NamedTuple):
             return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
         suspect = found.discrepancy.node
         drifts = found.cause is Cause.GNSS and not found.is_jump
+        slowest = abs(found.discrepancy.error) - found.discrepancy.sigma
         after = self._replace(
             num_exceeded=0,
             cause=found.cause,
             since=utime,
             suspect=suspect,
             is_jump=found.is_jump,
-            drift_rate=abs(found.discrepancy.error) / ((utime - suspect.utime) * 1e-6) if drifts else 0.0,
+            drift_rate=slowest / ((utime - suspect.utime) * 1e-6) if drifts else 0.0,
             largest=0.0,
             agreed_since=0,
         )
@@ -379,7 +381,8 @@ class ConsistencyMonitor(NamedTuple):
             least = max(0.5 * TYPICAL_CHANGE[Cause.GYRO], KNOWN_BIAS * math.sqrt(self.suspect.rate_variance))
             if change < least:
                 return self
-        path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False)
+        suspicion = max(self.suspicion, self.largest if self.excludes_fixes else 0.0)
+        path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False, suspicion=suspicion)
         return path._replace(cause=Cause.GYRO, since=utime, suspect=None, is_jump=False)
 
     def correct(self, shift: complex, turn: float) -> ConsistencyMonitor:

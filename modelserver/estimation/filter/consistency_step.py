@@ -103,7 +103,7 @@ def compare_path(
     found = monitor.find_cause(node, noise, settings)
     monitor = monitor.append(node)
     if found is not None:
-        return _handle(setup, state._replace(consistency=monitor), found)
+        return _handle(setup, state._replace(consistency=monitor), found, newest)
     if monitor.cause is Cause.HEADING and monitor.suspect is not None:
         return _drive_by_itself(setup, state._replace(consistency=monitor))
     if monitor.suspect is not None:
@@ -125,7 +125,9 @@ def compare_path(
     return state._replace(consistency=monitor), ()
 
 
-def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned, tuple[Decision, ...]]:
+def _handle(
+    setup: Setup, state: Aligned, found: Inconsistency, newest: PathFix
+) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after an inconsistency."""
     monitor, gnss, common, nav = state.consistency, state.gnss, state.common, state.nav
     after = state._replace(consistency=monitor.resolve(found, nav.utime))
@@ -135,6 +137,9 @@ def _handle(setup: Setup, state: Aligned, found: Inconsistency) -> tuple[Aligned
     if found.is_jump:
         gnss = gnss._replace(rejected=(), rejected_since=gnss.rejected_since or nav.utime)
     after = after._replace(nav=nav, gnss=gnss, common=common)
+    if monitor.excludes_fixes and not after.consistency.excludes_fixes:
+        # the path was wrong, and the state has followed it
+        after = _place(setup, after, newest)
     return after, (report_event(after, KIND, Verdict.RESET, text),)
 
 

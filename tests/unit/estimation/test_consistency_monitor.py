@@ -411,10 +411,13 @@ def test_given_fixes_that_jump_then_the_bound_covers_how_far_a_heading_that_may_
 def test_given_fixes_that_jumped_then_another_cause_that_is_corrected_ends_their_exclusion(cause: Cause) -> None:
     found = next(each for each in drive(230.0, Fault(200.0, 230.0, jump=40.0)) if each.found is not None)
     assert found.found is not None
-    monitor = found.monitor.resolve(found.found, found.node.utime)
+    monitor = found.monitor.resolve(found.found, found.node.utime)._replace(largest=55.0)
     assert monitor.excludes_fixes
     corrected = monitor.resolve(found.found._replace(cause=cause), found.node.utime)
     assert not corrected.excludes_fixes
+    # they may have jumped after all
+    assert corrected.horizontal_allowance >= 55.0
+    assert monitor.relearn(1.0, found.node.utime).suspicion >= 55.0
     # allowances fade again
     later = found.node._replace(utime=found.node.utime + 20_000_000)
     assert 0.0 < corrected.compare(later, NOISE, SETTINGS).horizontal_allowance < 0.75 * corrected.horizontal_allowance

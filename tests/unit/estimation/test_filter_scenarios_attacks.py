@@ -10,11 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter import fusion, heading_alignment, heading_step, propagation
+from modelserver.estimation.filter import consistency_step, fusion, heading_alignment, heading_step, propagation
+from modelserver.estimation.filter.consistency_monitor import ConsistencyMonitor
 from modelserver.estimation.filter.error_layout import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.path_fits import Cause
+from modelserver.estimation.filter.path_fits import Cause, Inconsistency
+from modelserver.estimation.filter.path_windows import PathNoise, compare_window
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Leveling, Unaligned
 from modelserver.estimation.filter.timeline import Timeline
@@ -22,7 +24,18 @@ from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, 
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
-from tests.support_filter import IMU, MOUNT, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, WHEELS_TIMING, drive, simulation
+from tests.support_filter import (
+    IMU,
+    MOUNT,
+    ORIGIN,
+    PLAIN_GPS,
+    RIG,
+    RTK_LIKE,
+    WHEELS_TIMING,
+    drive,
+    simulation,
+    skip_if_compiled,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -358,6 +371,29 @@ def test_given_a_gyro_whose_bias_changes_at_speed_then_it_is_corrected_for_good_
     assert all(abs(row.heading) < math.radians(3.0) for row in healed)
     # the sensor's own bias is 0.002
     assert found.localizer.head.nav.gyro_bias[2] == pytest.approx(step, abs=0.004)
+
+
+def test_given_fixes_that_were_not_used_and_a_gyro_that_is_the_cause_then_the_position_is_that_of_the_fixes(
+    monkeypatch,
+):
+    skip_if_compiled()
+    localizer = drive(simulation(EIGHT), 35.0).localizer
+    state, setup = localizer.head, localizer.setup
+    fix, node = state.gnss.last_fix, state.consistency.last
+    x, y, z = state.nav.position
+    monitor = state.consistency._replace(cause=Cause.GNSS, suspect=node, is_jump=True, largest=10.0)
+    off = state._replace(nav=state.nav._replace(position=(x + 10.0, y, z)), consistency=monitor)
+    noise = PathNoise(1e-6, 1e-12, 1.0)
+    found = Inconsistency(Cause.GYRO, compare_window(monitor.newest[0], node, noise, setup.settings))
+    monkeypatch.setattr(ConsistencyMonitor, "find_cause", lambda *_: found)
+
+    newest = fix._replace(utime=off.nav.utime, path=fix.path + 10.0)
+    after, _ = consistency_step.compare_path(setup, off, newest, is_compared=True)
+
+    assert math.dist(after.nav.position[:2], (x, y)) < 2.0
+    assert not after.consistency.excludes_fixes
+    assert after.consistency.horizontal_allowance >= 10.0
+    assert after.common.epoch > state.common.epoch
 
 
 def test_given_a_long_gap_of_the_imu_on_a_vehicle_without_wheels_then_it_is_leveled_again():
