@@ -149,7 +149,7 @@ def _fuse_speed(
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     nav = latency_estimator.hold_latency(context.nav, nav, setup.layout)
     has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
-    if has_gyro and not are_stationary and innovation.jacobian[:, 11].any():
+    if has_gyro and not are_stationary and len(innovation.residual) > 1:
         # two sides roll differently for good, by more than a gyro's bias
         nav = hold_bias(context.nav, nav)
     wheels = state.common.wheels
