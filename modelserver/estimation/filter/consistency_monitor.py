@@ -49,7 +49,6 @@ from modelserver.estimation.filter.path_fits import (
 )
 from modelserver.estimation.filter.path_windows import (
     COURSE_FLOOR,
-    LARGEST_TURN_SIGMA,
     MIN_TURN_PATH,
     Discrepancy,
     PathNode,
@@ -251,6 +250,11 @@ class ConsistencyMonitor(NamedTuple):
         return self.suspect is not None and self.is_jump
 
     @property
+    def _excluded(self) -> float:
+        """How far fixes that are not used have been off, m: they may have jumped, whatever is found after."""
+        return self.largest if self.excludes_fixes else 0.0
+
+    @property
     def may_reset(self) -> bool:
         """Whether rejected fixes may show where the vehicle is: they are not suspect themselves."""
         return self.suspect is None or self.cause is Cause.HEADING
@@ -260,8 +264,7 @@ class ConsistencyMonitor(NamedTuple):
         if found.cause not in (Cause.GNSS, Cause.HEADING):
             # the uncertainty of a latency that was corrected covers what is left
             cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
-            # fixes that were not used may have jumped after all
-            suspicion = max(self.suspicion, abs(found.discrepancy.error), self.largest if self.excludes_fixes else 0.0)
+            suspicion = max(self.suspicion, abs(found.discrepancy.error), self._excluded)
             path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None, is_jump=False)
             if found.cause is Cause.GYRO:
                 path = path._replace(hidden=0.0)
@@ -381,7 +384,7 @@ class ConsistencyMonitor(NamedTuple):
             least = max(0.5 * TYPICAL_CHANGE[Cause.GYRO], KNOWN_BIAS * math.sqrt(self.suspect.rate_variance))
             if change < least:
                 return self
-        suspicion = max(self.suspicion, self.largest if self.excludes_fixes else 0.0)
+        suspicion = max(self.suspicion, self._excluded)
         path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False, suspicion=suspicion)
         return path._replace(cause=Cause.GYRO, since=utime, suspect=None, is_jump=False)
 
@@ -421,8 +424,8 @@ class ConsistencyMonitor(NamedTuple):
             return self
         if self.num_exceeded and self.suspect is None:
             return self
-        if node.heading_variance > LARGEST_TURN_SIGMA**2:
-            return self  # the path has no direction yet
+        if not is_direction_known(node, node):
+            return self  # the path has none yet
         while newest and node.utime - newest[0].utime > NEWEST_US:
             if not older or newest[0].utime - older[-1].utime >= OLDER_SPACING_US:
                 older = (*older, newest[0])

@@ -180,11 +180,7 @@ def _realign(
         return None
     if fit.turn_sigma > setup.settings.align_sigma:
         return None
-    sigma = math.sqrt(float(nav.covariance[8, 8]))
-    if abs(fit.turn) > 2.0 * math.hypot(sigma, fit.turn_sigma):
-        P = nav.covariance.copy()
-        P[8, :] = P[:, 8] = 0.0
-        nav = _turn(nav._replace(covariance=P), fit.turn, fit.turn_sigma, setup.layout)
+    nav = _follow_turn(nav, fit.turn, fit.turn_sigma, setup.layout)
     monitor = held.restart()._replace(suspicion=fit.largest, horizontal_allowance=fit.largest)
     return _start_epoch(setup, state._replace(nav=nav), newest)._replace(consistency=monitor)
 
@@ -196,14 +192,11 @@ def _drive_by_itself(setup: Setup, state: Aligned) -> tuple[Aligned, tuple[Decis
     if shown is None:
         return state, ()
     rotation, sigma = shown
-    turn, turned = wrap_angle(rotation - monitor.rotation), nav
+    turn = wrap_angle(rotation - monitor.rotation)
     if abs(turn) > 0.5 * math.pi:
         return state, ()  # it may drive in reverse
-    if abs(turn) > 2.0 * math.hypot(sigma, math.sqrt(float(nav.covariance[8, 8]))):
-        P = nav.covariance.copy()
-        P[8, :] = P[:, 8] = 0.0
-        # fixes show the velocity, whatever the heading
-        turned = _turn(nav._replace(covariance=P), turn, sigma, setup.layout)._replace(velocity=nav.velocity)
+    # fixes show the velocity, whatever the heading
+    turned = _follow_turn(nav, turn, sigma, setup.layout)._replace(velocity=nav.velocity)
     common = state.common._replace(epoch=state.common.epoch + 1)
     state = state._replace(nav=turned, common=common, consistency=hold_heading(setup, state, turned).restart())
     return state, (
@@ -295,6 +288,15 @@ def _release_roll(nav: NavState, change: float) -> NavState:
 def _turn(nav: NavState, angle: float, sigma: float, layout: ErrorLayout) -> NavState:
     """Return the state turned about where it is, with its velocity."""
     return heading_alignment.rotate(nav, Rotation(angle, sigma), layout)._replace(position=nav.position)
+
+
+def _follow_turn(nav: NavState, angle: float, sigma: float, layout: ErrorLayout) -> NavState:
+    """Return the state turned by an angle that is shown to `sigma`, rad, unless its heading agrees with that."""
+    if abs(angle) <= 2.0 * math.hypot(sigma, math.sqrt(float(nav.covariance[8, 8]))):
+        return nav
+    P = nav.covariance.copy()
+    P[8, :] = P[:, 8] = 0.0
+    return _turn(nav._replace(covariance=P), angle, sigma, layout)
 
 
 def _turn_back(setup: Setup, state: Aligned, start: PathNode) -> NavState:

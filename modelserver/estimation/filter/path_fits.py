@@ -150,13 +150,16 @@ def find_causes(
     is_precise = np.array([each.correlated < LARGEST_FIX_SIGMA for each in begins])
     largest = 2.0 * LARGEST_REST * inside.sum(axis=1)
 
+    straight = _weight(_find_errors(nodes, first, np.zeros(len(first))), weights)
+
     def bend(models: Sequence[CauseModel]) -> tuple[Array, Array]:
         """Return the turn rates of the fits of one model, and the products about the paths that they turn."""
-        rates = np.zeros(len(first))
+        products = straight
         for _ in range(BENDS):
-            factors, _, _ = _fit(_weight(_find_errors(nodes, first, rates), weights), usual, models)
+            factors, _, _ = _fit(products, usual, models)
             rates = factors[:, 0, RATE] + factors[:, 0, len(USUAL) :].sum(axis=1)
-        return rates, _weight(_find_errors(nodes, first, rates), weights)
+            products = _weight(_find_errors(nodes, first, rates), weights)
+        return rates, products
 
     # by the errors that the state knows alone
     rates, bent = bend(NO_CAUSE)

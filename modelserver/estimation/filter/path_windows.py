@@ -33,7 +33,6 @@ LEAST_MOVED: Final = 0.5
 MAX_INFLATION: Final = 4.0
 """Largest inflation, in variance, of the error of fixes here: a drift must not excuse itself."""
 
-
 LARGEST_TURN_SIGMA: Final = 0.2
 """Standard deviation of the path's turn since the start of a window, rad, beyond which its errors are not linear."""
 
