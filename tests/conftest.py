@@ -24,6 +24,7 @@ from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
 import pytest  # noqa: E402
+import support_shared  # noqa: E402
 from hypothesis import settings  # noqa: E402
 from support_lcm import reserved_url  # noqa: E402
 
@@ -91,6 +92,11 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 50, 50)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Share nothing with tests that patch the code under test."""
+    support_shared.begin_test(getattr(item, "fixturenames", ()))
 
 
 LONGEST = (

@@ -87,7 +87,7 @@ def some_nav(setup: Setup, seed: int, *, extras: bool = True) -> NavState:
     )
 
 
-def drive(seconds: float, seed: int = 3, imu_hz: float = 50.0, **given: object) -> tuple[Simulation, list[Event]]:
+def drive(seconds: float, seed: int = 3, imu_hz: float = 25.0, **given: object) -> tuple[Simulation, list[Event]]:
     """A figure eight after three stationary seconds, and the samples of its first seconds."""
     options = {
         "gps_frame": ANTENNA,

@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from support_shared import run_shared
+
 from modelserver import core
 from modelserver.config.vehicle_file import load_config
 from modelserver.core import CoreState, Instant
@@ -106,7 +108,7 @@ def compare_pose(answer: PoseAnswer, truth: Pose) -> ComparedPose:
 
 @dataclass
 class CoreRun:
-    """The poses that the core published during a drive, at 50 Hz, and its final state."""
+    """The poses that the core published during a drive, at 20 Hz, and its final state."""
 
     drive: SimulatedDrive
     state: CoreState
@@ -140,7 +142,38 @@ class CoreRun:
         return longest_misleading([found for _, found in self.poses])
 
 
-PERIOD_US = 20_000
+PERIOD_US = 50_000
+
+
+@dataclass
+class Progress:
+    """The core so far in a drive, with ticks between the samples."""
+
+    drive: SimulatedDrive
+    clock_step: tuple[float, float]
+    state: CoreState
+    due: int
+    poses: list[tuple[PoseAnswer, ComparedPose]] = field(default_factory=list)
+
+    def update(self, event: Event) -> None:
+        arrival = event.header.host_utime
+        while arrival >= self.due:
+            self.state, outputs = core.step(self.state, Tick(0.0, 0, 0), self.now(self.due))
+            truth = self.drive.truth(self.due)
+            self.poses += [
+                (each.world, replace(compare_pose(each.world, truth), utime=self.due))
+                for each in outputs
+                if isinstance(each, PublishPose)
+            ]
+            self.due += PERIOD_US
+        self.state, _ = core.step(self.state, event, self.now(arrival))
+
+    def now(self, arrival: int) -> Instant:
+        since, (second, ahead) = arrival - self.drive.start_utime, self.clock_step
+        return Instant(1_000_000_000 + since * 1000, arrival + (round(ahead * 1e6) if since >= second * 1e6 else 0))
+
+    def copy(self) -> Progress:
+        return replace(self, poses=self.poses[:])
 
 
 def run_core(
@@ -151,28 +184,12 @@ def run_core(
     `clock_step`: the second at which the time of day is set ahead, and by how many seconds; stamps stay as given.
     """
     begin = drive.start_utime
-
-    def now(arrival: int) -> Instant:
-        since = arrival - begin
-        return Instant(
-            1_000_000_000 + since * 1000, arrival + (round(clock_step[1] * 1e6) if since >= clock_step[0] * 1e6 else 0)
-        )
-
-    run = CoreRun(drive, raptor().start_core(now(begin)))
-    due = begin
-    for event in events:
-        while event.header.host_utime >= due:
-            at = now(due)
-            run.state, outputs = core.step(run.state, Tick(0.0, 0, 0), at)
-            truth = drive.truth(due)
-            run.poses += [
-                (each.world, replace(compare_pose(each.world, truth), utime=due))
-                for each in outputs
-                if isinstance(each, PublishPose)
-            ]
-            due += PERIOD_US
-        run.state, _ = core.step(run.state, event, now(event.header.host_utime))
-    return run
+    at_start = Instant(1_000_000_000, begin)
+    # the events that two drives share come from the same truth
+    done = run_shared(
+        ("core", begin, clock_step), Progress(drive, clock_step, raptor().start_core(at_start), begin), events
+    )
+    return CoreRun(drive, done.state, done.poses)
 
 
 def longest_misleading(found: Sequence[ComparedPose]) -> float:

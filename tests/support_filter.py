@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+from support_shared import SameObject, freeze, run_shared, share
 
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -34,7 +37,7 @@ from modelserver.version import is_filter_compiled
 
 ORIGIN = origin_at(50.27, -111.18, 700.0)
 WHEELS = {"left": "Car:Left", "right": "Car:Right"}
-IMU_HZ, WHEELS_HZ, GPS_HZ = 50.0, 10.0, 4.0
+IMU_HZ, WHEELS_HZ, GPS_HZ = 25.0, 10.0, 4.0
 IMU_TIMING = Timing(IMU_HZ, 0.004, 0.001)
 GPS_TIMING = Timing(GPS_HZ, 0.06, 0.01)
 WHEELS_TIMING = Timing(WHEELS_HZ, 0.01, 0.002)
@@ -42,6 +45,8 @@ WHEELS_TIMING = Timing(WHEELS_HZ, 0.01, 0.002)
 PLAIN_GPS = GpsModel(GPS_TIMING, correlated_sigma=0.3, white_sigma=0.05)
 RTK_LIKE = GpsModel(GPS_TIMING, correlated_sigma=0.01, white_sigma=0.01, fix_type=FixType.RTK_FIXED)
 IMU = ImuModel(IMU_TIMING)
+QUICK_IMU = ImuModel(Timing(50.0, 0.004, 0.001))
+"""For what needs more of the motion than the usual rate shows."""
 WHEELS_MODEL = WheelsModel(WHEELS_TIMING)
 
 MOUNT = Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2)
@@ -49,6 +54,7 @@ MOUNT = Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2)
 Transform = Callable[[Iterable[Event]], Iterable[Event]]
 
 
+@cache
 def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential", *, wheels: bool = True) -> SensorRig:
     """The vehicle; `turned` is the yaw of its body on the ground: sensors stay where they are on the body."""
     builder = ModelBuilder("car")
@@ -98,22 +104,22 @@ def simulation(
         "wheels_model": WHEELS_MODEL,
         **more,
     }
-    return Simulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
+
+    def simulate() -> Simulation:
+        found = Simulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
+        (found._arrivals,) = itertools.tee(found._arrivals, 1)
+        found.truth = cache(found.truth)
+        return found
+
+    key = ("simulation", SameObject(on), freeze(phases), yaw, seed, freeze(arguments))
+    return fork(share(key, simulate))
 
 
-class SharedDrive:
-    """A simulated drive whose samples and truth are computed once for all tests that localize along it."""
-
-    def __init__(self, simulation: Simulation, seconds: float):
-        self.start_utime = simulation.start_utime
-        self.truth = cache(simulation.truth)
-        self._seconds = seconds
-        self._events = tuple(simulation.events(seconds))
-
-    def events(self, seconds: float) -> Iterator[Event]:
-        """Return the samples of the whole drive, in the order of arrival."""
-        assert seconds == self._seconds
-        return iter(self._events)
+def fork(simulation: Simulation) -> Simulation:
+    """Return a simulation that goes on like this one, which does not advance: their samples are computed once."""
+    forked = copy.copy(simulation)
+    forked._arrivals = copy.copy(simulation._arrivals)
+    return forked
 
 
 @dataclass
@@ -140,7 +146,7 @@ class Row:
 class Run:
     """What a drive showed: rows, the ledger, and the localizer at the end."""
 
-    simulation: Simulation | SharedDrive
+    simulation: Simulation
     localizer: Any
     rows: list[Row] = field(default_factory=list)
     ledger: list[Decision] = field(default_factory=list)
@@ -178,7 +184,7 @@ class Run:
         return steps
 
 
-def row(run: Simulation | SharedDrive, estimate: Estimate) -> Row:
+def row(run: Simulation, estimate: Estimate) -> Row:
     true = run.truth(estimate.utime)
     east = north = heading = math.nan
     if estimate.enu is not None:
@@ -193,8 +199,31 @@ def leave_unchanged(events: Iterable[Event]) -> Iterable[Event]:
     return events
 
 
+@dataclass
+class Progress:
+    """A drive so far."""
+
+    localizer: Any
+    every: float
+    due: int = 0
+    ledger: list[Decision] = field(default_factory=list)
+    estimates: list[Estimate] = field(default_factory=list)
+
+    def update(self, event: Sample | SwitchMode) -> None:
+        """Process a sample, and take an estimate every so often at the newest sample's instant."""
+        self.localizer, notes = self.localizer.process(event)
+        self.ledger += [note for note in notes if isinstance(note, Decision)]
+        utime = self.localizer.utime
+        if utime >= self.due and utime and not isinstance(event, SwitchMode):
+            self.due = utime + round(self.every * 1e6)
+            self.estimates.append(self.localizer.estimate(utime))
+
+    def copy(self) -> Progress:
+        return replace(self, ledger=self.ledger[:], estimates=self.estimates[:])
+
+
 def drive(
-    run: Simulation | SharedDrive,
+    run: Simulation,
     seconds: float,
     *,
     settings: FilterSettings | None = None,
@@ -206,23 +235,22 @@ def drive(
     switches: Sequence[tuple[float, SwitchMode]] = (),
 ) -> Run:
     """Drive for some seconds, and take a row every so often at the newest sample's instant."""
-    found: Any = localizer or FilterLocalizer.start(Setup(on, settings), ORIGIN, mode)
-    shown = Run(run, found)
-    due = 0
+    key = (SameObject(on), settings, mode) if localizer is None else SameObject(localizer)
+    first: Any = localizer or FilterLocalizer.start(Setup(on, settings), ORIGIN, mode)
+    events = _insert(switches, transform(run.events(seconds)), run.start_utime)
+    done = run_shared(("drive", key, every), Progress(first, every), events)
+    return Run(run, done.localizer, [row(run, each) for each in done.estimates], done.ledger)
+
+
+def _insert(
+    switches: Sequence[tuple[float, SwitchMode]], events: Iterable[Event], start_utime: int
+) -> Iterator[Event | SwitchMode]:
+    """Yield the events, before the first of each switch's second the switch."""
     waiting = list(switches)
-    for event in transform(run.events(seconds)):
-        sample: Sample = event
-        if waiting and sample.header.host_utime >= run.start_utime + round(waiting[0][0] * 1e6):
-            found, notes = found.process(waiting.pop(0)[1])
-            shown.ledger += [note for note in notes if isinstance(note, Decision)]
-        found, notes = found.process(sample)
-        shown.ledger += [note for note in notes if isinstance(note, Decision)]
-        utime = found.utime
-        if utime >= due and utime:
-            due = utime + round(every * 1e6)
-            shown.rows.append(row(run, found.estimate(utime)))
-    shown.localizer = found
-    return shown
+    for event in events:
+        if waiting and event.header.host_utime >= start_utime + round(waiting[0][0] * 1e6):
+            yield waiting.pop(0)[1]
+        yield event
 
 
 def rms(values: Iterable[float]) -> float:

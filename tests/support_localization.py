@@ -92,7 +92,7 @@ class Sensors:
     gps_sigma: float = 0.5
     gps_noise: float | None = None
     velocity_sigma: float | None = 0.1
-    imu_hz: float = 50.0
+    imu_hz: float = 25.0
     gyro_noise: float = 0.002
     gyro_bias: tuple[float, float, float] = (0.004, -0.003, 0.005)
     force_noise: float = 0.05

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from support_filter import RIG
 
 from modelserver.estimation.filter.persistence import get_setup_hash
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import PersistedPose, PersistedState
-from tests.support_filter import RIG
 
 SETUP = Setup(RIG)
 UTIME = 1_750_000_000_000_000

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import copy
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 
+from support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, WHEELS, WHEELS_MODEL, Run, drive, fork, simulation
+
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import Mode, PersistedState, RestoredState, WheelsSample
 from modelserver.simulation import DrivePhase, Event, Simulation, Trajectory
-from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, WHEELS, WHEELS_MODEL, Run, drive, simulation
 
 FIRST, GAP = 40.0, 4.0
 """Seconds of the first run, and until the second one receives its first sample."""
@@ -29,25 +28,17 @@ def simulate_first_run(
 ) -> tuple[Run, PersistedState]:
     """Return the interrupted run and its persisted state."""
     run, persisted = _simulate_first_run(tuple(after), seed, seconds)
-    return replace(run, simulation=_fork(run.simulation)), persisted
+    return replace(run, simulation=fork(run.simulation)), persisted
 
 
 @cache
 def _simulate_first_run(after: tuple[DrivePhase, ...], seed: int, seconds: float) -> tuple[Run, PersistedState]:
-    """Simulate a first run once for all tests of it; draw from its simulation only through `_fork`."""
+    """Simulate a first run once for all tests of it; draw from its simulation only through `fork`."""
     sim = simulation((*TO_A_STOP, *after, DrivePhase(200.0)), seed=seed)
-    (sim._arrivals,) = itertools.tee(sim._arrivals, 1)
     run = drive(sim, seconds)
     persisted = run.localizer.get_state_to_persist()
     assert persisted is not None
     return run, persisted
-
-
-def _fork(sim: Simulation) -> Simulation:
-    """Return a simulation that continues like `sim`, which does not advance."""
-    fork = copy.copy(sim)
-    fork._arrivals = copy.copy(sim._arrivals)
-    return fork
 
 
 def simulate_second_run(

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 from conftest import Daemon
+from support_filter import RIG, simulation
 from support_lcm import wait_until
+from support_restart import TO_A_STOP
 
 from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
@@ -17,8 +19,6 @@ from modelserver.messages import GpsSample, ImuSample
 from modelserver.server.persistence.stores import PersistedStateError, decode_state
 from modelserver.simulation import DrivePhase, Event
 from modelserver.wire.codec import encode
-from tests.support_filter import RIG, simulation
-from tests.support_restart import TO_A_STOP
 
 VEHICLE = """\
 vehicle: car

@@ -12,6 +12,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
+from support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, leave_unchanged
+from support_restart import find_longest_misleading
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -28,8 +30,6 @@ from modelserver.simulation import (
     WheelsModel,
 )
 from modelserver.simulation.scenario import START_UTIME
-from tests.support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, leave_unchanged
-from tests.support_restart import find_longest_misleading
 
 pytestmark = pytest.mark.slow
 

@@ -7,15 +7,8 @@ import re
 from dataclasses import replace
 
 import pytest
-
-from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Leveling
-from modelserver.messages import Mode, RestoredState
-from modelserver.messages import Phase as FilterPhase
-from modelserver.simulation import DrivePhase
-from tests.support_filter import ORIGIN, RIG, drive, simulation
-from tests.support_restart import (
+from support_filter import ORIGIN, RIG, drive, simulation
+from support_restart import (
     DRIVES_OFF,
     FIRST,
     GAP,
@@ -28,6 +21,13 @@ from tests.support_restart import (
     simulate_second_run,
     skip_samples,
 )
+
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Leveling
+from modelserver.messages import Mode, RestoredState
+from modelserver.messages import Phase as FilterPhase
+from modelserver.simulation import DrivePhase
 
 pytestmark = pytest.mark.slow
 

@@ -9,6 +9,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support_filter import (
+    IMU,
+    MOUNT,
+    ORIGIN,
+    PLAIN_GPS,
+    RIG,
+    RTK_LIKE,
+    WHEELS_TIMING,
+    drive,
+    simulation,
+    skip_if_compiled,
+)
 
 from modelserver.estimation.filter import consistency_step, fusion, heading_alignment, heading_step, propagation
 from modelserver.estimation.filter.consistency_monitor import ConsistencyMonitor
@@ -24,18 +36,6 @@ from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, 
 from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
-from tests.support_filter import (
-    IMU,
-    MOUNT,
-    ORIGIN,
-    PLAIN_GPS,
-    RIG,
-    RTK_LIKE,
-    WHEELS_TIMING,
-    drive,
-    simulation,
-    skip_if_compiled,
-)
 
 pytestmark = pytest.mark.slow
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
@@ -26,7 +27,6 @@ from modelserver.simulation import (
 )
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms.pose import Pose
-from tests.support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
 
 pytestmark = pytest.mark.slow
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support_filter import GPS_TIMING, ORIGIN, PLAIN_GPS, QUICK_IMU, RIG, RTK_LIKE, drive, rms, row, simulation
 
 from modelserver.estimation.filter import heading_step, output
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
@@ -30,7 +31,6 @@ from modelserver.simulation import (
     figure_eight,
     stop_and_go,
 )
-from tests.support_filter import GPS_TIMING, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, drive, rms, row, simulation
 
 pytestmark = pytest.mark.slow
 
@@ -200,7 +200,7 @@ def test_given_fixes_that_drift_ahead_with_their_velocity_then_the_path_that_jud
 def test_given_no_fixes_but_a_pose_then_it_is_used_and_ranges_to_beacons_maintain_it():
     phases = figure_eight(speed=2.0, radius=8.0, laps=2)
     once = AbsolutePoseModel(outages=((6.0, 200.0),))
-    without_fixes = {"gps_frame": None, "pose_frame": "Car:Camera", "pose_model": once}
+    without_fixes = {"gps_frame": None, "pose_frame": "Car:Camera", "pose_model": once, "imu_model": QUICK_IMU}
 
     alone = drive(simulation(phases, **without_fixes), 100.0)
     held = drive(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
+from support_filter import ORIGIN, RIG, drive, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
@@ -16,9 +16,8 @@ from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import AbsolutePoseSample, Invalid, Mode, SensorHeader, SwitchMode, Verdict
-from modelserver.simulation import city, figure_eight
+from modelserver.simulation import Simulation, city, figure_eight
 from modelserver.simulation.scenario import START_UTIME
-from tests.support_filter import ORIGIN, RIG, SharedDrive, drive, simulation
 
 pytestmark = pytest.mark.slow
 
@@ -26,10 +25,9 @@ WITH_FIXES = (Mode.FULL, Mode.RAW, Mode.NO_IMU, Mode.NO_WHEELS)
 WITHOUT_FIXES = (Mode.NO_GPS, Mode.DEAD_RECKONING)
 
 
-@cache
-def simulate_town() -> SharedDrive:
+def simulate_town() -> Simulation:
     """Drive through a town for 80 s."""
-    return SharedDrive(simulation(city(5, 80.0, speed=5.0)), 80.0)
+    return simulation(city(5, 80.0, speed=5.0))
 
 
 def _start_localizer(mode: Mode = Mode.FULL) -> ModeLocalizer:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
 
 from modelserver.messages import ImuSample, Invalid, Quality, Verdict
 from modelserver.simulation import (
@@ -23,7 +24,6 @@ from modelserver.simulation import (
 )
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
-from tests.support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support_cart import rig, some_nav
-from support_filter import RIG, simulation
+from support_filter import QUICK_IMU, RIG, simulation
 from support_journal import OPEN, JournalRig
 
 from modelserver.errors import ConfigError, RecordingError
@@ -63,7 +63,7 @@ def context(own: dict[str, str]) -> MeasurementContext:
 
 def drive(own: dict[str, str], samples: Callable[[ImuSample, float], MeasurementSample | None]) -> Any:
     """Return the filter after 20 s on the IMU and fixes with a sample beside some of the IMU's, and the decisions."""
-    run = simulation(figure_eight(speed=3.0, radius=15.0, stationary=4.0), wheel_frames={})
+    run = simulation(figure_eight(speed=3.0, radius=15.0, stationary=4.0), wheel_frames={}, imu_model=QUICK_IMU)
     localizer, decisions = FilterLocalizer.start(Setup(RIG, own=own)), list[Decision]()
     for event in run.events(20.0):
         localizer, events = localizer.process(event)

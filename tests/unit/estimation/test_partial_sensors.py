@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import cache
 
 import pytest
+from support_filter import RIG, Run, Transform, drive, simulation
 
 from modelserver.estimation.filter.receiver_monitor import (
     CARRIER_LIMIT,
@@ -31,9 +31,8 @@ from modelserver.messages import (
     Verdict,
     WheelsSample,
 )
-from modelserver.simulation import DrivePhase, Event, StatusModel
+from modelserver.simulation import DrivePhase, Event, Simulation, StatusModel
 from modelserver.wire.codec import decode, encode
-from tests.support_filter import RIG, Run, SharedDrive, Transform, drive, simulation
 
 NAN = math.nan
 SECONDS = 44.0
@@ -51,14 +50,12 @@ PHASES = (
 COVARIANCE = (0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.5)
 
 
-@cache
-def drive_with_wheels() -> SharedDrive:
-    return SharedDrive(simulation(PHASES), SECONDS)
+def drive_with_wheels() -> Simulation:
+    return simulation(PHASES)
 
 
-@cache
-def drive_with_status() -> SharedDrive:
-    return SharedDrive(simulation(PHASES, wheel_frames=None, status_model=StatusModel(1.5)), SECONDS)
+def drive_with_status() -> Simulation:
+    return simulation(PHASES, wheel_frames=None, status_model=StatusModel(1.5))
 
 
 def change(kind: type, function: Callable[..., Event]) -> Transform:

@@ -157,7 +157,7 @@ def test_reverse_does_not_reset_the_heading(velocity_sigma):
         speed=stepwise((0.0, 1.5), (20.0, 0.0), (24.0, -1.5), (44.0, 0.0), (46.0, 1.5)),
         yaw_rate=stepwise((28.0, 0.1), (40.0, 0.0)),
     )
-    found = errors(drive, Sensors(velocity_sigma=velocity_sigma, gps_sigma=0.3).events(drive), after=15.0)
+    found = errors(drive, Sensors(velocity_sigma=velocity_sigma, gps_sigma=0.3, imu_hz=50.0).events(drive), after=15.0)
 
     assert max(each[2] for each in found) < 0.35
     assert {each[4].pose_epoch for each in found} == {0}

@@ -74,7 +74,7 @@ def test_a_clock_step_of_any_size_in_a_turn_loses_no_heading(step):
 def test_delayed_samples_are_not_a_clock_step():
     drive = Drive(30.0, speed=stepwise((3.0, 2.0)), yaw_rate=lambda t: 0.3 * math.sin(t / 3))
     arrivals = sorted(
-        ((seconds(s) + (0.05 * (i * 7 % 10) / 10), s) for i, s in enumerate(Sensors().events(drive))),
+        ((seconds(s) + (0.05 * (i * 7 % 10) / 10), s) for i, s in enumerate(Sensors(imu_hz=50.0).events(drive))),
         key=lambda each: each[0],
     )
     rows, reasons, localizer = follow(drive, arrivals)

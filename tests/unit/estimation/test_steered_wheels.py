@@ -9,6 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support_cart import BASE, IMU, SITE, WHEELS, model, some_nav
+from support_filter import ORIGIN, drive, simulation
+from support_restart import TO_A_STOP, skip_samples
 
 from modelserver.estimation.filter import step
 from modelserver.estimation.filter.eskf import Earth, NavState
@@ -38,9 +41,6 @@ from modelserver.simulation import DrivePhase
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import cross
-from tests.support_cart import BASE, IMU, SITE, WHEELS, model, some_nav
-from tests.support_filter import ORIGIN, drive, simulation
-from tests.support_restart import TO_A_STOP, skip_samples
 
 SETTINGS = FilterSettings()
 FRONT = ("FL", "FR")

@@ -6,17 +6,16 @@ import math
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import cache
 
 import pytest
+from support_filter import GPS_TIMING, ORIGIN, RIG, rig, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.stream_correlation import MAX_LAG, STEP, WINDOW, StreamCorrelation
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.messages import FixType, GpsSample, ImuSample, Mode, Phase, SensorFinding, WheelsSample
-from modelserver.simulation import DrivePhase, Event, GpsModel, city, figure_eight
-from tests.support_filter import GPS_TIMING, ORIGIN, RIG, SharedDrive, rig, simulation
+from modelserver.simulation import DrivePhase, Event, GpsModel, Simulation, city, figure_eight
 
 SECONDS = 70.0
 NOISY = GpsModel(GPS_TIMING, correlated_sigma=1.0, white_sigma=0.3, fix_type=FixType.FIX_3D, has_velocity=False)
@@ -34,9 +33,8 @@ def plan_turns(seed: int) -> list[DrivePhase]:
     return [*phases, DrivePhase(3.0, 0.0, 0.0)]
 
 
-@cache
-def drive_turns(seed: int = 3) -> SharedDrive:
-    return SharedDrive(simulation(plan_turns(seed), gps_model=NOISY, seed=seed), SECONDS)
+def drive_turns(seed: int = 3) -> Simulation:
+    return simulation(plan_turns(seed), gps_model=NOISY, seed=seed)
 
 
 def change_samples(events: Iterable[Event], kind: type, change: Change) -> list[Event]:

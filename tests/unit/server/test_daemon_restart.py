@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from support_persistence import PERSISTED, SETUP
 from support_samples import GEOMETRY, START, VEHICLE, ScriptedLocalizer, instant_at, start_core, write_vehicle
 
 from modelserver import core
@@ -30,7 +31,6 @@ from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence.stores import StateStore
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode
-from tests.support_persistence import PERSISTED, SETUP
 
 EVERY_S = 5
 

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from support_journal import SMALL
 from support_journal import JournalRig as Journalled
+from support_persistence import PERSISTED
 from support_samples import VEHICLE, write_vehicle
 from support_signing import write_test_key
 
@@ -27,7 +28,6 @@ from modelserver.server.journal.segments import Ring
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
 from modelserver.server.persistence.stores import PersistentStores, open_stores
-from tests.support_persistence import PERSISTED
 
 ORIGIN = make_origin(500_000.0, 5_500_000.0, 700.0, 12, True)
 NOW = Instant(PERSISTED.monotonic_ns, PERSISTED.utime)

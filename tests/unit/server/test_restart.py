@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support_lcm import TIMEOUT_S
+from support_persistence import PERSISTED, POSE, UTIME
 
 from modelserver.core import Instant
 from modelserver.messages import PersistedState, RestoredState
@@ -27,7 +28,6 @@ from modelserver.server.persistence.stores import (
     encode_state,
     read_boot_id,
 )
-from tests.support_persistence import PERSISTED, POSE, UTIME
 
 NOW = Instant(PERSISTED.monotonic_ns + 7_000_000_000, UTIME + 7_000_000)
 

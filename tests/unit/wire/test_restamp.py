@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from support_wire import EXAMPLES
 
 from modelserver.messages import GetBodyList, RelativePoseSample, RequestHeader
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.encoded import is_of_service, is_stamped, restamp
-from tests.support_wire import EXAMPLES
 
 
 @pytest.mark.parametrize(
