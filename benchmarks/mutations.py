@@ -32,8 +32,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("modelserver", "drivers/msdrivers", "tools/mstools")
-TIMEOUT_S = 900
-"""A mutation whose tests take longer has been noticed: it made an endless loop."""
+LEAST_TIMEOUT_S = 60.0
+SLOWDOWN = 4.0
+"""A mutation whose tests take this many times what they take without it, and the least time, has made an endless loop,
+and is noticed: the suite would not end."""
 
 COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">",
@@ -219,8 +221,16 @@ def data_folder() -> Path:
     return Path(os.environ.get("MODELSERVER_DATA") or ROOT / "../shared/data").resolve()
 
 
-def record(tree: Path, folder: Path) -> dict[int, list[str]]:
-    """Return the tests that reach each mutation, cheapest first, from a run with none turned on."""
+@dataclass(frozen=True)
+class Reach:
+    """The tests that reach a mutation, cheapest first, and the seconds that they take without it."""
+
+    tests: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+def record(tree: Path, folder: Path) -> dict[int, Reach]:
+    """Return what reaches each mutation, from a run with none turned on."""
     reached, costs_file = folder / "reached.tsv", folder / "costs.json"
     if not (folder / "recorded").exists():
         for left in (reached, costs_file):
@@ -244,11 +254,19 @@ def record(tree: Path, folder: Path) -> dict[int, list[str]]:
         test, _, phase = where.rpartition(" ")
         # what a fixture reaches may be shared by all tests of its file
         tests_of[int(number)].update(by_file[test.partition("::")[0]] if phase == "(setup)" else [test])
-    return {n: sorted(found - bad, key=lambda test: costs[test]) for n, found in tests_of.items() if found - bad}
+    return {
+        number: Reach(
+            tuple(sorted(found - bad, key=lambda test: (costs[test], test))), sum(costs[test] for test in found - bad)
+        )
+        for number, found in tests_of.items()
+        if found - bad
+    }
 
 
-def try_mutation(number: int, tests: Sequence[str], tree: Path, folder: Path) -> str:
+def try_mutation(number: int, reach: Reach, tree: Path, folder: Path) -> str:
     """Return how a mutation ended: the test that noticed it, 'lives', or 'unreached'."""
+    tests = reach.tests
+    timeout = LEAST_TIMEOUT_S + SLOWDOWN * reach.seconds
     if not tests:
         return "unreached"
     order = folder / f"tests-{number}.json"
@@ -257,11 +275,11 @@ def try_mutation(number: int, tests: Sequence[str], tree: Path, folder: Path) ->
     files = sorted({test.partition("::")[0] for test in tests})
     try:
         code = run_tests(
-            tree, ["-x", "-p", "no:xdist", "-o", "addopts=-q --strict-markers", *files], log, TIMEOUT_S,
+            tree, ["-x", "-p", "no:xdist", "-o", "addopts=-q --strict-markers", *files], log, timeout,
             MUTANT=str(number), MUTANT_TESTS=str(order),
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return f"noticed: not done in {TIMEOUT_S} s"
+        return f"noticed: not done in {timeout:.0f} s"
     if code == 0:
         return "lives"
     first = next(
@@ -295,7 +313,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     todo = only or [number for number in range(len(sample)) if str(number) not in results]
 
     def attempt(number: int) -> None:
-        results[str(number)] = found = try_mutation(number, reached.get(number, ()), folder / "tree", folder)
+        results[str(number)] = found = try_mutation(number, reached.get(number, Reach()), folder / "tree", folder)
         results_file.write_text(json.dumps(results, indent=1))
         each = sample[number]
         print(f"{number:3} {each.file}:{each.line}: {each.before!r} -> {each.after!r}: {found}", flush=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import signal
 import sys
@@ -16,7 +17,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # As in the `modelserver` command: threads of numpy's linear algebra cost each process 0.1 s and save nothing.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from collections.abc import Iterator  # noqa: E402
+from collections import Counter  # noqa: E402
+from collections.abc import Generator, Iterator  # noqa: E402
 from contextlib import suppress  # noqa: E402
 from importlib import import_module  # noqa: E402
 from itertools import zip_longest  # noqa: E402
@@ -68,23 +70,22 @@ def pytest_collection(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the files, the units of `--dist loadfile`: the slowest first.
+    """Order the files, which `--dist loadfile` hands out whole: the longest first, so that the workers end together.
 
-    Scenario files, which mostly wait, alternate with files that compute.
+    Whole files, since what their tests share is computed once in a process. Scenario files, which mostly wait,
+    alternate with files that compute.
     """
-    files: dict[Path, list[pytest.Item]] = {}
-    for item in items:
-        files.setdefault(item.path, []).append(item)
-    slow = {path: sum(map(_is_slow, found)) / len(found) for path, found in files.items()}
-    waiting = sorted((path for path in files if path.parent.name == "scenario"), key=_rank)
-    computing = sorted((path for path, share in slow.items() if share and path not in waiting), key=lambda p: -slow[p])
-    mixed = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
-    rest = [path for path in files if path not in mixed]
-    items[:] = [item for path in (*mixed, *rest) for item in files[path]]
+    files: dict[str, list[pytest.Item]] = {}
+    for item in sorted(items, key=lambda item: -DURATIONS.get(_name_file(item.nodeid), 0.0)):
+        files.setdefault(_name_file(item.nodeid), []).append(item)
+    waiting = [name for name in files if "/scenario/" in name]
+    computing = [name for name in files if "/scenario/" not in name]
+    mixed = [name for pair in zip_longest(waiting, computing) for name in pair if name is not None]
+    items[:] = [item for name in mixed for item in files[name]]
 
 
-def _is_slow(item: pytest.Item) -> bool:
-    return item.get_closest_marker("slow") is not None or item.path.parent.name == "realdata"
+def _name_file(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
 
 
 def pytest_collection_finish() -> None:
@@ -99,23 +100,38 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     support_shared.begin_test(getattr(item, "fixturenames", ()))
 
 
-LONGEST = (
-    "docs_commands",
-    "drivers",
-    "service",
-    "monitoring",
-    "systemd",
-    "demo",
-    "faults_data",
-    "faults_processes",
-    "faults_drivers",
+DURATIONS_FILE = Path(__file__).with_name("durations.json")
+DURATIONS: dict[str, float] = json.loads(DURATIONS_FILE.read_text())
+"""Seconds of each test file in a whole run; those of a second and less are left out."""
+
+_measured: Counter[str] = Counter()
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Measure the files; in the process that hands them out this is called for all tests."""
+    _measured[_name_file(report.nodeid)] += report.duration
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Store the durations with MODELSERVER_STORE_DURATIONS=1, after a whole run."""
+    if os.environ.get("MODELSERVER_STORE_DURATIONS") == "1" and not hasattr(session.config, "workerinput"):
+        longest = {name: round(seconds) for name, seconds in _measured.most_common() if seconds > 1.0}
+        DURATIONS_FILE.write_text(json.dumps(longest, indent=1) + "\n")
+
+
+NO_RECORDINGS = (
+    "no recordings: docs/recordings.md names the public projects that they come from; set MODELSERVER_DATA to the "
+    "folder with them"
 )
-"""The slowest scenario files, slowest first."""
 
 
-def _rank(path: Path) -> int:
-    name = path.stem.removeprefix("test_")
-    return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
+    """Give all tests that lack the recordings one place, so that pytest prints one line for them."""
+    report = yield
+    if report.skipped and isinstance(report.longrepr, tuple) and report.longrepr[2].endswith(NO_RECORDINGS):
+        report.longrepr = (__file__, 0, report.longrepr[2])
+    return report
 
 
 @pytest.fixture(scope="session")
@@ -124,7 +140,7 @@ def data_dir() -> Path:
     given = os.environ.get("MODELSERVER_DATA")
     place = Path(given) if given else Path(__file__).resolve().parents[1] / "../shared/data"
     if not place.is_dir():
-        pytest.skip(f"the recorded data are not at {place}; set MODELSERVER_DATA to their folder")
+        pytest.skip(NO_RECORDINGS)
     return place.resolve()
 
 
