@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import cmath
+import copy
+import itertools
 import math
 import random
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,43 +64,48 @@ class Step(NamedTuple):
     found: Inconsistency | None
 
 
-def drive(
-    seconds: float,
-    fault: Fault,
-    seed: int = 1,
-    *,
-    is_measured: bool = True,
-    correlated: float = CORRELATED,
-    start: ConsistencyMonitor = FRESH,
-) -> Iterator[Step]:
-    """Yield the fixes of a vehicle at 2 to 6 m/s that turns now and then, and whose fixes no state follows."""
-    noise = random.Random(seed)
-    truth = antenna = wander = shift = 0j
-    yaw = error = 0.0
-    monitor = start
-    keep = math.exp(-PERIOD / SETTINGS.gps_correlation_time)
-    for n in range(round(seconds / PERIOD)):
-        t = n * PERIOD
+@dataclass
+class Vehicle:
+    """A vehicle at 2 to 6 m/s that turns now and then, and whose fixes no state follows."""
+
+    noise: random.Random
+    monitor: ConsistencyMonitor
+    is_measured: bool
+    correlated: float
+    truth: complex = 0j
+    antenna: complex = 0j
+    wander: complex = 0j
+    shift: complex = 0j
+    yaw: float = 0.0
+    error: float = 0.0
+
+    def copy(self) -> Vehicle:
+        return replace(self, noise=copy.copy(self.noise))
+
+    def advance(self, n: int, fault: Fault) -> Step:
+        """Return the fix at an instant, and drive on to the next one."""
+        t, noise = n * PERIOD, self.noise
         is_wrong = fault.begin <= t < fault.end
         speed = 4.0 + 2.0 * math.sin(t / 7.0)
-        velocity = cmath.rect(speed, yaw)
+        velocity = cmath.rect(speed, self.yaw)
         if is_wrong:
-            shift += fault.drift * PERIOD
-            error -= fault.rate * PERIOD
+            self.shift += fault.drift * PERIOD
+            self.error -= fault.rate * PERIOD
         elif t >= fault.end:
-            shift = 0j
+            self.shift = 0j
+        keep = math.exp(-PERIOD / SETTINGS.gps_correlation_time)
         walk = complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
-        wander = keep * wander + correlated * math.sqrt(1.0 - keep**2) * walk
-        white = WHITE / CORRELATED * correlated * complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
+        self.wander = keep * self.wander + self.correlated * math.sqrt(1.0 - keep**2) * walk
+        white = WHITE / CORRELATED * self.correlated * complex(noise.gauss(0.0, 1.0), noise.gauss(0.0, 1.0))
         late = fault.latency * velocity if is_wrong else 0j
-        arm = fault.lever_arm * cmath.rect(1.0, yaw) if is_wrong else 0j
-        fix = truth + arm + wander + white + shift - late + (fault.jump if is_wrong else 0j)
+        arm = fault.lever_arm * cmath.rect(1.0, self.yaw) if is_wrong else 0j
+        fix = self.truth + arm + self.wander + white + self.shift - late + (fault.jump if is_wrong else 0j)
         utime = 1_000_000 + round(t * 1e6)
-        monitor = monitor.extend(utime, antenna, 0.0, is_measured=is_measured)
+        monitor = self.monitor.extend(utime, self.antenna, 0.0, is_measured=self.is_measured)
         node = PathNode(
             utime=utime,
             fix=fix,
-            antenna=antenna,
+            antenna=self.antenna,
             velocity=velocity,
             turn_rate=0.0,
             path=monitor.path,
@@ -110,33 +119,63 @@ def drive(
             rate_variance=0.0003**2,
             scale_variance=0.003**2,
             has_gyro=True,
-            is_measured=is_measured,
-            own_heading=yaw + error,
+            is_measured=self.is_measured,
+            own_heading=self.yaw + self.error,
             bias_turn=monitor.bias_turn,
             latency=0.0,
             latency_variance=0.02**2,
             shows_latency=fault.shows_latency,
             lost=monitor.lost,
             unmeasured=monitor.unmeasured,
-            white=WHITE / CORRELATED * correlated,
-            correlated=correlated,
+            white=WHITE / CORRELATED * self.correlated,
+            correlated=self.correlated,
             position_covariance=(0.5, 0.5, 0.0),
         )
         monitor = monitor.compare(node, NOISE, SETTINGS)
         found = monitor.find_cause(node, NOISE, SETTINGS)
         monitor = monitor.append(node)
-        yield Step(t, node, monitor, found)
-        if found is not None:
-            monitor = monitor.resolve(found, utime)
-        truth += velocity * PERIOD
-        antenna += velocity * cmath.rect(PERIOD * (1.0 - (fault.scale if is_wrong else 0.0)), error)
-        yaw += PERIOD * (0.2 if math.sin(t / 15.0) > 0.5 else 0.0)
+        self.monitor = monitor if found is None else monitor.resolve(found, utime)
+        self.truth += velocity * PERIOD
+        lost = fault.scale if is_wrong else 0.0
+        self.antenna += velocity * cmath.rect(PERIOD * (1.0 - lost), self.error)
+        self.yaw += PERIOD * (0.2 if math.sin(t / 15.0) > 0.5 else 0.0)
+        return Step(t, node, monitor, found)
+
+
+@cache
+def drive_before(
+    num_fixes: int, seed: int, is_measured: bool, correlated: float, shows_latency: bool
+) -> tuple[Vehicle, tuple[Step, ...]]:
+    """Return the vehicle and its fixes before a fault, which all faults that begin there share."""
+    vehicle = Vehicle(random.Random(seed), FRESH, is_measured, correlated)
+    none = Fault(shows_latency=shows_latency)
+    return vehicle, tuple(vehicle.advance(n, none) for n in range(num_fixes))
+
+
+def drive(
+    seconds: float,
+    fault: Fault,
+    seed: int = 1,
+    *,
+    is_measured: bool = True,
+    correlated: float = CORRELATED,
+    start: ConsistencyMonitor = FRESH,
+) -> Iterator[Step]:
+    """Yield the fixes of a vehicle with a fault."""
+    first = math.ceil(min(fault.begin, seconds) / PERIOD) if start is FRESH else 0
+    before, steps = drive_before(first, seed, is_measured, correlated, fault.shows_latency)
+    yield from steps
+    vehicle = before.copy()
+    if not first:
+        vehicle.monitor = start
+    for n in range(first, round(seconds / PERIOD)):
+        yield vehicle.advance(n, fault)
 
 
 def find(fault: Fault, seed: int = 1) -> Step:
     """Return where an inconsistency is found, and its cause decided."""
-    found = [each for each in drive(fault.begin + 120.0, fault, seed) if each.found is not None]
-    return next((each for each in found[:2] if each.found and each.found.cause is not Cause.GNSS), found[0])
+    found = list(itertools.islice((each for each in drive(fault.begin + 120.0, fault, seed) if each.found), 2))
+    return next((each for each in found if each.found and each.found.cause is not Cause.GNSS), found[0])
 
 
 @pytest.mark.parametrize("seed", range(6))
