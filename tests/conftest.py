@@ -119,10 +119,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         DURATIONS_FILE.write_text(json.dumps(longest, indent=1) + "\n")
 
 
-NO_RECORDINGS = (
-    "no recordings: docs/recordings.md names the public projects that they come from; set MODELSERVER_DATA to the "
-    "folder with them"
-)
+NO_RECORDINGS = "no recordings: tests/realdata/README.md has where to get them; set MODELSERVER_DATA to their folder"
 
 
 @pytest.hookimpl(wrapper=True)
