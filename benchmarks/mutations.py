@@ -3,11 +3,13 @@
     python -m benchmarks mutations                         # 110 mutations, the tests beside them
     python -m benchmarks mutations --tests OTHER/tests     # the same mutations before the tests of another checkout
     python -m benchmarks mutations --only 3,17             # some of them again
+    python -m benchmarks mutations --known OLD/results.json  # first the tests that noticed in an earlier run
 
 A mutation changes one expression inside a function: a comparison, an operator, a number, a condition, `and` and `or`.
 All stand in one copy of the tree, each behind a switch, and the environment variable MUTANT turns one on. So a run
 without any of them shows which tests reach which mutation, also through the processes that they start, and a mutation
-is tried with those tests alone, cheapest first, until one fails. A test that fails without a mutation is left out.
+is tried with those tests alone, cheapest first, until one fails; with the tests of processes (tests/scenario) only if
+no other test reaches it. A test that fails without a mutation is left out.
 
 The sample depends on the seed and on the product's sources alone. Each mutation prints a line; the results stand in
 FOLDER/results.json, and a run that was interrupted goes on from there. Two to three hours on two cores.
@@ -27,7 +29,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -73,7 +75,7 @@ COSTS = os.environ.get("MUTANT_COSTS")
 def pytest_collection_modifyitems(config, items):
     if ORDER:
         with open(ORDER) as file:
-            rank = {name: k for k, name in enumerate(json.load(file))}
+            rank = {name: k for k, name in reversed([*enumerate(json.load(file))])}
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in rank])
         items[:] = sorted((item for item in items if item.nodeid in rank), key=lambda item: rank[item.nodeid])
 
@@ -254,13 +256,18 @@ def record(tree: Path, folder: Path) -> dict[int, Reach]:
         test, _, phase = where.rpartition(" ")
         # what a fixture reaches may be shared by all tests of its file
         tests_of[int(number)].update(by_file[test.partition("::")[0]] if phase == "(setup)" else [test])
+    for found in tests_of.values():
+        # processes are slow: they are tried only where no other test reaches the mutation
+        found -= bad
+        found -= {test for test in found if test.startswith("tests/scenario/")} if not _is_scenario(found) else set()
     return {
-        number: Reach(
-            tuple(sorted(found - bad, key=lambda test: (costs[test], test))), sum(costs[test] for test in found - bad)
-        )
+        number: Reach(tuple(sorted(found, key=lambda test: (costs[test], test))), sum(costs[test] for test in found))
         for number, found in tests_of.items()
-        if found - bad
     }
+
+
+def _is_scenario(tests: set[str]) -> bool:
+    return all(test.startswith("tests/scenario/") for test in tests)
 
 
 def try_mutation(number: int, reach: Reach, tree: Path, folder: Path) -> str:
@@ -295,6 +302,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the sample (default %(default)s)")
     parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="folder of the tests (default: this one's)")
     parser.add_argument("--folder", type=Path, default=ROOT / "build/mutations", help="for the copy and the results")
+    parser.add_argument("--known", type=Path, help="results of an earlier run, to try the tests that noticed first")
     parser.add_argument("--only", default="", help="numbers of mutations, with commas (default: all)")
     parser.add_argument("--list", action="store_true", help="print the sample and stop")
     given = parser.parse_args(list(arguments))
@@ -311,9 +319,13 @@ def main(arguments: Sequence[str] = ()) -> int:
     results: dict[str, str] = json.loads(results_file.read_text()) if results_file.exists() else {}
     only = [int(each) for each in given.only.split(",") if each]
     todo = only or [number for number in range(len(sample)) if str(number) not in results]
+    known: dict[str, str] = json.loads(given.known.read_text()) if given.known else {}
 
     def attempt(number: int) -> None:
-        results[str(number)] = found = try_mutation(number, reached.get(number, Reach()), folder / "tree", folder)
+        reach = reached.get(number, Reach())
+        first = [test for test in reach.tests if f" {test} " in f"{known.get(str(number), '')} "]
+        found = try_mutation(number, replace(reach, tests=(*first, *reach.tests)), folder / "tree", folder)
+        results[str(number)] = found
         results_file.write_text(json.dumps(results, indent=1))
         each = sample[number]
         print(f"{number:3} {each.file}:{each.line}: {each.before!r} -> {each.after!r}: {found}", flush=True)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 from support_daemon import write_raptor
 from support_drive import CHANNELS, SimulatedDrive, compare_pose
 
 from modelserver.config.vehicle_file import load_config
+from modelserver.core import CoreState
 from modelserver.messages import (
     AbsolutePoseSample,
     FixType,
@@ -121,18 +124,28 @@ class LoopRun:
     def __init__(self, drive: SimulatedDrive, folder: Path):
         config = load_config(write_raptor(folder, "", AIDING))
         vehicle = load_vehicle(config)
-        self._clock = FakeClock(drive.start_utime)
-        self._bus = FakeBus(self._clock)
-        settings = LoopSettings(
+        self._settings = LoopSettings(
             round(1e9 / vehicle.tick_hz()),
             vehicle.sensor_channels(),
             publisher_conflict=config.sensors.publisher_conflict,
             shared_channels=frozenset({config.sensors.joints.channel}),
         )
-        self.loop = Loop(self._bus, self._clock, vehicle.start_core(self._clock.now()), settings)
+        clock = FakeClock(drive.start_utime)
+        self._start_loop(drive, clock, vehicle.start_core(clock.now()))
+        self._sensors = [(each.header.host_utime, CHANNELS[type(each)], encode(each)) for each in drive.events()]
+
+    def _start_loop(self, drive: SimulatedDrive, clock: FakeClock, state: CoreState) -> None:
+        self._clock, self._bus = clock, FakeBus(clock)
+        self.loop = Loop(self._bus, clock, state, self._settings)
         self.outcome = AttackResult(drive, self.loop)
         self._step_us = 0
-        self._sensors = [(each.header.host_utime, CHANNELS[type(each)], encode(each)) for each in drive.events()]
+
+    def copy(self) -> Self:
+        """Return a run of the same drive whose own loop starts now, with the state of the core so far."""
+        other = copy.copy(self)
+        clock = FakeClock(self._clock.utime(), self._clock.monotonic_ns())
+        other._start_loop(self.outcome.drive, clock, self.loop.state)
+        return other
 
     def step_clock(self, seconds: float) -> None:
         """Step the host's clock; the sensors, on another computer, keep theirs."""

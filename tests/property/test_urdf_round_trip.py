@@ -24,8 +24,9 @@ def assert_same_places(model, again, place, values):
     root = next(iter(place))
     # one route for each frame here, and one for each pair only in the model that is tested: routes are what takes time
     X_R = {frame: pose_at(model, frame, root, values) for frame in place}
+    X_inverse = {frame: pose.inverse() for frame, pose in X_R.items()}
     for a, b in product(place, repeat=2):
-        wanted = X_R[b].inverse() @ X_R[a]
+        wanted = X_inverse[b] @ X_R[a]
         assert pose_at(again, place[a], place[b], values).is_close(wanted, 1e-9, 1e-9), (a, b)
 
 
@@ -133,9 +134,10 @@ def test_another_loader_reads_what_is_written_and_agrees_on_every_pair_of_links(
     # the other loader leaves out each transformation that is within 1e-8 of none
     for _, _, edge in other.scene.graph.to_edgelist():
         assume(not 0.0 < np.abs(np.asarray(edge["matrix"]) - np.eye(4)).max() <= 1e-8)
+    again = read(text)
     for a, b in product(model.get_body_list(), repeat=2):
         wanted = other.get_transform(frame_to=a, frame_from=b)
-        for one in (model, read(text)):
+        for one in (model, again):
             found = pose_at(one, f"{a}:Origin", f"{b}:Origin", values).matrix
             np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
 

@@ -91,10 +91,13 @@ def logs(data_dir: Path) -> Iterator[Path]:
 def differences(data: bytes, found: list[Report], later: int = 0) -> Iterator[str]:
     """Yield the differences; `later`: microseconds by which gpsd's times exceed the receiver's."""
     own = epochs(data)
+    own_at: dict[int, list[NmeaEpoch]] = {}
+    for each in own:
+        own_at.setdefault(each.utime, []).append(each)
     tolerance = print_precision(data)
     for report in last_of_each_instant(found):
         at = report["time"]
-        of_instant = [each for each in own if each.utime + later == utime(report)]
+        of_instant = own_at.get(utime(report) - later, [])
         if report["mode"] == 0:
             continue  # gpsd knows only the time of this instant
         has_fix = report["mode"] >= 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -55,7 +56,13 @@ def recording(data_dir):
     return [(sample, index) for _, sample, index in sorted(events, key=lambda event: event[0])]
 
 
-def replay(recording, withheld, orientation=True):
+@pytest.fixture(scope="module")
+def replay(recording):
+    """Return the function that replays the recording, the same way once for all tests."""
+    return cache(partial(replay_recording, recording))
+
+
+def replay_recording(recording, withheld, orientation):
     """Return for each fix (its index, error of the antenna predicted to it, estimate, place of the fix)."""
     localizer, found = RawLocalizer.start(MOUNTS), []
     for sample, index in recording:
@@ -75,8 +82,8 @@ def replay(recording, withheld, orientation=True):
     return localizer, found
 
 
-def test_the_pose_becomes_valid_and_follows_the_fixes_within_their_noise(recording):
-    localizer, found = replay(recording, withheld=False)
+def test_the_pose_becomes_valid_and_follows_the_fixes_within_their_noise(replay):
+    localizer, found = replay(withheld=False, orientation=True)
     valid = [each for each in found if each[2].invalid == 0]
     assert len(valid) > 0.95 * len(found)
     assert found[0][2].invalid  # it has not moved yet
@@ -87,8 +94,8 @@ def test_the_pose_becomes_valid_and_follows_the_fixes_within_their_noise(recordi
 
 
 @pytest.mark.parametrize("orientation", [True, False])
-def test_withheld_fixes_are_met_better_than_by_holding_the_last(recording, orientation):
-    _, found = replay(recording, withheld=True, orientation=orientation)
+def test_withheld_fixes_are_met_better_than_by_holding_the_last(replay, orientation):
+    _, found = replay(withheld=True, orientation=orientation)
     places = {index: np.array(place[:2]) for index, _, _, place in found}
     odd = [each for each in found if each[0] % 2 == 1 and each[0] - 3 in places]
     rmse = math.sqrt(np.mean([error**2 for _, error, _, _ in odd]))
@@ -100,9 +107,9 @@ def test_withheld_fixes_are_met_better_than_by_holding_the_last(recording, orien
     assert rmse < rmse_line
 
 
-def test_both_sources_of_tilt_agree_on_the_vehicle_being_about_level(recording):
+def test_both_sources_of_tilt_agree_on_the_vehicle_being_about_level(replay):
     for orientation in (True, False):
-        _, found = replay(recording, withheld=False, orientation=orientation)
+        _, found = replay(withheld=False, orientation=orientation)
         tilts = np.array([estimate.utm.rpy[:2] for *_, estimate, _ in found])
         assert np.abs(tilts.mean(axis=0)).max() < math.radians(3.0)
         assert np.abs(tilts).max() < math.radians(12.0)

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from support_source import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -122,6 +123,7 @@ def package_of(module: str) -> str:
     return parts[0] if parts[0] in MAY_IMPORT else ""
 
 
+@cache
 def iterate_imports(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
     """Return line and dotted name of everything imported, inside functions and TYPE_CHECKING blocks too."""
     found = []
@@ -194,11 +196,6 @@ def impure(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]
     return wrong
 
 
-@cache
-def parse(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), str(path))
-
-
 def findings(rule) -> list[str]:
     report = []
     for path in sources():
@@ -227,10 +224,9 @@ def test_no_module_imports_itself_through_others() -> None:
     modules = {module_of(path): path for path in sources()}
     graph: dict[str, set[str]] = {}
     for module, path in modules.items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
         found = {
             name if name in modules else name.rpartition(".")[0]
-            for _, name in iterate_imports(tree, module, path.name == "__init__.py")
+            for _, name in iterate_imports(parse(path), module, path.name == "__init__.py")
         }
         # a package that a module is inside of is loaded before it in any case
         graph[module] = {name for name in found & modules.keys() if not f"{module}.".startswith(f"{name}.")}

@@ -48,17 +48,19 @@ def test_strapdown_integration_of_the_imu_reproduces_the_path(name: str) -> None
     rates, forces = compute_imu(truth, lever)
     places = truth.locate(lever)
     earth, g, dt = earth_rate(LATITUDE), gravity(LATITUDE, HEIGHT), 1.0 / RATE
+    coriolis = 2.0 * so3.skew(earth)
+    turns = 0.5 * dt * (rates[:-1] + rates[1:])
     turned_back = so3.exponential(so3.scale(-dt, earth))
     place = places[0]
     velocity = truth.velocity[0] + truth.rotation[0] @ np.cross(truth.rate[0], lever)
     attitude = so3.from_matrix(truth.rotation[0])
     before = np.array(so3.rotate(attitude, tuple(forces[0])))
     for k in range(1, len(rates)):
-        turn = so3.exponential(tuple(0.5 * dt * (rates[k - 1] + rates[k])))
+        turn = so3.exponential(tuple(turns[k - 1].tolist()))
         attitude = so3.multiply(turned_back, so3.multiply(attitude, turn))
-        force = np.array(so3.rotate(attitude, tuple(forces[k])))
+        force = np.array(so3.rotate(attitude, tuple(forces[k].tolist())))
         down = np.array((-place[0] / EARTH_RADIUS, -place[1] / EARTH_RADIUS, -1.0))
-        acceleration = 0.5 * (before + force) - 2.0 * np.cross(earth, velocity) + g * down
+        acceleration = 0.5 * (before + force) - coriolis @ velocity + g * down
         place = place + dt * velocity + 0.5 * dt * dt * acceleration
         velocity, before = velocity + dt * acceleration, force
     assert np.ptp(places[:, :2], axis=0).max() > 10.0

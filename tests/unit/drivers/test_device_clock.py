@@ -62,7 +62,7 @@ def quantile(values: list[float], share: float) -> float:
 
 
 @cache
-def devices(rate: float, tick: float = 1.0, delay: Delay = uniform) -> list[Device]:
+def devices(rate: float, tick: float, delay: Delay) -> list[Device]:
     seconds = {4: 40.0, 20: 15.0, 100: 8.0}[round(rate)]
     drifts = (-1e-4, 1e-4, 0.0, 5e-5)
     return [
@@ -74,7 +74,7 @@ def devices(rate: float, tick: float = 1.0, delay: Delay = uniform) -> list[Devi
 @pytest.mark.parametrize("tick", [1.0, 6553.6, 10_000.0])
 @pytest.mark.parametrize("rate", [4.0, 20.0, 100.0])
 def test_given_delays_to_20_ms_and_drift_to_100_ppm_then_the_instant_is_right_to_2_ms(rate: float, tick: float) -> None:
-    errors = [error for device in devices(rate, tick) for error, _ in device.after(5.0)]
+    errors = [error for device in devices(rate, tick, uniform) for error, _ in device.after(5.0)]
     assert quantile(errors, 0.95) < 2e-3 + (tick * 1e-6 if tick > 1.0 else 0.0)
 
 
@@ -92,14 +92,14 @@ def test_given_delays_to_20_ms_and_drift_to_100_ppm_then_the_instant_is_right_to
 )
 @pytest.mark.parametrize("rate", [4.0, 20.0, 100.0])
 def test_given_any_delays_then_sigma_covers_the_error_from_the_first_sample_on(rate: float, delay: Delay) -> None:
-    errors = [each for device in devices(rate, delay=delay) for each in device.errors]
+    errors = [each for device in devices(rate, 1.0, delay) for each in device.errors]
     assert sum(abs(error) <= 2.0 * sigma for _, error, sigma in errors) >= 0.95 * len(errors)
     early = [(error, sigma) for at, error, sigma in errors if at < 2.0]
     assert sum(abs(error) <= 2.0 * sigma for error, sigma in early) >= 0.9 * len(early)
 
 
 def test_given_ticks_then_sigma_covers_them_too() -> None:
-    pairs = [pair for device in devices(20.0, 10_000.0) for pair in device.after(0.0)]
+    pairs = [pair for device in devices(20.0, 10_000.0, uniform) for pair in device.after(0.0)]
     assert sum(error <= 2.0 * sigma for error, sigma in pairs) >= 0.95 * len(pairs)
 
 

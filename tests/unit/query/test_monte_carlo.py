@@ -13,6 +13,7 @@ from support_between import lookup_between
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, estimate, vehicle, view
 
 from modelserver.estimation.history import History
+from modelserver.geometry.joint import Joint, JointType
 from modelserver.messages import TimeQuery
 from modelserver.query import PlatformView
 from modelserver.transforms import pose_array as arrays
@@ -35,6 +36,19 @@ def held() -> PlatformView:
 
 def utime(seconds: float) -> int:
     return T0 + round(seconds * S)
+
+
+def move(joint: Joint, positions: Array) -> PoseArray:
+    """Return the poses (n,) of a joint at positions (n, size)."""
+    axis, none = np.array(joint.axis), np.zeros((len(positions), 3))
+    if joint.type is JointType.REVOLUTE:
+        return PoseArray(none, arrays.exponential(positions * axis))
+    if joint.type is JointType.PRISMATIC:
+        return PoseArray(positions * axis, arrays.exponential(none))
+    if joint.type is JointType.SPHERICAL:
+        return PoseArray(none, arrays.exponential(positions))
+    moved = [joint.compute_pose(row) for row in positions.tolist()]
+    return PoseArray(np.array([each.xyz for each in moved]), np.array([each.wxyz for each in moved]))
 
 
 class Samples:
@@ -70,8 +84,7 @@ class Samples:
                     reading = self.platform.joints.tracks[name].interpolate(utime(seconds))
                     off = self.error((name, seconds), 1)[:, 0] * 0.001
                     columns.append(drive.multiplier * (reading.position + off) + drive.offset)
-                moved = [edge.joint.compute_pose(row) for row in np.stack(columns, axis=1).tolist()]
-                step = PoseArray(np.array([each.xyz for each in moved]), np.array([each.wxyz for each in moved]))
+                step = move(edge.joint, np.stack(columns, axis=1))
             poses = poses @ (step if edge.forward else step.inverse())
         return poses
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,12 +29,29 @@ STAMPS = {
 ATTACK_HZ = 300.0
 
 
-def check_attacks(folder: Path, attacks: list[tuple[str, Attack]]) -> LoopRun:
-    """Drive until the pose is valid, then run the attacks in turn; assert that no pose is worse for any."""
-    drive = SimulatedDrive.create(START, WARM_S + PHASE_S * len(attacks) + 1.0, imu_model=INERTIAL)
-    loop_run = LoopRun(drive, folder)
-    outcome = loop_run.run(WARM_S)
-    at = WARM_S
+MAX_ATTACKS = len(FORGED) * len(STAMPS)
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory: pytest.TempPathFactory) -> LoopRun:
+    """Drive until shortly before the attacks, once for all tests."""
+    drive = SimulatedDrive.create(START, WARM_S + PHASE_S * MAX_ATTACKS + 1.0, imu_model=INERTIAL)
+    loop_run = LoopRun(drive, tmp_path_factory.mktemp("warm"))
+    loop_run.run(WARM_S - 1.0)
+    return loop_run
+
+
+@pytest.fixture
+def loop_run(warm: LoopRun) -> LoopRun:
+    """Return the loop of the test itself, which has received all sensors and whose pose is valid."""
+    loop_run = warm.copy()
+    loop_run.run(WARM_S)
+    return loop_run
+
+
+def check_attacks(loop_run: LoopRun, attacks: list[tuple[str, Attack]]) -> None:
+    """Run the attacks in turn; assert that no pose is worse for any."""
+    outcome, at = loop_run.outcome, WARM_S
     for name, attack in attacks:
         attack.since = at
         attack.first += round((at - WARM_S) * attack.hz)
@@ -48,25 +64,24 @@ def check_attacks(folder: Path, attacks: list[tuple[str, Attack]]) -> LoopRun:
     published = sum(utime >= START + WARM_S * 1e6 for utime, _ in outcome.poses)
     assert published >= (at - WARM_S) * 100.0 - 2.0
     assert loop_run.loop.state.handler_errors == 0
-    return loop_run
 
 
 @pytest.mark.parametrize("source", ["stranger", "imu"])
-def test_given_forged_stamps_on_any_channel_then_every_pose_stays_valid(source: str, tmp_path: Path) -> None:
+def test_given_forged_stamps_on_any_channel_then_every_pose_stays_valid(source: str, loop_run: LoopRun) -> None:
     attacks = [
         (f"{channel} {name}", Attack(channel, source, stamps, hz=ATTACK_HZ))
         for channel in FORGED
         if source == "stranger" or channel not in CHANNELS.values()
         for name, stamps in STAMPS.items()
     ]
-    loop_run = check_attacks(tmp_path, attacks)
+    check_attacks(loop_run, attacks)
     # counted under their reasons
     assert loop_run.loop.state.rejected[f"sensor:{source}", "future"] > 30
 
 
 @pytest.mark.parametrize("channel", sorted(CHANNELS.values()))
 def test_given_forged_stamps_with_the_source_of_the_sensor_then_every_pose_stays_valid(
-    channel: str, tmp_path: Path
+    channel: str, loop_run: LoopRun
 ) -> None:
     attacks = [
         (f"{channel} {name} {row}", Attack(channel, channel.lower(), stamps, **options))
@@ -77,16 +92,13 @@ def test_given_forged_stamps_with_the_source_of_the_sensor_then_every_pose_stays
             ("a number that may follow lost ones", {"seq_offset": 3000, "count": 1}),
         )
     ]
-    check_attacks(tmp_path, attacks)
+    check_attacks(loop_run, attacks)
 
 
 def test_given_the_hosts_clock_set_back_then_no_pose_is_valid_until_the_sensors_have_the_new_time(
-    tmp_path: Path,
+    loop_run: LoopRun,
 ) -> None:
     """By half a second: stored estimates seem current, and are half a second old."""
-    drive = SimulatedDrive.create(START, 12.0, imu_model=INERTIAL)
-    loop_run = LoopRun(drive, tmp_path)
-    loop_run.run(WARM_S)
     loop_run.step_clock(-0.5)
     outcome = loop_run.run(10.0)
     # all but the first, whose tick was at the instant of the step
@@ -94,12 +106,10 @@ def test_given_the_hosts_clock_set_back_then_no_pose_is_valid_until_the_sensors_
 
 
 def test_given_forged_stamps_half_a_second_back_1000_times_a_second_then_little_is_fused_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    loop_run: LoopRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each out-of-sequence measurement has all later ones fused again: unbounded, that exceeds the available time."""
-    drive = SimulatedDrive.create(START, 12.0, imu_model=INERTIAL)
-    loop_run = LoopRun(drive, tmp_path)
-    outcome = loop_run.run(WARM_S)
+    outcome = loop_run.outcome
     count = 0
     fuse = timeline.step
 

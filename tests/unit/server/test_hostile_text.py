@@ -66,11 +66,14 @@ class Rig:
         self.loop = Loop(self.bus, self.clock, state, settings, Hooks(on_mode_switch=log_mode_switch, verifier=gate))
 
     def settle(self) -> None:
-        for _ in range(3):
+        # all messages are handled in the first passes; the others are for what follows them
+        for passes in (40, 10, 10):
             # longer than the log's rate limit and the health report's period
             self.clock.advance(6.0)
-            for _ in range(40):
+            for _ in range(passes):
                 self.loop.run_once()
+        assert not self.bus.sensors.pending
+        assert not self.bus.requests.pending
 
 
 class Text(bytes):

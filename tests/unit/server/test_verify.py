@@ -34,7 +34,7 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.server.bus import Inboxes
-from modelserver.server.journal.segments import files_of
+from modelserver.server.journal.segments import files_of, list_segments
 from modelserver.server.journal.verify import VerificationReport, verify
 from modelserver.server.requests.deferred import DeferredReply
 from modelserver.wire.codec import encode
@@ -45,6 +45,36 @@ pytestmark = pytest.mark.slow
 
 S = 1_000_000
 NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")
+
+
+@pytest.fixture(scope="module")
+def recorded_ring(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a drive in small segments, once for all tests."""
+    rig = JournalRig(tmp_path_factory.mktemp("ring"), SMALL, segment_bytes=150_000)
+    rig.drive(7.0)
+    assert len(rig.finish()) > 3
+    return rig.directory
+
+
+@pytest.fixture
+def ring(recorded_ring: Path, tmp_path: Path) -> list[Path]:
+    """Return a copy of those segments."""
+    return list_segments(shutil.copytree(recorded_ring, tmp_path / "journal"))
+
+
+@pytest.fixture(scope="module")
+def recorded_segment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a drive in one segment, once for all tests."""
+    rig = JournalRig(tmp_path_factory.mktemp("one"))
+    rig.drive(6.0)
+    (path,) = rig.finish()
+    return path
+
+
+@pytest.fixture
+def segment(recorded_segment: Path, tmp_path: Path) -> Path:
+    """Return a copy of that segment."""
+    return Path(shutil.copy(recorded_segment, tmp_path))
 
 
 def again(rig: JournalRig) -> VerificationReport:
@@ -201,26 +231,21 @@ def test_given_an_error_of_the_core_and_one_of_the_bus_when_verified_then_all_is
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_given_a_segment_taken_out_of_the_middle_when_verified_then_that_is_damage(tmp_path: Path, number: int) -> None:
-    rig = JournalRig(tmp_path, SMALL, segment_bytes=150_000)
-    rig.drive(12.0)
-    segments = rig.finish()
-    assert len(segments) > 3
-    segments[number].unlink()
-    found = verify(rig.segments)
+def test_given_a_segment_taken_out_of_the_middle_when_verified_then_that_is_damage(
+    ring: list[Path], number: int
+) -> None:
+    ring[number].unlink()
+    found = verify(list_segments(ring[0].parent))
     assert not found.is_reproduced
     assert found.difference is None
-    assert f"1 segments before it are missing, after {segments[number - 1].name}" in str(found.findings[0])
+    assert f"1 segments before it are missing, after {ring[number - 1].name}" in str(found.findings[0])
     whole = (found.last_utime - found.first_utime) * 1e-6
     assert 1.0 < found.seconds < whole - 0.1
 
 
-def test_given_a_segment_cut_off_in_the_middle_when_verified_then_that_is_damage(tmp_path: Path) -> None:
-    rig = JournalRig(tmp_path, SMALL, segment_bytes=150_000)
-    rig.drive(12.0)
-    segments = rig.finish()
-    segments[1].write_bytes(segments[1].read_bytes()[:100_000])
-    found = verify(segments)
+def test_given_a_segment_cut_off_in_the_middle_when_verified_then_that_is_damage(ring: list[Path]) -> None:
+    ring[1].write_bytes(ring[1].read_bytes()[:100_000])
+    found = verify(ring)
     assert not found.is_reproduced
     assert any("whose end was cut off after it was written" in str(each) for each in found.findings)
 
@@ -238,28 +263,22 @@ def tamper(path: Path, channel: str, number: int, change: Callable[[bytes], byte
     return chosen.utime
 
 
-def test_given_a_bit_of_one_pose_that_was_changed_when_verified_then_that_pose_is_named(tmp_path: Path) -> None:
-    rig = JournalRig(tmp_path)
-    rig.drive(6.0)
-    (path,) = rig.finish()
-    utime = tamper(path, "POSE", 200, lambda data: data[:-1] + bytes([data[-1] ^ 1]))
-    found = verify([path])
+def test_given_a_bit_of_one_pose_that_was_changed_when_verified_then_that_pose_is_named(segment: Path) -> None:
+    utime = tamper(segment, "POSE", 200, lambda data: data[:-1] + bytes([data[-1] ^ 1]))
+    found = verify([segment])
     assert not found.is_reproduced
     assert found.difference is not None
     assert (found.difference.channel, found.difference.utime) == ("POSE", utime)
     assert found.reproduced["POSE"] == 200
-    event = path.read_bytes()[found.difference.at :]
+    event = segment.read_bytes()[found.difference.at :]
     assert event[:4] == b"\xed\xa1\xda\x01"
     assert b"POSE" in event[:40]
 
 
-def test_given_a_sample_that_was_changed_when_verified_then_a_pose_after_it_differs(tmp_path: Path) -> None:
-    rig = JournalRig(tmp_path)
-    rig.drive(6.0)
-    (path,) = rig.finish()
+def test_given_a_sample_that_was_changed_when_verified_then_a_pose_after_it_differs(segment: Path) -> None:
     other = encode(replace(imu(START + 5 * S), angular_velocity=(0.0, 0.0, 0.01)))
-    utime = tamper(path, "IMU", 250, lambda data: other)
-    found = verify([path])
+    utime = tamper(segment, "IMU", 250, lambda data: other)
+    found = verify([segment])
     assert found.difference is not None
     assert found.difference.utime >= utime
 
@@ -296,16 +315,12 @@ def test_given_each_segment_by_itself_when_verified_then_its_poses_are_reproduce
     assert text is OPEN or any(each.unverifiable for each in alone)
 
 
-def test_given_a_segment_that_is_missing_when_verified_then_replay_restarts_after_it(tmp_path: Path) -> None:
-    rig = JournalRig(tmp_path, SMALL, segment_bytes=150_000)
-    rig.drive(7.0)
-    files = rig.finish()
-    assert len(files) > 3
-    found = verify([*files[:1], *files[2:]])
+def test_given_a_segment_that_is_missing_when_verified_then_replay_restarts_after_it(ring: list[Path]) -> None:
+    found = verify([*ring[:1], *ring[2:]])
     # the rest is reproduced, but the journal is incomplete
     assert found.difference is None
     assert not found.is_reproduced
-    assert found.segments == len(files) - 1
+    assert found.segments == len(ring) - 1
 
 
 def test_given_a_second_start_when_verified_then_both_runs_are_and_nothing_is_overwritten(tmp_path: Path) -> None:
@@ -339,22 +354,19 @@ def test_given_a_journal_that_breaks_off_anywhere_when_verified_then_what_is_sea
 
 
 def test_given_damage_in_the_middle_when_verified_then_it_is_located_and_what_follows_is_skipped(
-    tmp_path: Path,
+    ring: list[Path],
 ) -> None:
-    rig = JournalRig(tmp_path, SMALL, segment_bytes=150_000)
-    rig.drive(6.0)
-    files = rig.finish()
-    whole = verify(files)
-    data = bytearray(files[1].read_bytes())
+    whole = verify(ring)
+    data = bytearray(ring[1].read_bytes())
     data[len(data) // 2] ^= 0x10
-    files[1].write_bytes(data)
-    found = verify(files)
+    ring[1].write_bytes(data)
+    found = verify(ring)
     assert found.difference is None
     assert not found.is_reproduced
     assert found.skipped["POSE"]
     assert found.reproduced["POSE"] < whole.reproduced["POSE"]
     damage = [each for each in found.findings if each.is_damage]
-    assert damage[0].segment == files[1]
+    assert damage[0].segment == ring[1]
     assert "checksum" in damage[0].text
 
 
@@ -445,8 +457,10 @@ def slow_steps(monkeypatch: pytest.MonkeyPatch, rig: JournalRig, seconds: float 
 def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reproduced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment_bytes: int
 ) -> None:
-    rig = JournalRig(tmp_path, vehicle=SMALL, segment_bytes=segment_bytes)
+    rig = JournalRig(tmp_path, vehicle=SMALL)
     rig.drive(6.0)
+    # small ones only where they begin within a reply
+    rig.ring.segment_bytes = segment_bytes
     slow_steps(monkeypatch, rig)
     for number in range(4):
         ask_long(rig, number)
@@ -454,6 +468,9 @@ def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reprod
         rig.drive(0.7)
         rig.send(GetStateVector(ME))
         rig.drive(0.3)
+        if not number:
+            # parts of the first reply are in segments of their own; those of the others in the same as what follows
+            rig.ring.segment_bytes = max(segment_bytes, 20_000)
     rig.run_cycles(100)
     assert len(rig.bus.get_published("REPLY_LONG")) == 4 * 20
     # poses and other replies were sent between the parts

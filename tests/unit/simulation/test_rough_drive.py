@@ -88,17 +88,20 @@ def test_wheels_roll_what_their_contact_points_move_ahead(simulate, hills, car, 
     """A steered wheel moves along itself where nothing slides; the others see nothing of what is across."""
     steered = frozenset(("front_left", "front_right"))
     run = simulate(terrain=hills, side_slip=slip, wheels_model=WheelsModel.noise_free(Timing(50.0), steered))
-    ways: dict[str, float] = {}
     frames = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
     levers = {name: car.get_transformation(frame, "Car:CG").position for name, frame in frames.items()}
-    last = dict.fromkeys(levers, 0.0)
-    for sample in run.events(run.trajectory.duration):
-        linear, angular = run.truth(sample.header.utime).twist
-        for wheel in sample.wheels:
-            vx, vy, _ = np.array(linear) + np.cross(angular, levers[wheel.name])
-            expected = vx * math.cos(wheel.steering) + vy * math.sin(wheel.steering)
-            assert wheel.speed == pytest.approx(expected, abs=1e-9)
-            ways[wheel.name] = ways.get(wheel.name, 0.0) + 0.02 * (expected + last[wheel.name]) / 2.0
-            last[wheel.name] = expected
-            assert wheel.travel == pytest.approx(ways[wheel.name], abs=1e-3)
+    samples = list(run.events(run.trajectory.duration))
+    twists = np.array([run.truth(sample.header.utime).twist for sample in samples])
+    for number, wheel in enumerate(samples[0].wheels):
+        rows = [
+            (each.wheels[number].speed, each.wheels[number].travel, each.wheels[number].steering) for each in samples
+        ]
+        assert {each.wheels[number].name for each in samples} == {wheel.name}
+        speed, travel, steering = np.array(rows).T
+        vx, vy, _ = (twists[:, 0] + np.cross(twists[:, 1], levers[wheel.name])).T
+        expected = vx * np.cos(steering) + vy * np.sin(steering)
+        np.testing.assert_allclose(speed, expected, rtol=0, atol=1e-9)
+        before = np.concatenate(([0.0], expected[:-1]))
+        np.testing.assert_allclose(travel, np.cumsum(0.02 * (expected + before) / 2.0), rtol=0, atol=1e-3)
+    assert len(samples[0].wheels) == len(levers)
     assert run.drive.at(10.0).attitude is not None

@@ -98,10 +98,11 @@ def test_scale_and_misalignment_are_one_matrix_of_the_stated_size(simulate):
     _, rest, _, _ = np.linalg.lstsq(true, seen, rcond=None)
     assert rest.max() < 1e-15
     # over many units
-    found = []
+    found, timing = [], Timing(25.0)
+    true = vectors(simulate(imu_model=replace(QUIET, timing=timing)), 9.0, "specific_force")
     for seed in range(30):
-        seen = vectors(simulate(imu_model=model, seed=seed), 9.0, "specific_force")
-        found.append(np.linalg.lstsq(true[: len(seen)], seen, rcond=None)[0] - np.eye(3))
+        seen = vectors(simulate(imu_model=replace(model, timing=timing), seed=seed), 9.0, "specific_force")
+        found.append(np.linalg.lstsq(true, seen, rcond=None)[0] - np.eye(3))
     sigma = np.sqrt((np.array(found) ** 2).mean(axis=0))
     np.testing.assert_allclose(sigma.diagonal(), 0.01, rtol=0.4)
     np.testing.assert_allclose(sigma[~np.eye(3, dtype=bool)], 0.003, rtol=0.45)
@@ -115,7 +116,7 @@ def test_a_bias_that_is_unstable_stays_within_its_size_and_one_that_walks_does_n
     np.testing.assert_allclose(drift.std(axis=0), 1e-3, rtol=0.15)
     shifted = (drift[50:] * drift[:-50]).mean() / (drift**2).mean()
     assert shifted == pytest.approx(math.exp(-1.0), abs=0.1)
-    walking = replace(QUIET, timing=timing, accelerometer=TriadModel(walk=1e-3))
+    walking = replace(QUIET, timing=Timing(2.0), accelerometer=TriadModel(walk=1e-3))
     ends = []
     for seed in range(30):
         force = vectors(simulate(STANDING, imu_model=walking, seed=seed), 100.1, "specific_force")
@@ -196,11 +197,12 @@ def test_a_yaw_with_a_source_does_not_drift(simulate, car, source, expected):
         assert sample.yaw_source is source
         X_ES = run.truth(sample.header.utime).enu @ X_BS
         error = so3.logarithm(so3.multiply(sample.orientation, so3.conjugate(X_ES.wxyz)))
-        np.testing.assert_allclose(error[:2], 0.0, atol=1e-9)
-        errors.append(error[2])
-        assert sample.orientation_covariance[8] == pytest.approx(0.02**2)
-    assert np.mean(errors) == pytest.approx(expected, abs=0.002)
-    assert np.std(errors) == pytest.approx(0.02, rel=0.05)
+        errors.append((*error, sample.orientation_covariance[8]))
+    tilt_x, tilt_y, yaw, variance = np.array(errors).T
+    np.testing.assert_allclose((tilt_x, tilt_y), 0.0, atol=1e-9)
+    np.testing.assert_allclose(variance, 0.02**2)
+    assert yaw.mean() == pytest.approx(expected, abs=0.002)
+    assert yaw.std() == pytest.approx(0.02, rel=0.05)
 
 
 # --- the wheels ---------------------------------------------------------------------------------------------

@@ -50,10 +50,29 @@ def _failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def built_jar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Build the jar by the command, once for all tests; return the empty cache that it began with and its output."""
+    folder = tmp_path_factory.mktemp("cache")
+    done = subprocess.run(
+        [*MODELSERVER, "spy", "--build-only"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "XDG_CACHE_HOME": str(folder)},
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "modelserver", done.stdout
+
+
 @pytest.mark.slow
 @needs_javac
-def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_retained(cache: Path) -> None:
-    jar = spy.get_types_jar()
+def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_retained(
+    built_jar: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache, out = built_jar
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache.parent))
+    jar = Path(out.strip())
     assert jar.is_relative_to(cache)
     with zipfile.ZipFile(jar) as archive:
         classes = {name for name in archive.namelist() if "$" not in name}
@@ -66,10 +85,9 @@ def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_re
 
 @pytest.mark.slow
 @needs_javac
-def test_given_build_only_when_run_as_a_command_then_the_path_alone_is_printed(cache: Path) -> None:
-    done = subprocess.run([*MODELSERVER, "spy", "--build-only"], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    (line,) = done.stdout.splitlines()
+def test_given_build_only_when_run_as_a_command_then_the_path_alone_is_printed(built_jar: tuple[Path, str]) -> None:
+    cache, out = built_jar
+    (line,) = out.splitlines()
     assert Path(line).is_file()
     assert Path(line).is_relative_to(cache)
 

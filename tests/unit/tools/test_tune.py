@@ -24,7 +24,7 @@ from support_tuning import RAPTOR, write_simulated_log
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.server.vehicle import load_vehicle
-from modelserver.simulation import GpsModel, Timing
+from modelserver.simulation import GpsModel, Timing, WheelsModel
 from mstools import cli
 from mstools.commands.tune import TUNABLES, choose_parameters
 from mstools.tuning.evaluation import EvaluationJob, evaluate, mixture_log_density
@@ -132,11 +132,14 @@ def test_given_the_settings_that_are_tuned_then_all_are_the_filters_and_within_b
 # --- the command --------------------------------------------------------------------------------------------
 
 
+WHEELS = WheelsModel(Timing(10.0))
+
+
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A drive whose fixes have white errors of 0.6 m, as they state."""
+    """A drive whose fixes have white errors of 0.6 m, as they state. Few wheel samples, for a short computing time."""
     receiver = GpsModel(Timing(3.0), correlated_sigma=0.0, white_sigma=0.6, has_velocity=False)
-    return write_simulated_log(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver)
+    return write_simulated_log(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver, wheels_model=WHEELS)
 
 
 @pytest.mark.slow
@@ -180,7 +183,7 @@ def test_given_the_same_drive_when_tuned_twice_then_the_same_is_reported(
 @pytest.mark.slow
 def test_given_settings_that_are_overconfident_in_gaps_then_they_lose_by_the_ends_of_the_gaps(tmp_path: Path) -> None:
     receiver = GpsModel(Timing(3.0), correlated_sigma=1.0, time_constant=20.0, white_sigma=0.1, has_velocity=False)
-    log, config = write_simulated_log(tmp_path, seconds=60.0, gps_model=receiver)
+    log, config = write_simulated_log(tmp_path, seconds=60.0, gps_model=receiver, wheels_model=WHEELS)
     overconfident = (("gps_correlation_time", 900.0),)
     good, bad = (evaluate(EvaluationJob(log, config, "outage", each)) for each in ((), overconfident))
     assert len(good.nees) == len(bad.nees) == len(good.gaps) == 4
