@@ -15,6 +15,7 @@ from support_moving import BASE, DEEP, ODOM, SCAN, SURVEY, T0, UTM, S, estimate,
 from support_moving import view as exact_view
 
 import modelserver as ms
+from modelserver.client.extrapolation import PublishedEstimate
 from modelserver.client.mirror_state import MAX_COUNTERS, MirrorReceiver
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
@@ -61,6 +62,16 @@ def other_model() -> Model:
         builder.add_constraint(each.name, each.from_, each.to, each.pose, sigma=each.sigma, joint=each.joint)
     builder.add_constraint("LampOn", "Rover:Mast", "Lamp:Origin", Pose((0.0, 0.0, 0.3)), sigma=SURVEY)
     return builder.build()
+
+
+@pytest.mark.parametrize(("pose", "is_known"), [(Pose((3.0, 4.0, 0.0)), True), (Pose(), False)])
+def test_given_a_published_pose_without_covariance_then_it_is_in_the_world_unless_it_is_the_identity(
+    pose: Pose, is_known: bool
+) -> None:
+    answer = exact_view().get_published_pose(estimate(0.0), UTM)
+    world = answer._replace(transformation=ms.Transformation(BASE, UTM, pose))
+    found = PublishedEstimate(T0, world, exact_view().get_published_pose(estimate(0.0), ODOM), None, False).resolve()
+    assert found.utm == (pose if is_known else None)
 
 
 # --- the same answers as the service's ----------------------------------------------------------------------

@@ -38,6 +38,11 @@ def test_given_ticks_further_ahead_than_the_time_passed_then_they_do_not_fit(wat
     assert watch.unwrap(65_000 + 52, 10 * MS, True) is not None
 
 
+def test_given_ticks_further_ahead_than_the_time_since_the_last_ones_then_they_do_not_fit(watch):
+    assert watch.unwrap(65_100, 1 * S, True) == 65_536 + 65_100
+    assert watch.unwrap(65_100 + 54 + 50, 1 * S + 10 * MS, True) is None
+
+
 def test_given_a_host_that_read_late_then_replies_that_come_all_at_once_fit(watch):
     assert all(watch.unwrap(65_000 + k, 3 * S, True) is not None for k in range(1, 300))
 

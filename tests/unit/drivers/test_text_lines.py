@@ -18,7 +18,7 @@ from msdrivers.emulate.text_imu import TextImuEmulator
 from msdrivers.emulate.text_joints import TextJointsEmulator
 from msdrivers.endpoint import EndpointPhase
 from msdrivers.factory import find_unknown_joint
-from msdrivers.protocol.text_lines import MAX_LINE, ColumnMap
+from msdrivers.protocol.text_lines import MAX_LINE, ColumnMap, LineReader
 from msdrivers.settings import read_driver
 from tests.unit.drivers.test_imu_units import turn
 
@@ -196,3 +196,10 @@ def test_given_wrong_joints_then_the_error_names_them() -> None:
     assert (problem.nearest, problem.fix) == (("Pan",), "write Pan")
     with pytest.raises(ConfigError, match="joints"):
         read_driver("head", {key: value for key, value in section.items() if key != "joints"})
+
+
+def test_given_a_reader_that_is_cleared_then_the_rest_of_a_line_is_not_used() -> None:
+    reader = LineReader()
+    assert reader.feed(b"3,4\n5,6\n7,", 1) == [(b"5,6", 1)]
+    reader.clear()
+    assert reader.feed(b"8\n9,10\n", 2) == [(b"9,10", 2)]
