@@ -172,8 +172,9 @@ class Progress:
         since, (second, ahead) = arrival - self.drive.start_utime, self.clock_step
         return Instant(1_000_000_000 + since * 1000, arrival + (round(ahead * 1e6) if since >= second * 1e6 else 0))
 
-    def copy(self) -> Progress:
-        return replace(self, poses=self.poses[:])
+    def resume(self, at: Progress) -> Progress:
+        # what is compared with the truth later is that of this drive
+        return replace(at, drive=self.drive, poses=at.poses[:])
 
 
 def run_core(

@@ -218,8 +218,8 @@ class Progress:
             self.due = utime + round(self.every * 1e6)
             self.estimates.append(self.localizer.estimate(utime))
 
-    def copy(self) -> Progress:
-        return replace(self, ledger=self.ledger[:], estimates=self.estimates[:])
+    def resume(self, at: Progress) -> Progress:
+        return replace(at, ledger=at.ledger[:], estimates=at.estimates[:])
 
 
 def drive(

@@ -12,6 +12,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, Protocol, Self, TypeVar
 
+from msgspec.msgpack import encode
+
 STRIDE = 200
 """Events between two stored states: 3 s of the filter's drives."""
 
@@ -26,11 +28,12 @@ V = TypeVar("V")
 
 
 class Progress(Protocol):
-    """A computation over events. It refers to immutable values, and lists that `copy` copies."""
+    """A computation over events: immutable values, and lists that `resume` copies."""
 
     def update(self, event: Any) -> None: ...
 
-    def copy(self) -> Self: ...
+    def resume(self, at: Self) -> Self:
+        """Return this computation with what another one has reached."""
 
 
 P = TypeVar("P", bound=Progress)
@@ -66,7 +69,8 @@ def run_shared(key: Hashable, begin: P, events: Iterable[Any]) -> P:
     waiting: list[Any] | None = []
     for event in events:
         count += 1
-        chain = hash((chain, event))
+        # the bytes, since a value that is not a number differs from itself
+        chain = hash((chain, type(event), encode(event)))
         if waiting is None:
             progress.update(event)
         else:
@@ -79,19 +83,19 @@ def run_shared(key: Hashable, begin: P, events: Iterable[Any]) -> P:
             _values.move_to_end(name)
             waiting.clear()
             continue
-        progress, waiting = _catch_up(progress, waiting), None
-        _store(name, progress.copy())
+        progress, waiting = _catch_up(begin, progress, waiting), None
+        _store(name, progress.resume(progress))
     name = (key, count, chain)
     if name not in _values:
-        _store(name, _catch_up(progress, waiting).copy())
-    return _values[name].copy()  # type: ignore[no-any-return]
+        _store(name, _catch_up(begin, progress, waiting))
+    return begin.resume(_values[name])
 
 
-def _catch_up(progress: P, waiting: list[Any] | None) -> P:
+def _catch_up(begin: P, progress: P, waiting: list[Any] | None) -> P:
     """Return the progress after the events that were only read."""
     if waiting is None:
         return progress
-    progress = progress.copy()
+    progress = begin.resume(progress)
     for event in waiting:
         progress.update(event)
     return progress
