@@ -92,13 +92,17 @@ def test_given_a_huge_count_anywhere_when_decoded_then_little_memory_is_used(typ
     data = encode(value, type_name)
     tracemalloc.start()
     try:
-        for count in (0x7FFFFFFF, 0xFFFFFFFF):
-            for place in range(8, len(data) - 3, _step(data)):
+        for number, place in enumerate(range(8, len(data) - 3, _step(data))):
+            # both at each place of a short message, in turn in a long one
+            for count in COUNTS if _step(data) == 1 else COUNTS[number % 2 :][:1]:
                 _decode_any(type_name, data[:place] + struct.pack(">I", count) + data[place + 4 :])
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert peak < 4 << 20
+
+
+COUNTS = (0x7FFFFFFF, 0xFFFFFFFF)
 
 
 def _step(data: bytes) -> int:
