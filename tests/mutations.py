@@ -1,9 +1,9 @@
 """Share of small mutations of the product that the tests notice.
 
-    python -m benchmarks mutations                         # 110 mutations, the tests beside them
-    python -m benchmarks mutations --tests OTHER/tests     # the same mutations before the tests of another checkout
-    python -m benchmarks mutations --only 3,17             # some of them again
-    python -m benchmarks mutations --known OLD/results.json  # first the tests that noticed in an earlier run
+    python tests/mutations.py                         # 110 mutations, the tests beside them
+    python tests/mutations.py --tests OTHER/tests       # the same mutations before the tests of another checkout
+    python tests/mutations.py --only 3,17               # some of them again
+    python tests/mutations.py --known OLD/results.json  # first the tests that noticed in an earlier run
 
 A mutation changes one expression inside a function: a comparison, an operator, a number, a condition, `and` and `or`.
 All stand in one copy of the tree, each behind a switch, and the environment variable MUTANT turns one on. So a run
@@ -29,7 +29,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -257,17 +257,14 @@ def record(tree: Path, folder: Path) -> dict[int, Reach]:
         # what a fixture reaches may be shared by all tests of its file
         tests_of[int(number)].update(by_file[test.partition("::")[0]] if phase == "(setup)" else [test])
     for found in tests_of.values():
-        # processes are slow: they are tried only where no other test reaches the mutation
         found -= bad
-        found -= {test for test in found if test.startswith("tests/scenario/")} if not _is_scenario(found) else set()
+        # processes are slow: they are tried only where no other test reaches the mutation
+        others = {test for test in found if not test.startswith("tests/scenario/")}
+        found &= others or found
     return {
         number: Reach(tuple(sorted(found, key=lambda test: (costs[test], test))), sum(costs[test] for test in found))
         for number, found in tests_of.items()
     }
-
-
-def _is_scenario(tests: set[str]) -> bool:
-    return all(test.startswith("tests/scenario/") for test in tests)
 
 
 def try_mutation(number: int, reach: Reach, tree: Path, folder: Path) -> str:
@@ -297,7 +294,7 @@ def try_mutation(number: int, reach: Reach, tree: Path, folder: Path) -> str:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Draw a sample, run the tests before it, and print the share that they notice."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks mutations", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tests/mutations.py", description=__doc__)
     parser.add_argument("--count", type=int, default=110, help="about how many mutations (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the sample (default %(default)s)")
     parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="folder of the tests (default: this one's)")
@@ -332,10 +329,9 @@ def main(arguments: Sequence[str] = ()) -> int:
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(attempt, todo))
-    (folder / "sample.json").write_text(json.dumps([asdict(each) for each in sample], indent=1))
-    noticed = sum(found.startswith("noticed") for found in results.values())
+    count = sum(found.startswith("noticed") for found in results.values())
     lives = sorted(int(number) for number, found in results.items() if not found.startswith("noticed"))
-    print(f"noticed {noticed} of {len(results)} ({noticed / len(results):.0%}); not noticed: {lives}")
+    print(f"noticed {count} of {len(results)} ({count / len(results):.0%}); not noticed: {lives}")
     return 0
 
 
