@@ -166,16 +166,16 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
 def test_given_a_running_demo_when_it_is_sent_a_signal_then_its_children_end_too(smaller, number, code):
     vehicle, _ = all_started(smaller)
     smaller.send_signal(number)
-    smaller.communicate(timeout=TIMEOUT_S)
-    assert smaller.returncode == code
+    _, err = smaller.communicate(timeout=TIMEOUT_S)
+    assert smaller.returncode == code, err
     assert list_running(vehicle) == {}
 
 
 def test_given_a_demo_that_is_being_started_when_it_is_sent_a_signal_then_its_children_end_too(smaller):
     vehicle = vehicle_in(text_until(smaller, "modelserver run"))
     smaller.send_signal(signal.SIGTERM)
-    smaller.communicate(timeout=TIMEOUT_S)
-    assert smaller.returncode == 143
+    _, err = smaller.communicate(timeout=TIMEOUT_S)
+    assert smaller.returncode == 143, err
     assert list_running(vehicle) == {}
 
 

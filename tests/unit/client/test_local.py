@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
+from datetime import UTC as UTC_ZONE
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -43,6 +45,14 @@ def test_given_a_question_then_every_client_takes_it_alike(client: type, name: s
 def test_given_a_client_then_it_has_no_question_that_the_other_lacks(client: type) -> None:
     public = {name for name in dir(client) if name.startswith(("get_", "explain"))}
     assert public == {name for name in QUESTIONS if name != "close"}
+
+
+def test_given_a_time_as_a_date_then_it_is_that_of_its_microseconds(receiver: MirrorReceiver) -> None:
+    answer, at = FedPlatform(receiver, NOW), T0 + S
+    date = datetime(1970, 1, 1, tzinfo=UTC_ZONE) + timedelta(microseconds=at)
+    by_date, by_number = (answer.get_transformation(BASE, UTM, at=each) for each in (date, at))
+    assert by_date.utime == by_number.utime == at
+    assert by_date.pose == by_number.pose
 
 
 def test_given_what_is_known_then_every_question_has_its_answer(receiver: MirrorReceiver) -> None:

@@ -50,6 +50,12 @@ def test_given_a_prismatic_joint_then_it_slides_along_its_axis():
     assert Joint(JointType.PRISMATIC, (0, 0, 5)).compute_pose((0.4,)) == Pose((0, 0, 0.4))
 
 
+@pytest.mark.parametrize("length", [1.0, 2.0])
+def test_given_an_axis_with_negative_zeros_then_it_has_positive_ones(length: float) -> None:
+    for axis in ((length, -0.0, -0.0), (-0.0, -0.0, length)):
+        assert min(math.copysign(1.0, each) for each in Joint(JointType.REVOLUTE, axis).axis) == 1.0
+
+
 def test_given_a_spherical_joint_then_its_coordinates_are_a_rotation_vector():
     joint = Joint(JointType.SPHERICAL)
     np.testing.assert_allclose(

@@ -98,7 +98,8 @@ class ChildProcesses:
 
     def __enter__(self) -> ChildProcesses:
         def end(number: int, frame: FrameType | None) -> None:
-            # Python drops what is raised in a destructor or a callback of its import system: `check` raises it again
+            # Python drops what is raised in a destructor or a callback of its import system, and makes another error of
+            # what is raised in __set_name__: `check` and the end of the block raise it again
             self._signal = number
             raise SystemExit(128 + number)
 
@@ -118,6 +119,8 @@ class ChildProcesses:
         finally:
             for number, before in self._before.items():
                 signal.signal(number, before)
+        if self._signal:
+            raise SystemExit(128 + self._signal) from None
 
     def start(self, name: str, *arguments: str, is_last: bool = False) -> None:
         """Start a Python process with these arguments; `is_last`: it ends after those that need it."""
