@@ -29,7 +29,7 @@ def product_of(route, positions):
 
 @pytest.mark.slow
 @given(models(), st.data())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_given_joints_anywhere_then_a_routes_pose_is_the_product_of_its_edges(model, data):
     frames = all_frames(model)
     pair = data.draw(st.tuples(st.sampled_from(frames), st.sampled_from(frames)))
@@ -120,7 +120,7 @@ def test_given_a_covariance_of_any_rank_then_its_factor_squares_to_it(rank):
 
 @pytest.mark.slow
 @given(models(), st.data())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_given_joints_that_err_then_a_routes_covariance_is_what_moving_each_does(model, data):
     frames = all_frames(model)
     pair = max(itertools.product(frames[:4], frames), key=lambda pair: len(model.get_kinematic_path(*pair).edges))

@@ -118,7 +118,7 @@ def check(estimate):
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
 
 
-@settings(max_examples=120, phases=PHASES)
+@settings(max_examples=60, phases=PHASES)
 @given(
     samples=st.lists(st.one_of(gps, imu, other, st.sampled_from(GOOD)), max_size=40),
     asked=st.lists(utime, min_size=1, max_size=4),
@@ -206,7 +206,7 @@ def check_state(localizer: FilterLocalizer) -> None:
         )
 
 
-@settings(max_examples=100, phases=PHASES, deadline=None)
+@settings(max_examples=50, phases=PHASES, deadline=None)
 @given(
     samples=st.lists(st.one_of(gps, imu, further), max_size=25),
     asked=st.lists(utime, min_size=1, max_size=3),

@@ -50,7 +50,7 @@ def assert_same(found, links):
 
 
 @given(models(), st.data())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_given_any_model_and_positions_of_its_joints_then_the_covariance_is_that_of_the_chain(model, data):
     frames = all_frames(model)
     pair = data.draw(st.tuples(st.sampled_from(frames), st.sampled_from(frames)))

@@ -47,7 +47,7 @@ def assert_same_joints(one, other):
 
 
 @given(st.data())
-@settings(max_examples=80)
+@settings(max_examples=40)
 def test_a_model_written_as_urdf_has_every_frame_at_its_place_wherever_the_joints_stand(data):
     model = data.draw(jointed_models())
     saved = save_model(model, "urdf")
@@ -59,7 +59,7 @@ def test_a_model_written_as_urdf_has_every_frame_at_its_place_wherever_the_joint
 
 
 @given(st.data())
-@settings(max_examples=80)
+@settings(max_examples=40)
 def test_a_model_that_came_from_urdf_comes_back_from_it_whole(data):
     model = read(save_model(data.draw(jointed_models()), "urdf").text)
     saved = save_model(model, "urdf")

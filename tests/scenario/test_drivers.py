@@ -449,7 +449,7 @@ def test_given_a_log_then_the_emulated_device_measures_what_is_stationary_in_it(
     for n, sample in zip(numbers, bench.samples, strict=True):
         assert sample.latitude_deg == pytest.approx(50.0 + n * 1e-6, abs=1e-9)
         assert sample.longitude_deg == pytest.approx(-111.0 - n * 2e-6, abs=1e-9)
-    assert_rate("gps", bench.samples)
+    check_steps("gps", bench.samples)
 
 
 def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_the_device_stores_it(

@@ -338,7 +338,7 @@ KEYS = sorted({field for kind in KINDS.values() for field in kind.load().setting
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from(sorted(KINDS)),
     st.dictionaries(st.one_of(st.sampled_from([*KEYS, "port", "can", "address", "baud"]), st.text(max_size=5)), VALUES),

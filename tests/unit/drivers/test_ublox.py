@@ -188,7 +188,7 @@ def test_given_corrections_then_their_use_is_counted() -> None:
     assert (counts["rtcm.used"], counts["rtcm.unused"], counts["rtcm.damaged"]) == (1, 1, 1)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.binary(max_size=300), st.integers(0, 10), st.randoms(use_true_random=False))
 def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
     noise: bytes, at: int, chance: random.Random

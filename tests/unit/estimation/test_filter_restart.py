@@ -32,7 +32,7 @@ from modelserver.simulation import DrivePhase
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_given_a_kill_while_stationary_then_the_pose_is_valid_at_once_and_within_its_protection_levels(seed):
     first, persisted = simulate_first_run((DrivePhase(60.0), *DRIVES_OFF), seed)
     assert persisted.pose is not None

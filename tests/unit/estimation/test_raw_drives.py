@@ -121,7 +121,7 @@ def test_pose_is_invalid_until_the_vehicle_moves_and_valid_after():
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
 def test_ten_minutes_stationary_hold_the_heading_and_measure_the_bias(velocity_sigma):
     drive = Drive(680.0, speed=stepwise((0.0, 1.5), (60.0, 0.0)), yaw_rate=stepwise((10.0, 0.1), (50.0, 0.0)))
-    sensors = Sensors(imu_hz=25.0, gps_hz=2.0, velocity_sigma=velocity_sigma, gyro_bias=(0.01, -0.01, 0.012))
+    sensors = Sensors(imu_hz=12.5, gps_hz=2.0, velocity_sigma=velocity_sigma, gyro_bias=(0.01, -0.01, 0.012))
     localizer = final(start(), sensors.events(drive))
     utime = START + 679_980_000
     estimate = localizer.estimate(utime)

@@ -93,8 +93,10 @@ def test_a_pose_requested_by_a_clock_that_is_behind_is_invalid():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("velocity_sigma", [0.03, 0.1, None])
-@pytest.mark.parametrize(("speed", "rate"), [(0.1, 0.008), (0.1, 0.013), (0.25, 0.013)])
+@pytest.mark.parametrize(
+    ("velocity_sigma", "speed", "rate"),
+    [(0.03, 0.1, 0.008), (0.1, 0.1, 0.013), (None, 0.1, 0.013), (0.03, 0.25, 0.013)],
+)
 def test_creeping_along_a_curve_is_not_stationary(velocity_sigma, speed, rate):
     drive = Drive(
         120.0,

@@ -129,7 +129,7 @@ POINTS = np.array([(0.0, 0.0, 0.0), (1.0, 0.1, 0.0), (0.2, 1.2, 0.3), (0.8, 0.9,
 coordinates = st.floats(-3.0, 3.0)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.tuples(coordinates, coordinates, coordinates), st.integers(3, 4))
 def test_given_exact_distances_then_the_position_is_found(place: tuple[float, float, float], count: int) -> None:
     points = POINTS[:count]

@@ -22,14 +22,20 @@ def test_given_a_signal_in_a_callback_whose_exceptions_python_drops_then_the_nex
     dropped: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", lambda error: dropped.append(error.exc_value))
     before = signal.getsignal(number)
-    with pytest.raises(SystemExit) as ended, ChildProcesses() as children:
-        thing = Thing()
-        reference = weakref.ref(thing, lambda _: signal.raise_signal(number))
-        del thing
-        assert (reference(), len(dropped)) == (None, 1)
-        with pytest.raises(SystemExit) as caught:
-            children.check()
-    assert caught.value.code == ended.value.code == code
+
+    def run_group() -> None:
+        with ChildProcesses() as children:
+            thing = Thing()
+            reference = weakref.ref(thing, lambda _: signal.raise_signal(number))
+            del thing
+            assert (reference(), len(dropped)) == (None, 1)
+            with pytest.raises(SystemExit) as caught:
+                children.check()
+            assert caught.value.code == code
+
+    with pytest.raises(SystemExit) as ended:
+        run_group()
+    assert ended.value.code == code
     assert signal.getsignal(number) is before
 
 
@@ -38,8 +44,12 @@ def test_given_a_signal_whose_exception_python_makes_another_error_of_then_the_g
         def __set_name__(self, owner: type, name: str) -> None:
             signal.raise_signal(signal.SIGTERM)
 
-    with pytest.raises(SystemExit) as ended, ChildProcesses():
-        type("Owner", (), {"field": Field()})
+    def run_group() -> None:
+        with ChildProcesses():
+            type("Owner", (), {"field": Field()})
+
+    with pytest.raises(SystemExit) as ended:
+        run_group()
     assert ended.value.code == 143
 
 
