@@ -1,8 +1,10 @@
 """Driver of gpsd: publishes the fixes of the receiver that gpsd reads.
 
-A TPV report is a fix. The standard deviations are those of a GST report of the same instant, which gpsd passes on from
-the receiver; its own error estimates (epx, epy, epv) are of an unstated certainty and are not used. Without GST the
-dilution of the last SKY report is published, from which the filter computes the sigma.
+A TPV report is a fix. Its height `alt` is that above mean sea level in releases before 3.20, which have no other; later
+ones leave open what it is, and have `altHAE` and `altMSL`. The standard deviations are those of a GST report of the
+same instant, which gpsd passes on from the receiver; its own error estimates (epx, epy, epv) are of an unstated
+certainty and are not used. Without GST the dilution of the last SKY report is published, from which the filter computes
+the sigma.
 """
 
 from __future__ import annotations
@@ -125,7 +127,7 @@ class GpsdDriver(StreamDriver[GpsdReport]):
             latitude,
             longitude,
             height_ellipsoidal=get("altHAE"),
-            height_msl=get("altMSL"),
+            height_msl=get("altMSL" if {"altMSL", "altHAE"} & tpv.fields.keys() else "alt"),
             undulation=get("geoidSep"),
             satellites=-1 if sky is None or not math.isfinite(sky.get_number("uSat")) else int(sky.get_number("uSat")),
             hdop=NAN if sky is None else sky.get_number("hdop"),

@@ -36,6 +36,9 @@ def rmc(clock: str = "120000.00", status: str = "A", date: str = "211126", mode:
     return f"GPRMC,{clock},{status},5000.0,N,11100.0,W,10.0,90.0,{date},,,{mode}"
 
 
+GNS = "GNGNS,120000.00,5000.0,N,11100.0,W,RR,13,0.9,700.0,-20.0,,"
+
+
 def utime(*parts: int) -> int:
     return round(datetime(*parts, tzinfo=UTC).timestamp() * 1e6)  # type: ignore[misc]
 
@@ -92,6 +95,11 @@ def test_given_any_talker_when_it_speaks_then_it_is_read(talker: str):
         ((gga(), "GPGSA,A,3,,,,,,,,,,,,,1,1,1", "GLGSA,A,1,,,,,,,,,,,,,,,"), FixType.FIX_3D),
         (("GNGNS,120000.00,5000.0,N,11100.0,W,RNN,09,0.9,700.0,-20.0,,",), FixType.RTK_FIXED),
         (("GNGNS,120000.00,5000.0,N,11100.0,W,NNN,09,0.9,700.0,-20.0,,",), FixType.NONE),
+        ((GNS, "GPGNS,120000.00,,,,,,8,,,,1.0,23", "GLGNS,120000.00,,,,,,5,,,,1.0,23"), FixType.RTK_FIXED),
+        (("GLGNS,120000.00,,,,,N,0,,,,,", GNS), FixType.RTK_FIXED),
+        (("GPGNS,120000.00,,,,,,8,,,,1.0,23", gga(quality="4")), FixType.RTK_FIXED),
+        ((gga(quality="4"), "GNGNS,120000.00,,,,,NN,0,,,,,"), FixType.NONE),
+        ((GNS, "GLGNS,120000.00,5000.0,N,11100.0,W,N,0,,,,,"), FixType.RTK_FIXED),
         (("GPGLL,5000.0,N,11100.0,W,120000.00,A,A",), FixType.FIX_2D),
         (("GPGLL,5000.0,N,11100.0,W,120000.00,V,N",), FixType.NONE),
     ],
@@ -263,6 +271,11 @@ def test_given_values_when_written_then_they_read_as_they_should():
 def test_given_motion_that_is_flagged_invalid_when_read_then_it_is_not_reported(sentence: str, moves: bool):
     (epoch,) = epochs(gga(), sentence)
     assert [value == value for value in (epoch.speed, epoch.track)] == [moves, moves]
+
+
+def test_given_a_gns_for_each_system_when_read_then_the_satellites_are_those_of_the_fix():
+    (epoch,) = epochs("GPGNS,120000.00,,,,,,18,,,,1.0,23", GNS, "GLGNS,120000.00,,,,,,5,,,,1.0,23")
+    assert (epoch.fix_type, epoch.satellites) == (FixType.RTK_FIXED, 13)
 
 
 def test_given_a_gns_without_a_mode_when_read_then_it_is_no_fix_as_a_gga_without_quality():

@@ -257,13 +257,17 @@ def test_given_a_log_of_the_secondary_antenna_when_read_then_it_is_marked(as_bin
     stream = GpsStream()
     (log,) = stream.feed(frame)
     assert isinstance(log, NovatelLog)
-    assert (log.header.name, log.header.antenna) == ("BESTPOS", 1)
+    assert log.header.name == "BESTPOS"
+    assert log.header.is_secondary
     assert stream.counts[f"novatel.BESTPOS{'B' if as_binary else 'A'}_1"] == 1
 
 
-def test_given_bits_of_format_and_source_when_read_then_only_the_source_is_taken_for_the_antenna():
-    assert one(binary(42, one_body(), kind=0x1F)).header.antenna == 31
-    assert one(binary(42, one_body(), kind=0x00)).header.antenna == 0
+def test_given_any_source_of_five_bits_when_read_then_only_1_is_the_secondary_antenna():
+    for kind in range(32):
+        log = one(binary(42, one_body(), kind=kind))
+        assert log.body is not None
+        assert log.header.is_secondary is (kind == 1)
+        assert log.header.label == ("BESTPOSB_1" if kind == 1 else "BESTPOSB")
 
 
 def test_given_a_source_that_five_bits_cannot_hold_when_read_then_the_log_is_rejected():

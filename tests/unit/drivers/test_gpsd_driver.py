@@ -48,6 +48,27 @@ def test_given_a_type_of_fix_then_it_is_published(fix_type: FixType) -> None:
     assert {each.fix_type for each in line.samples} == {fix_type}
 
 
+@pytest.mark.parametrize(
+    ("heights", "height"),
+    [
+        ({"alt": 152.3}, 152.3),
+        ({"alt": 152.3, "altMSL": 150.0}, 150.0),
+        ({"alt": 152.3, "altHAE": 199.0}, None),
+        ({}, None),
+    ],
+)
+def test_given_the_height_of_releases_up_to_3_19_then_it_is_that_above_mean_sea_level(
+    heights: dict[str, float], height: float | None
+) -> None:
+    line = Line(GpsdDriver(GpsdSettings("gps")), GpsdEmulator(()))
+    line.open()
+    report = {"class": "TPV", "mode": 3, "time": "2027-01-15T08:00:00.000Z", "lat": 50.0, "lon": 8.0}
+    line.deliver(json.dumps(report | heights).encode() + b"\n")
+    line.run(0.1)
+    (sample,) = line.samples
+    assert sample.height_msl == height if height is not None else math.isnan(sample.height_msl)
+
+
 def test_given_several_receivers_then_only_the_chosen_one_is_used() -> None:
     for receiver, count in (("/dev/ttyACM0", 2), ("/dev/ttyUSB9", 0)):
         line = Line(GpsdDriver(GpsdSettings("gps", receiver=receiver)), GpsdEmulator(()))

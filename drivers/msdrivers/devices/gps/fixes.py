@@ -205,7 +205,7 @@ class FixAssembler:
         """Process a log whose first byte was received at `host_utime`."""
         if log.header.name not in self._logs or log.body is None:
             return []
-        if log.header.antenna:
+        if log.header.is_secondary:
             self.counts["rejected.secondary_antenna"] += 1
             self._add_problem(
                 f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"

@@ -6,7 +6,9 @@ fix does not wait for the next instant. Sentences without a time (VTG, GSA, HDT)
 precede; the order is learned from the pauses of the line. Motion of unknown order is left out, because it could be
 that of the next instant.
 
-The fix type of an epoch is NONE if any sentence flags the fix invalid, else that of the most detailed sentence.
+The fix type of an epoch is NONE if any sentence flags the fix invalid, else that of the most detailed sentence with a
+position. Receivers with several satellite systems send some sentences once for each: a GNS of one system, which has
+counts only, flags nothing, and the GSA with the best fix counts.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ _MODE = {
 def determine_fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
     """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
     placed = _list_places(sentences)
-    if not placed or any(_is_invalid(each) for each in sentences) or _has_no_satellites(sentences):
+    if not placed or any(map(_is_invalid, sentences)) or _has_no_mode(sentences) or _has_no_satellites(sentences):
         return FixType.NONE
     dimension = max((each.dimension for each in sentences if each.dimension is not None), default=None)
     if dimension == 1:
@@ -67,12 +69,21 @@ def _is_invalid(sentence: NmeaSentence) -> bool:
     """Return whether a sentence flags the fix invalid."""
     if sentence.kind == "GGA":
         return sentence.quality not in _QUALITY
-    if sentence.kind == "GNS":
-        return _best_mode(sentence.mode) is None
     if sentence.kind in ("RMC", "GLL"):
         # status V with mode E is dead reckoning, a fix of its kind
         return bool(sentence.mode and sentence.mode not in _MODE) or (sentence.status != "A" and sentence.mode != "E")
     return False
+
+
+def _has_no_mode(sentences: Iterable[NmeaSentence]) -> bool:
+    """Return whether every GNS that speaks of the fix flags it invalid.
+
+    That of one system has neither a position nor a mode, or a mode of that system alone.
+    """
+    whole = [
+        each for each in sentences if each.kind == "GNS" and (each.has_position or (each.talker == "GN" and each.mode))
+    ]
+    return bool(whole) and all(_best_mode(each.mode) is None for each in whole)
 
 
 def _best_mode(mode: str) -> FixType | None:
@@ -86,7 +97,10 @@ def count_satellites(sentences: Sequence[NmeaSentence]) -> int:
     Some receivers (Furuno GL, Garmin 25) send a GGA with 0 in use while the GSA of the same instant lists them: then
     the list counts.
     """
-    counted = max((each.satellites for each in sentences if each.satellites is not None), default=-1)
+    counts = [each for each in sentences if each.satellites is not None]
+    # a GNS of one system counts those of that system
+    whole = [each for each in counts if each.has_position] or counts
+    counted = max((each.satellites for each in whole if each.satellites is not None), default=-1)
     return counted or sum(each.listed for each in sentences)
 
 

@@ -90,8 +90,8 @@ class LogHeader(NamedTuple):
 
     name: e.g. "BESTPOS", or "id 1234" for an unknown binary log. week may be rolled over, see `gps_time`.
     milliseconds: of the week. time_status: a `TimeStatus`; UNKNOWN for a short header.
-    port: as ASCII names it, or the binary address's number. antenna: the measurement source, 0 for the primary antenna,
-    1 for the secondary one; ASCII writes it as a suffix of the name (`BESTPOSA_1`).
+    port: as ASCII names it, or the binary address's number. antenna: the measurement source; 1 is the secondary
+    antenna, which ASCII writes as a suffix of the name (`BESTPOSA_1`). Older boards send others, which mean none.
     """
 
     name: str
@@ -107,7 +107,12 @@ class LogHeader(NamedTuple):
     @property
     def label(self) -> str:
         """The name as receivers write it: `BESTPOSB`, `BESTPOSA_1`."""
-        return f"{self.name}{'B' if self.is_binary else 'A'}{f'_{self.antenna}' if self.antenna else ''}"
+        return f"{self.name}{'B' if self.is_binary else 'A'}{'_1' if self.is_secondary else ''}"
+
+    @property
+    def is_secondary(self) -> bool:
+        """Whether the log is of the secondary antenna."""
+        return self.antenna == 1
 
 
 class Position(NamedTuple):
