@@ -13,7 +13,8 @@ from msdrivers.devices.axis import AxisSettings, NodSettings
 from msdrivers.devices.vehicle import CommandLimits, VehicleSettings
 from msdrivers.devices.wheels import WheelsSettings
 from msdrivers.endpoint import Endpoint, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.can.database import CanDatabase, parse_dbc
+from msdrivers.protocol.can.database import CanDatabase
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from msdrivers.protocol.can.mapping import (
     CommandMap,
     CountMap,

@@ -126,10 +126,10 @@ def _locate_errors(driver: DriverSettings) -> Iterator[None]:
 
 
 def find_unbuildable_drivers(drivers: Iterable[DriverSettings], folder: Path) -> Iterator[Problem]:
-    """Yield the problems of drivers that cannot be made: a missing DBC file, an unknown signal."""
+    """Yield the problems of drivers that cannot be made: a missing DBC file, an unknown signal; and of their files."""
     for driver in drivers:
         try:
-            make_driver(driver, folder)
+            yield from getattr(make_driver(driver, folder), "problems", ())
         except ConfigError as error:
             yield from error.problems
 

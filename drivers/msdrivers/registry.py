@@ -199,7 +199,7 @@ def _make_axis_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
 def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
     """Load the DBC file of a driver's settings. Raises ConfigError."""
-    from msdrivers.protocol.can.database import MAX_DBC_CHARS, parse_dbc
+    from msdrivers.protocol.can.dbc_file import MAX_DBC_CHARS, parse_dbc
 
     path = Path(settings.dbc)
     file = folder / path.expanduser()

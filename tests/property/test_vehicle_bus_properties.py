@@ -24,7 +24,7 @@ from msdrivers.devices.vehicle import VehicleDriver
 from msdrivers.devices.wheels import WheelsDriver
 from msdrivers.emulate.axis import AxisEmulator, AxisUnit
 from msdrivers.endpoint import MeasuredSample, Send
-from msdrivers.protocol.can.database import parse_dbc
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.odometer import Odometer
 from msdrivers.protocol.can.vehicle import bind_command

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+from modelserver.errors import quote
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Reopen
-from msdrivers.protocol.can.database import CanDatabase, CanFrameAssembler, CanFrameSet, FrameError
+from msdrivers.protocol.can.database import BoundSignal, CanDatabase, CanFrameAssembler, CanFrameSet, FrameError
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
 
 MAX_SEEN = 8
-"""Identifiers that are remembered for the status text."""
+"""Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
+
+
+MAX_FLAWS = 3
+"""Warnings about the DBC file at a start: `modelserver check` has all."""
 
 
 def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
@@ -33,31 +38,44 @@ class CanDriver(ABC):
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
         self.counts: Counter[str] = Counter()
-        """Frames, samples, incomplete instants, silences, commands, and rejections by reason."""
+        """Frames, samples, incomplete instants, silences, commands, and rejections by reason. `outside_range`: values
+        outside the range of the DBC, which are used; `rejected.reserved`: those that stand for no measurement."""
+        self.problems = database.warnings
+        """What is wrong with parts of the DBC file that are not used."""
         self._database, self._needed, self._silence_s = database, needed, silence
         self._assembler = CanFrameAssembler(frozenset(needed), round(window * 1e9))
         self._seq = 0
         self._silence_deadline_ns: int | None = None
-        self._seen: dict[FrameKey, None] = {}
-        self._reported_malformed: set[FrameKey] = set()
-        self._has_only_malformed = False
+        self._received = 0
+        self._others: Counter[FrameKey] = Counter()
+        self._useless: Counter[str] = Counter()
+        """Since the last usable data: frames, those that are not needed, and what is wrong with the others."""
+        self._reasons: dict[str, None] = {}
+        """Why values of the last instant cannot be used."""
+        self._reported: set[object] = set()
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Discard incomplete instants and start the silence timer."""
         self._assembler.clear()
         self.phase, self.is_bus_off = EndpointPhase.WAITING, False
-        self._reported_malformed.clear()
+        self._reported.clear()
         self._restart_silence_timer(now)
-        return [EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")] if self._needed else []
+        flaws = [
+            EndpointStatus(EndpointPhase.WAITING, str(each), is_warning=True) for each in self.problems[:MAX_FLAWS]
+        ]
+        if not self._needed:
+            return [*flaws]
+        return [*flaws, EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")]
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
         """Process a received frame."""
         if unit.is_error:
             return self._on_error_frame(unit)
+        self._received += 1
         if unit.key not in self._needed:
             self.counts["other_frames"] += 1
-            if len(self._seen) < MAX_SEEN:
-                self._seen[unit.key] = None
+            if unit.key in self._others or len(self._others) < MAX_SEEN:
+                self._others[unit.key] += 1
             return []
         try:
             values = self._database.decode(unit)
@@ -101,11 +119,48 @@ class CanDriver(ABC):
     def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
         """Count a malformed frame; reported once per kind."""
         self.counts[f"rejected.{error.reason}"] += 1
-        self._has_only_malformed = True
-        if frame.key in self._reported_malformed:
+        self._note_useless(f"{self._needed[frame.key]} ({frame.key}) {error.summary}")
+        if frame.key in self._reported:
             return []
-        self._reported_malformed.add(frame.key)
+        self._reported.add(frame.key)
         return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
+
+    def _note_useless(self, what: str) -> None:
+        """Note what is wrong with a frame, or with the frames of an instant."""
+        if what in self._useless or len(self._useless) < MAX_SEEN:
+            self._useless[what] += 1
+
+    def _note_empty(self) -> None:
+        """Count an instant without any value."""
+        self.counts["rejected.empty"] += 1
+        self._note_useless(f"no value that can be used ({', '.join(self._reasons) or 'no number'})")
+
+    def _check_values(self, signals: Iterable[BoundSignal | None], instant: CanFrameSet) -> list[Output[CanFrame]]:
+        """Count values outside the DBC's range, and those that stand for no measurement; each is reported once."""
+        outputs: list[Output[CanFrame]] = []
+        self._reasons.clear()
+        for signal in signals:
+            raw = instant.raw(signal)
+            if signal is None or raw is None or raw != raw:
+                continue
+            if name := signal.find_reserved(raw):
+                self.counts["rejected.reserved"] += 1
+                self._reasons[name] = None
+                text = f"{signal.path} is {raw:.0f}, {quote(name, 60)}: that is no measurement, and it is not used"
+            elif signal.is_outside(raw):
+                self.counts["outside_range"] += 1
+                name = "range"
+                value, limits = raw * signal.scale + signal.offset, f"[{signal.minimum:g}|{signal.maximum:g}]"
+                text = (
+                    f"{signal.path} is {value:g} {signal.unit}".rstrip() + f", outside its range {limits} in "
+                    f"{self._database.name}: it is used, for such ranges are often wrong"
+                )
+            else:
+                continue
+            if (signal.path, name) not in self._reported:
+                self._reported.add((signal.path, name))
+                outputs.append(EndpointStatus(self.phase, text, is_warning=True))
+        return outputs
 
     def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
         """Process an error frame of the interface; bus-off requests a reopening, once."""
@@ -123,17 +178,20 @@ class CanDriver(ABC):
 
     def _restart_silence_timer(self, now: HostTime) -> None:
         self._silence_deadline_ns = now.monotonic_ns + round(self._silence_s * 1e9) if self._needed else None
-        self._has_only_malformed = False
-        self._seen.clear()
+        self._received = 0
+        self._others.clear()
+        self._useless.clear()
 
     def _explain_silence(self) -> str:
         head = f"no usable {self._format_needed()} for {self._silence_s:g} s"
-        if self._has_only_malformed:
-            return f"{head}: frames arrive but do not match the DBC; use the DBC of this controller's version"
-        if self._seen:
-            seen = ", ".join(map(str, self._seen)) + (", ..." if len(self._seen) == MAX_SEEN else "")
-            return f"{head}; on the bus are {seen}: is the controller on, and is this its DBC and its bus?"
-        return f"{head}, and nothing else on the bus: check power, wiring, the interface's name and the bit rate"
+        if not self._received:
+            return f"{head}, and nothing on the bus: check power, wiring, the interface's name and the bit rate"
+        wrong = [f"{number} x {what}" for what, number in self._useless.most_common()]
+        if self._others:
+            keys = ", ".join(map(str, self._others)) + (", ..." if len(self._others) == MAX_SEEN else "")
+            wrong.append(f"others: {keys}")
+        fix = "" if self._useless else "; is the controller on, and is this its DBC and its bus?"
+        return f"{head}; received {self._received} frames: {'; '.join(wrong) or 'not all of an instant'}{fix}"
 
     def _format_needed(self) -> str:
         return ", ".join(f"{name} ({key})" for key, name in sorted(self._needed.items()))

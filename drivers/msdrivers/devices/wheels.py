@@ -78,6 +78,7 @@ class WheelsDriver(CanDriver):
             wheel.name: wheel.make_odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels
         }
         self._odometers = {name: odometer for name, odometer in odometers.items() if odometer is not None}
+        self._measured = [signal for wheel in self._wheels for signal in (wheel.count, wheel.speed, wheel.steering)]
         self._warned: set[str] = set()
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
@@ -88,11 +89,11 @@ class WheelsDriver(CanDriver):
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         outputs: list[Output[CanFrame]] = []
         for instant in instants:
-            warnings: list[Output[CanFrame]] = []
+            warnings = self._check_values(self._measured, instant)
             wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
             self.counts["incomplete"] += not instant.is_complete
             if all(_is_empty(wheel) for wheel in wheels):
-                self.counts["rejected.empty"] += 1
+                self._note_empty()
                 outputs += warnings
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
@@ -109,7 +110,7 @@ class WheelsDriver(CanDriver):
         direction = wheel.get_direction(instant)
         travel = travel_sigma = speed_sigma = NAN
         raw = instant.raw(wheel.count)
-        if raw is not None and wheel.map.count is not None:
+        if raw is not None and wheel.count is not None and wheel.map.count and not wheel.count.find_reserved(raw):
             sign = _SIGNS.get(direction)
             odometer = self._odometers[wheel.name]
             self._odometers[wheel.name], travel, reason = odometer.update(raw, instant.monotonic_ns, sign)
@@ -130,6 +131,7 @@ class WheelsDriver(CanDriver):
     def _warn(self, name: str, reason: str, warnings: list[Output[CanFrame]]) -> None:
         key = reason if reason == "resumed" else f"rejected.{reason}"
         self.counts[key] += 1
+        self._reasons[reason] = None
         if f"{name} {reason}" in self._warned:
             return
         self._warned.add(f"{name} {reason}")

@@ -8,8 +8,9 @@ import re
 import pytest
 from support_vehicle_bus import DBC, METERS_PER_COUNT, RAPTOR_COMMAND, RAPTOR_STATUS, raptor_dbc, wheel
 
-from modelserver.errors import ConfigError
-from msdrivers.protocol.can.database import CanDatabase, FrameError, parse_dbc
+from modelserver.errors import ConfigError, Severity
+from msdrivers.protocol.can.database import CanDatabase, FrameError
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame, FrameKey, make_bus_off_frame
 from msdrivers.protocol.can.mapping import (
     CommandMap,
@@ -89,9 +90,9 @@ def test_given_a_wrong_length_then_the_frame_is_rejected_with_both_lengths(datab
 
 
 @pytest.mark.parametrize(
-    ("raw", "value"), [(0, 0.0), (20_000, 20.0), (20_001, None), (65_535, None), (math.nan, None), (math.inf, None)]
+    ("raw", "value"), [(0, 0.0), (20_000, 20.0), (20_001, 20.001), (65_535, 65.535), (math.nan, None), (math.inf, None)]
 )
-def test_given_a_value_beyond_the_files_range_then_it_is_not_reported(
+def test_given_a_value_beyond_the_files_range_then_it_is_that_and_what_is_no_number_is_missing(
     database: CanDatabase, raw: float, value: float | None
 ) -> None:
     assert database.bind_signals("WheelSpeeds")["FrontLeftSpeed"].to_physical(raw) == value
@@ -128,16 +129,9 @@ def test_given_error_frames_then_bus_off_is_distinguished() -> None:
     [
         ("hello", 1, "Invalid syntax"),
         ("", 1, "Invalid syntax"),
-        ("BO_ 1 M: 8 A\n SG_ x : zz\n", 2, "Invalid syntax"),
-        ('BO_ 1 M: 1 A\n SG_ x : 0|16@1+ (1,0) [0|0] "" A\n', 0, "does not fit"),
-        (
-            'BO_ 1 M: 1 A\n SG_ x : 0|8@1+ (1,0) [0|0] "" A\nBO_ 1 N: 1 A\n SG_ y : 0|8@1+ (1,0) [0|0] "" A\n',
-            0,
-            "one id",
-        ),
         ("\0" * 100, 1, "Invalid syntax"),
     ],
-    ids=["words", "empty", "signal", "too_long", "twice", "zeros"],
+    ids=["words", "empty", "zeros"],
 )
 def test_given_what_is_no_dbc_file_then_it_is_reported_where_and_why(text: str, line: int, expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -147,6 +141,48 @@ def test_given_what_is_no_dbc_file_then_it_is_reported_where_and_why(text: str, 
     assert expected in problem.message
     assert problem.fix
     assert len(str(problem)) < 500
+
+
+GOOD = 'BO_ 535 Wheels: 8 A\n SG_ V : 0|16@1- (0.01,0) [0|0] "" A\n'
+
+
+@pytest.mark.parametrize(
+    ("flaw", "line", "message", "expected"),
+    [
+        ('BO_ 1 M: 1 A\n SG_ x : 0|16@1+ (1,0) [0|255] "" A\n', 4, "M", "x does not fit"),
+        ('BO_ 1 M: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] "" A\n SG_ y : 1|1@1+ (1,0) [0|0] "" A\n', 4, "M", "overlapping"),
+        ('BO_ 274923520 M: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] "" A\n', 3, "M", "more than 11 bits"),
+        ("BO_ 1 M: 8 A\n SG_ x : zz\n", 4, "M", "Invalid syntax"),
+        ("BO_ 1 M: 8 A\n SG_ x : 0|8@1+ (1,0) [0|0] km/h A\n", 4, "M", "Invalid syntax"),
+        ('VAL_ 700 Gear 0 "P" 1 "D" ;\n', 3, "", "of message 700, which is not there"),
+        ('VAL_ 535 Gear 0 "P" 1 "D" ;\n', 3, "", "unused VAL_"),
+        ('CM_ SG_ 535 V "a\nBO_ 1 M: 8 A\n" ;\nBA_ "What" 3;\n', 0, "", "cannot be read"),
+        (
+            GOOD.replace("Wheels", "M").replace("535", "1") + GOOD.replace("Wheels", "N").replace("535", "1"),
+            0,
+            "M",
+            "one id",
+        ),
+    ],
+    ids=["too_long", "overlap", "identifier", "syntax", "unit", "names", "signal_names", "attribute", "twice"],
+)
+def test_given_a_flaw_elsewhere_then_the_mapped_message_is_read_and_a_flaw_in_it_is_an_error(
+    flaw: str, line: int, message: str, expected: str
+) -> None:
+    found = parse_dbc("\ufeff" + GOOD + flaw, "d.dbc")
+    assert found.decode(CanFrame(535, bytes((200, 0, 0, 0, 0, 0, 0, 0)))) == {"V": 200}
+    warning = next(each for each in found.warnings if expected in each.message)
+    assert warning.severity is Severity.WARNING
+    assert line in (0, warning.line)
+    assert "the other messages can be used" in warning.fix
+    bind_wheels({"left": WheelMap(speed=SpeedMap("Wheels.V"))}, found, "w")
+    if message:
+        with pytest.raises(ConfigError) as caught:
+            bind_wheels({"left": WheelMap(speed=SpeedMap(f"{message}.x"))}, found, "w")
+        (problem,) = caught.value.problems
+        assert problem.severity is Severity.ERROR
+        assert (problem.message, problem.line) == (warning.message, warning.line)
+        assert "can be used" not in problem.fix
 
 
 def test_given_mistyped_names_then_every_one_is_reported_with_the_nearest(database: CanDatabase) -> None:

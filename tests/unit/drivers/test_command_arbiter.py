@@ -12,7 +12,8 @@ from modelserver.errors import ConfigError
 from modelserver.messages import VehicleCommand
 from msdrivers.devices.vehicle import CommandLimits, VehicleDriver
 from msdrivers.endpoint import EndpointStatus, Output, Reopen, Send
-from msdrivers.protocol.can.database import CanDatabase, parse_dbc
+from msdrivers.protocol.can.database import CanDatabase
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame, make_bus_off_frame
 from msdrivers.protocol.can.mapping import CommandMap, SignalMap
 

@@ -7,6 +7,7 @@ import gc
 import itertools
 import math
 import random
+import re
 import tracemalloc
 from collections.abc import Callable
 
@@ -32,7 +33,7 @@ from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
 from msdrivers.emulate.faults import InjectedFault
 from msdrivers.emulate.wheels import WheelsEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
-from msdrivers.protocol.can.database import parse_dbc
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
 
@@ -166,7 +167,7 @@ def test_given_silence_then_it_is_reported_once_and_nothing_is_published() -> No
     wire = connect(9.0, oscillate, InjectedFault(2.0, "stall", 4.0)).run(9.5)
     silent = [(t, status.text) for t, status in wire.statuses if status.phase is EndpointPhase.SILENT]
     assert [round(t) for t, _ in silent] == [3]
-    assert "nothing else on the bus: check power, wiring" in silent[0][1]
+    assert "nothing on the bus: check power, wiring" in silent[0][1]
     assert not [t for t, _ in wire.samples if 2.01 < t < 6.0]
     assert [status.phase for _, status in wire.statuses][-1] is EndpointPhase.STREAMING
 
@@ -178,7 +179,7 @@ def test_given_another_bus_then_what_is_on_it_is_reported() -> None:
         assert driver.on_receive(CanFrame(0x400 + number % 500, bytes(8)), at(0.0005 * number)) == []
     (status,) = driver.on_timer(at(1.0))
     assert isinstance(status, EndpointStatus)
-    assert "on the bus are 0x400, 0x401" in status.text
+    assert "received 1000 frames: others: 0x400, 0x401" in status.text
     assert len(status.text) < 300
 
 
@@ -189,7 +190,82 @@ def test_given_frames_of_a_wrong_length_then_they_are_reported_once_and_counted(
     assert wire.status_text().count("has 9 bytes, raptor.dbc expects 8") == 1
     assert wire.host.counts["rejected.length"] > 500
     assert not [t for t, _ in wire.samples if t > 2.01]
-    assert "frames arrive but do not match the DBC" in wire.status_text()
+    assert re.search(r"received \d+ frames: \d+ x WheelCounts \(0x100\) with 9 bytes instead of 8", wire.status_text())
+
+
+def speeds_of(dbc: str, raw: bytes, number: int = 535) -> tuple[WheelsDriver, list[object]]:
+    """Return the driver of two speeds, and what it has made of a hundred frames and seconds of silence."""
+    maps = {side: WheelMap(speed=SpeedMap(f"Wheels.V_{side}")) for side in "LR"}
+    driver = WheelsDriver(wheels_settings(wheels=maps), parse_dbc(dbc, "d.dbc"))
+    found: list[object] = [*driver.on_open(at(0.0))]
+    for n in range(100):
+        found += driver.on_receive(CanFrame(number % (1 << 29), raw, number > 2047), at(0.01 * n))
+    return driver, [*found, *driver.on_timer(at(5.0))]
+
+
+def make_dbc(signal: str, number: int = 535, more: str = "") -> str:
+    two = "".join(f" SG_ V_{side} : {at}|16@1{signal} A\n" for side, at in (("L", 0), ("R", 16)))
+    return f'VERSION ""\nNS_ :\nBS_:\nBU_: A\nBO_ {number} Wheels: 8 A\n{two}{more}\n'
+
+
+@pytest.mark.parametrize(
+    ("signal", "raw", "speed", "limits"),
+    [
+        ('+ (0.0087,0) [0|1] "m/s"', 230, 2.001, "[0|1]"),
+        ('- (0.0625,0) [0|255] "m/s"', -16, -1.0, "[0|255]"),
+        ('+ (0.01,-327.68) [0|65535] "m/s"', 32668, -1.0, "[0|65535]"),
+        ('+ (0.01,0) [5|-5] "m/s"', 100, 1.0, "[5|-5]"),
+    ],
+)
+def test_given_a_value_outside_the_range_of_the_file_then_it_is_used_and_warned_of_once(
+    signal: str, raw: int, speed: float, limits: str
+) -> None:
+    data = (raw % 65536).to_bytes(2, "little") * 2 + bytes(4)
+    driver, found = speeds_of(make_dbc(signal), data)
+    samples = [each.sample for each in found if isinstance(each, MeasuredSample)]
+    assert len(samples) == 100
+    assert all(wheel.speed == pytest.approx(speed) for sample in samples for wheel in sample.wheels)
+    warnings = [each.text for each in found if isinstance(each, EndpointStatus) and each.is_warning]
+    assert len(warnings) == 2
+    assert warnings[0].startswith(f"Wheels.V_L is {speed:g} m/s, outside its range {limits} in d.dbc")
+    assert driver.counts["outside_range"] == 200
+
+
+EXTENDED = 0x80000000 + 0x18FE0217
+J1939 = (
+    'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+    'BA_DEF_DEF_ "VFrameFormat" "StandardCAN";\nBA_ "VFrameFormat" BO_ {} 3;\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("number", "signal", "more", "raw", "name"),
+    [
+        (EXTENDED, '+ (0.001,0) [0|64.255] "m/s"', "", 0xFFFF, "not available in J1939"),
+        (EXTENDED, '+ (0.001,0) [0|64.255] "m/s"', "", 0xFE12, "error in J1939"),
+        (EXTENDED, '+ (0.0001,0) [0|0] "m/s"', J1939.format(EXTENDED), 0xFFFF, "not available in J1939"),
+        (535, '- (0.0001,0) [0|0] "m/s"', 'VAL_ 535 V_L -32768 "SNA" ;\nVAL_ 535 V_R -32768 "Error" ;', -32768, "SNA"),
+        (535, '+ (0.0001,0) [0|5] "m/s"', 'VAL_ 535 V_L 65535 "off" ;\nVAL_ 535 V_R 65535 "off" ;', 65535, "off"),
+    ],
+)
+def test_given_a_value_that_stands_for_none_then_it_is_missing_and_the_silence_says_why(
+    number: int, signal: str, more: str, raw: int, name: str
+) -> None:
+    data = (raw % 65536).to_bytes(2, "little") * 2 + bytes(4)
+    driver, found = speeds_of(make_dbc(signal, number, more), data, number)
+    assert not [each for each in found if isinstance(each, MeasuredSample)]
+    texts = [each.text for each in found if isinstance(each, EndpointStatus)]
+    assert sum(name in text and "that is no measurement" in text for text in texts) in (1, 2)
+    assert "received 100 frames: 100 x no value that can be used" in texts[-1]
+    assert name in texts[-1]
+    assert "check power" not in texts[-1]
+    assert driver.counts["rejected.reserved"] == 200
+
+
+def test_given_a_standard_frame_whose_highest_values_are_within_the_range_then_they_are_values() -> None:
+    _, found = speeds_of(make_dbc('+ (0.0001,0) [0|0] "m/s"'), b"\xff\xff" * 2 + bytes(4))
+    samples = [each.sample for each in found if isinstance(each, MeasuredSample)]
+    assert samples[0].wheels[0].speed == pytest.approx(6.5535)
 
 
 def test_given_speeds_that_the_vehicle_cannot_have_then_they_are_not_published() -> None:

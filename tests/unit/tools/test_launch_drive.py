@@ -10,7 +10,7 @@ from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, WheelsSample
 from msdrivers.emulate.wheels import WheelsEmulator
 from msdrivers.endpoint import HostTime
-from msdrivers.protocol.can.database import parse_dbc
+from msdrivers.protocol.can.dbc_file import parse_dbc
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_driver
 from mstools.launch.drive import make_simulation

@@ -1,10 +1,15 @@
-"""DBC databases (by cantools): bind signals by name, decode and encode frames, assemble the frames of one instant."""
+"""DBC databases (by cantools): bind signals by name, decode and encode frames, assemble the frames of one instant.
+
+The range that a DBC gives a signal is no authority: in public files every ninth is of raw values, of the other sign or
+made up. It bounds what is sent, and a received value outside it is used. Only what the file or J1939 reserves for
+"not available" or "error" is no value.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,24 +28,32 @@ from msdrivers.protocol.can.frame import CanFrame, FrameKey
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
 
-MAX_DBC_CHARS = 8 << 20
-"""Largest DBC file in characters."""
+_UNUSED_FIX = "correct it, or leave it: the other messages can be used"
 
-_WRONG_FILE_FIX = "is this the DBC file of the vehicle, saved as plain text?"
-_LINE = re.compile(r"at line (\d+)")
+_NO_VALUE = re.compile(
+    r"not? ?(?:available|avail|valid|defined|data|signal)|invalid|\b(?:sna|na|n/a|error|fault|failure|undefined)\b",
+    re.IGNORECASE,
+)
+"""Names in a value table that stand for no measurement."""
+
+_J1939_NAMES = {0xFF: "not available", 0xFE: "error"}
+"""By the highest byte of a number of a byte and more: SAE J1939-71, 5.1.4."""
 
 
 class FrameError(ModelServerError, ValueError):
-    """A frame that does not match the DBC; `reason` is the counter's name."""
+    """A frame that does not match the DBC; `reason` is the counter's name, `summary` what is wrong in a few words."""
 
-    def __init__(self, reason: str, message: str):
-        self.reason = reason
+    def __init__(self, reason: str, message: str, summary: str = ""):
+        self.reason, self.summary = reason, summary
         super().__init__(message)
 
 
 @dataclass(frozen=True, slots=True)
 class BoundSignal:
-    """A signal of the database; `minimum` and `maximum` are physical values, infinite without limits."""
+    """A signal of the database; `minimum` and `maximum` are physical values, infinite without limits.
+
+    names: of raw values, by the file's value table. is_j1939: the file states that protocol for the frame.
+    """
 
     key: FrameKey
     message: str
@@ -52,12 +65,40 @@ class BoundSignal:
     offset: float
     minimum: float
     maximum: float
+    unit: str = ""
+    names: Mapping[int, str] = field(default_factory=dict)
+    is_j1939: bool = False
+
+    @property
+    def path(self) -> str:
+        """`Message.Signal`."""
+        return f"{self.message}.{self.name}"
 
     def to_physical(self, raw: float) -> float | None:
-        """Return the physical value of raw bits; None (missing) if it is non-finite or outside the DBC's range."""
+        """Return the physical value of raw bits; None (missing) if it is not finite, or reserved."""
         value = raw * self.scale + self.offset
-        slack = 1e-6 * abs(self.scale)
-        return value if isfinite(value) and self.minimum - slack <= value <= self.maximum + slack else None
+        return value if isfinite(value) and not self.find_reserved(raw) else None
+
+    def is_outside(self, raw: float) -> bool:
+        """Return whether the physical value of raw bits is outside the file's range."""
+        value, slack = raw * self.scale + self.offset, 1e-6 * abs(self.scale)
+        return not self.minimum - slack <= value <= self.maximum + slack
+
+    def find_reserved(self, raw: float) -> str:
+        """Return what raw bits stand for if that is no value, by the file's value table or by J1939; else nothing.
+
+        A file seldom states the protocol: frames with 29-bit identifiers are J1939's where the value is outside the
+        range, too.
+        """
+        if self.is_float or not isfinite(raw):
+            return ""
+        name = self.names.get(int(raw), "")
+        if name and (self.is_outside(raw) or _NO_VALUE.search(name)):
+            return name
+        if self.length < 8 or self.is_signed or not (self.is_j1939 or (self.key.is_extended and self.is_outside(raw))):
+            return ""
+        reserved = _J1939_NAMES.get(int(raw) >> (self.length - 8))
+        return f"{reserved} in J1939" if reserved else ""
 
     def to_raw(self, physical: float) -> int:
         """Return the raw bits nearest to a physical value, clamped to the signal's length and the DBC's range."""
@@ -72,11 +113,22 @@ class BoundSignal:
 
 @dataclass(frozen=True, slots=True)
 class CanDatabase:
-    """The messages of a DBC file called `name`."""
+    """The messages of a DBC file called `name`.
+
+    flaws: what is wrong with the messages that cannot be used, by name, as errors; with anything else, as warnings
+    under "".
+    """
 
     name: str
     messages: Mapping[str, Message] = field(repr=False)
     by_key: Mapping[FrameKey, Message] = field(repr=False)
+    flaws: Mapping[str, tuple[Problem, ...]] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """What is wrong with the file, none of which affects a signal that could be bound."""
+        found = dict.fromkeys(each for several in self.flaws.values() for each in several)
+        return tuple(replace(each, severity=Severity.WARNING, fix=_UNUSED_FIX) for each in found)
 
     def decode(self, frame: CanFrame) -> dict[str, float]:
         """Decode a frame to the raw value of each signal by name.
@@ -92,6 +144,7 @@ class CanDatabase:
                 f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
                 f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
                 f"identifier",
+                f"with {len(frame.data)} bytes instead of {message.length}",
             )
         from cantools.database.errors import Error
 
@@ -100,9 +153,13 @@ class CanDatabase:
                 frame.data, decode_choices=False, scaling=False, allow_truncated=False, allow_excess=False
             )
         except Error as error:
-            raise FrameError("multiplexer", f"frame {frame.key} ({message.name}): {error}") from None
+            raise FrameError(
+                "multiplexer", f"frame {frame.key} ({message.name}): {error}", "with an unknown multiplexer"
+            ) from None
         except (ValueError, KeyError, OverflowError) as error:
-            raise FrameError("bits", f"frame {frame.key} ({message.name}): {error}") from None
+            raise FrameError(
+                "bits", f"frame {frame.key} ({message.name}): {error}", "with bits that are no number"
+            ) from None
         return {name: value for name, value in values.items() if isinstance(value, int | float)}
 
     def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:
@@ -115,37 +172,6 @@ class CanDatabase:
         """Return the signals of a message by name. Raises KeyError for an unknown message."""
         found = self.messages[message]
         return {signal.name: _bind_signal(found, signal) for signal in found.signals}
-
-
-def parse_dbc(text: str, name: str) -> CanDatabase:
-    """Parse the text of a DBC file called `name`. Raises ConfigError with the line."""
-    from cantools.database import load_string
-    from cantools.database.can import Database
-    from cantools.database.errors import UnsupportedDatabaseFormatError
-
-    if len(text) > MAX_DBC_CHARS:
-        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Location(name), _WRONG_FILE_FIX)])
-    try:
-        database = load_string(text, "dbc")
-    except UnsupportedDatabaseFormatError as error:
-        line = _LINE.search(str(error))
-        message = f"not a DBC file that can be read: {quote(str(error.e_dbc or error), 100)}"
-        problem = Problem(Severity.ERROR, message, Location(name, int(line[1]) if line else 0), _WRONG_FILE_FIX)
-        raise ConfigError([problem]) from None
-    assert isinstance(database, Database)
-    messages = {message.name: message for message in database.messages}
-    by_key: dict[FrameKey, Message] = {}
-    problems = []
-    for found in database.messages:
-        key = FrameKey(found.frame_id, found.is_extended_frame)
-        other = by_key.setdefault(key, found)
-        if other is not found:
-            fix = "keep the one that the controller uses"
-            text = f"messages {other.name} and {found.name} have one identifier, {key}"
-            problems.append(Problem(Severity.ERROR, text, Location(name), fix))
-    if problems:
-        raise ConfigError(problems)
-    return CanDatabase(name, messages, by_key)
 
 
 class SignalBinder:
@@ -163,6 +189,9 @@ class SignalBinder:
         `whole`: it must be an integer of at most `bits` bits.
         """
         message_name, _, name = path.partition(".")
+        if message_name in self._database.flaws:
+            self.problems += self._database.flaws[message_name]
+            return None
         message = self._database.messages.get(message_name)
         if message is None:
             form = f"{{}}.{name}" if name else "{}"
@@ -214,6 +243,9 @@ def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
         float(signal.offset),
         -inf if signal.minimum is None else float(signal.minimum),
         inf if signal.maximum is None else float(signal.maximum),
+        signal.unit or "",
+        {int(number): str(name) for number, name in (signal.choices or {}).items()},
+        message.protocol == "j1939",
     )
 
 
