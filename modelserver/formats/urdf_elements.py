@@ -3,6 +3,7 @@ inertials."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -95,6 +96,10 @@ class UrdfElement(ElementReader):
         return value or None
 
 
+LARGEST_ANGLE = 2.0 * math.pi + 0.01
+"""Radians beyond which an angle was hardly written as such; from 4 on also whole numbers."""
+
+
 def read_origin(parts: dict[str, UrdfElement]) -> Pose | None:
     """Read the pose of an <origin>, the identity for none; roll, pitch, yaw are in radians."""
     at = parts.get("origin")
@@ -108,6 +113,12 @@ def read_origin(parts: dict[str, UrdfElement]) -> Pose | None:
     angles = at.read_numbers("rpy", 3, (0.0, 0.0, 0.0))
     if position is None or angles is None or not at.check_position(position):
         return None
+    degrees = [angle for angle in angles if abs(angle) > LARGEST_ANGLE or (abs(angle) >= 4.0 and angle.is_integer())]
+    if degrees:
+        at.warning(
+            f"rpy is in radians, and {degrees[0]:g} rad looks like degrees",
+            f"write {math.radians(degrees[0]):.6g} if {degrees[0]:g} deg are meant",
+        )
     return Pose.from_rpy(position, *angles)
 
 
@@ -205,9 +216,13 @@ def read_inertial(at: UrdfElement) -> RigidInertia | None:
         at.error(f"the inertia is out of reach: {quote(mass_text)} kg", "look for a slip")
         return None
     fault = found.find_problem()
+    if mass < 0.0:
+        parts["mass"].error(fault, "look for a wrong sign, or remove <inertial> if it is not known")
+        return None
     if fault and not mass > 0.0:
         parts["mass"].warning(f"{fault}; ignored", "remove <inertial> if it is not known")
         return None
-    if fault:
+    # what no body can have is an error of the model
+    if fault and not found.find_error():
         parts["inertia"].warning(fault, "look for a wrong digit or a wrong unit (kg m2)")
     return found

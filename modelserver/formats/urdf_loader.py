@@ -90,7 +90,9 @@ class _UrdfReader:
             texts = [str(value) for key, value in element.items() if at_work or str(key) not in _NAME_ATTRIBUTES]
             variable = next((text for text in texts if "${" in text or "$(" in text), None)
             if macro or variable is not None:
-                what = f"<xacro:{label(get_tag(element))}>" if macro else quote(variable or "", 60)
+                what = (
+                    f"<xacro:{label(get_tag(element).removeprefix('xacro:'))}>" if macro else quote(variable or "", 60)
+                )
                 message = f"{what} is to be replaced by xacro: this is the source of a URDF file"
                 self.root.enter(element, "").error(message, "run xacro first: xacro FILE > robot.urdf")
                 return True

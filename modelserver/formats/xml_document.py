@@ -2,6 +2,9 @@
 
 A DOCTYPE with declarations of its own, or with a reference to a DTD, is rejected before parsing (external entities,
 exponential expansion), and again after it, for encodings in which the first search cannot see it.
+
+ROS's own parser (TinyXML) reads a URDF that breaks some rules of XML without effect on its elements: what it reads is
+read here, too, with a warning.
 """
 
 from __future__ import annotations
@@ -20,6 +23,11 @@ if TYPE_CHECKING:
     from lxml.etree import _Element as Element
 
 _BEFORE_DOCTYPE = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s+|<\?(?s:.*?)\?>|<!--(?s:.*?)-->)*+")
+
+_NO_ELEMENT = re.compile(r"<!--.*?-->|<\?.*?\?>", re.DOTALL)
+_BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9A-Fa-f]+);)")
+_PASSED_OVER = frozenset({"NS_ERR_UNDEFINED_NAMESPACE", "ERR_LT_IN_ATTRIBUTE", "ERR_DOCUMENT_END"})
+"""Errors of libxml2 that TinyXML does not have: an undeclared prefix, < in a value, text after the last element."""
 
 _DOCTYPE_FIX = "remove the DOCTYPE line, or leave it bare: <!DOCTYPE MiroConfigDocument>"
 
@@ -42,9 +50,13 @@ def parse(content: bytes, builder: ModelBuilder, file: str) -> Element | None:
         # the first entry is the cause; the exception's own log is shared with other parsers
         log: Any = parser.error_log
         line, message = (log[0].line, log[0].message) if len(log) else (error.lineno or 0, str(error))
-        fix = "close every element and quote every value; an editor that knows XML shows the place"
-        at.error(f"the XML is not well-formed: {message.strip()}", fix, line)
-        return None
+        what = f"the XML is not well-formed: {message.strip()}"
+        root = _read_as_ros(content)
+        if root is None:
+            fix = "close every element and quote every value; an editor that knows XML shows the place"
+            at.error(what, fix, line)
+            return None
+        at.warning(f"{what}; it is read as ROS does", "correct it: other programs reject it", line)
     except ValueError as error:
         at.error(f"the XML cannot be read: {error}", "save it as UTF-8 text")
         return None
@@ -53,6 +65,26 @@ def parse(content: bytes, builder: ModelBuilder, file: str) -> Element | None:
         at.error("the DOCTYPE declares entities or names a DTD, which is rejected", _DOCTYPE_FIX)
         return None
     return root
+
+
+def _read_as_ros(content: bytes) -> Element | None:
+    """Return the root of a URDF whose flaws ROS's parser passes over; None if it has others, or is no URDF."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    # what is no element: its flaws do not count, its lines do
+    text = _NO_ELEMENT.sub(lambda found: "\n" * found[0].count("\n"), text)
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, recover=True)
+    try:
+        root: Any = etree.fromstring(_BARE_AMPERSAND.sub("&amp;", text).encode(), parser)
+    except (etree.XMLSyntaxError, ValueError):
+        return None
+    entries: Any = parser.error_log
+    if root is None or get_tag(root) != "robot" or any(each.type_name not in _PASSED_OVER for each in entries):
+        return None
+    found: Element = root
+    return found
 
 
 def _is_doctype_rejected(content: bytes, builder: ModelBuilder, file: str) -> bool:

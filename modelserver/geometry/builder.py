@@ -274,6 +274,11 @@ class _ModelReview:
                 body = replace(body, inertia=draft.inertia)
             except ValueError as error:
                 self.report(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
+            if fault := body.find_inertia_error():
+                self.report(
+                    f"{label}: {fault}", draft.source, "look for a wrong sign or digit, or leave the inertia out"
+                )
+                body = replace(body, inertia=None)
             valid[draft.name] = body
         if not valid and not self.has_errors:
             # not after an error: it is the cause

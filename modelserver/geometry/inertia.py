@@ -63,14 +63,35 @@ class RigidInertia(NamedTuple):
         """
         if not self.mass > 0.0:
             return f"the mass is {self.mass:g} kg; it must be positive"
-        inertia = np.asarray(self.about_center, dtype=float)
-        least, middle, greatest = (float(value) for value in np.linalg.eigvalsh((inertia + inertia.T) / 2.0))
-        moments = f"the principal moments of inertia are {least:.4g}, {middle:.4g} and {greatest:.4g} kg m2"
+        least, middle, greatest = self._find_moments()
+        moments = _format_moments(least, middle, greatest)
         if not least > 0.0:
             return f"{moments}; all must be positive"
         if greatest > (least + middle) * (1.0 + MOMENT_TOLERANCE):
             return f"{moments}; none can be greater than the sum of the other two"
         return ""
+
+    def find_error(self) -> str:
+        """Return what is certainly wrong, "" for nothing: a negative mass, or a negative moment.
+
+        A moment of 0, or one greater than the sum of the others, stands in many files, and computes.
+        """
+        if self.mass < 0.0:
+            return f"the mass is {self.mass:g} kg; it must be positive"
+        least, middle, greatest = self._find_moments()
+        if least < -MOMENT_TOLERANCE * max(greatest, -least):
+            return f"{_format_moments(least, middle, greatest)}; no body has a negative one"
+        return ""
+
+    def _find_moments(self) -> tuple[float, float, float]:
+        """Return the principal moments, the least first."""
+        inertia = np.asarray(self.about_center, dtype=float)
+        least, middle, greatest = (float(value) for value in np.linalg.eigvalsh((inertia + inertia.T) / 2.0))
+        return least, middle, greatest
+
+
+def _format_moments(least: float, middle: float, greatest: float) -> str:
+    return f"the principal moments of inertia are {least:.4g}, {middle:.4g} and {greatest:.4g} kg m2"
 
 
 def from_spatial_inertia(matrix: Sequence[Sequence[float]]) -> RigidInertia | None:

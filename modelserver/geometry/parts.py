@@ -114,6 +114,11 @@ class Body:
         found = None if self.inertia is None else spatial_inertia.from_spatial_inertia(self.inertia)
         return None if found is None else found.center
 
+    def find_inertia_error(self) -> str:
+        """Return why no body can have the inertia, "" if one may."""
+        found = None if self.inertia is None else spatial_inertia.from_spatial_inertia(self.inertia)
+        return "" if found is None else found.find_error()
+
     def frame(self, name: str) -> BodyFrame:
         """Return the frame of that name. Raises UnknownFrameError with the nearest names."""
         found = self._by_name.get(name)

@@ -248,7 +248,7 @@ J1939 = (
         (535, '+ (0.0001,0) [0|5] "m/s"', 'VAL_ 535 V_L 65535 "off" ;\nVAL_ 535 V_R 65535 "off" ;', 65535, "off"),
     ],
 )
-def test_given_a_value_that_stands_for_none_then_it_is_missing_and_the_silence_says_why(
+def test_given_a_value_that_stands_for_none_then_it_is_missing_and_the_silence_is_explained(
     number: int, signal: str, more: str, raw: int, name: str
 ) -> None:
     data = (raw % 65536).to_bytes(2, "little") * 2 + bytes(4)

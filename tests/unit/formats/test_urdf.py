@@ -147,7 +147,6 @@ def test_a_bad_file_has_an_error_with_place_and_fix(old, new, message, fix, elem
     [
         ('<link name="mast"/>', '<link name="mast"/><lnk/>', "unknown element <lnk>; ignored"),
         ('value="40"', 'value="0"', "the mass is 0 kg; it must be positive; ignored"),
-        ('ixx="2"', 'ixx="-2"', "all must be positive"),
         ('izz="4"', 'izz="40"', "none can be greater than the sum of the other two"),
         ('lower="-1.5" upper="1.5" ', "", "the joint cannot move"),
         ('<box size="1 0.5 0.2"/>', "<bax/>", "geometry bax is not known; ignored"),
@@ -242,3 +241,86 @@ def test_a_file_of_yaml_becomes_urdf():
     saved = save_model(read(YAML), "urdf")
     assert saved.unsupported == ("frames but as links of their own; written Cart:Mast as Cart.Mast",)
     assert read(saved.text).get_body_list() == ["Cart", "Camera", "Cart.Mast"]
+
+
+ROBOT = '<robot name="r">\n<link name="a"/>\n<link name="b"/>\n{}<joint name="j" type="fixed"><parent link="a"/>'
+ROBOT += '<child link="b"/><origin xyz="0.1 0 0.2"/></joint>\n</robot>\n'
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ('\n<?xml version="1.0"?>\n' + ROBOT.format(""), 2),
+        ('<!-- made by hand -->\n<?xml version="1.0"?>\n' + ROBOT.format(""), 2),
+        ('<?xml version="0.0" ?>\n' + ROBOT.format(""), 1),
+        ('<?xml version="1.0" encoding="utf8mb4"?>\n' + ROBOT.format(""), 1),
+        (ROBOT.format('<gazebo><sensor:camera name="c"/></gazebo>\n'), 4),
+        (ROBOT.format("<!-- a -- b --->\n"), 4),
+        (ROBOT.format('<gazebo note="a & b &nbsp; c < d"/>\n'), 4),
+        (ROBOT.format("<!-- \u00e9 -->\n").encode("latin-1"), 4),
+        (ROBOT.format("") + "done\n", 6),
+    ],
+    ids=["blank", "comment", "version", "encoding", "prefix", "hyphens", "ampersand", "latin_1", "text_after"],
+)
+def test_a_file_that_ros_reads_is_read_with_a_warning(content, line):
+    model = read(content)
+    assert pose_at(model, "b:Origin", "a:Origin", {}).is_close(Pose((0.1, 0, 0.2)))
+    (problem,) = [each for each in model.problems if each.severity is Severity.WARNING]
+    assert "not well-formed" in problem.message
+    assert "as ROS does" in problem.message
+    assert problem.line == line
+
+
+@pytest.mark.parametrize(
+    "flaw", ['<link name="c">', "<link name=c/>", '<link name="c" name="d"/>', '<link name="c"a="b"/>']
+)
+def test_a_file_that_ros_rejects_is_an_error(flaw):
+    assert "not well-formed" in only_problem(ROBOT.format(flaw)).message
+
+
+def test_the_source_of_a_file_is_no_file_with_an_undeclared_prefix():
+    *_, last = problems_of(ROBOT.format('<xacro:include filename="a.xacro"/>'))
+    assert last.severity is Severity.ERROR
+    assert "<xacro:include>" in last.message
+    assert "run xacro first" in last.fix
+
+
+@pytest.mark.parametrize(
+    ("mass", "moments", "message"),
+    [
+        ("0.5", "0.001 -0.0002 0.001", "no body has a negative one"),
+        ("0.5", "-1 -1 -1", "no body has a negative one"),
+        ("-0.5", "1 1 1", "the mass is -0.5 kg"),
+    ],
+)
+def test_an_inertia_that_no_body_can_have_is_an_error_that_names_the_link(mass, moments, message):
+    xx, yy, zz = moments.split()
+    inertia = f'<inertia ixx="{xx}" ixy="0" ixz="0" iyy="{yy}" iyz="0" izz="{zz}"/>'
+    link = f'<link name="b"><inertial><mass value="{mass}"/>{inertia}</inertial></link>'
+    problem = only_problem(ROBOT.format("").replace('<link name="b"/>', link))
+    assert problem.severity is Severity.ERROR
+    assert message in problem.message
+    assert "link b" in problem.element
+
+
+def test_a_negative_moment_in_yaml_or_in_a_program_is_an_error():
+    rows = [[1.0 if a == b else 0.0 for a in range(6)] for b in range(6)]
+    rows[4][4] = -0.1
+    builder = ModelBuilder()
+    builder.add_body("Arm", inertia=tuple(map(tuple, rows))).add_frame("Origin")
+    with pytest.raises(GeometryError, match=r"'Arm'.*no body has a negative one"):
+        builder.build()
+
+
+@pytest.mark.parametrize("angle", ["90", "-45", "5", "6.5", "1e3"])
+def test_angles_that_look_like_degrees_are_a_warning(angle):
+    model = read(ROBOT.format("").replace('xyz="0.1 0 0.2"', f'rpy="0 0 {angle}"'))
+    (problem,) = [each for each in model.problems if each.severity is Severity.WARNING]
+    assert f"{float(angle):g} rad looks like degrees" in problem.message
+    assert f"write {math.radians(float(angle)):.6g}" in problem.fix
+
+
+@pytest.mark.parametrize("angle", ["3", "3.14159", "-4.712389", "6.2831853", "6.28"])
+def test_angles_within_a_turn_are_none(angle):
+    model = read(ROBOT.format("").replace('xyz="0.1 0 0.2"', f'rpy="0 0 {angle}"'))
+    assert [each for each in model.problems if each.severity is Severity.WARNING] == []
