@@ -110,6 +110,8 @@ class SensorConfig:
     """Frame at which it is mounted, `Body:Frame`."""
     latency: float = 0.0
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
+    publisher: str = ""
+    """The `header.source` of its samples, which others on the channel do not displace; empty: a driver of this file."""
 
     def __post_init__(self) -> None:
         _check(self, channel="channel")
@@ -183,6 +185,8 @@ class WheelsConfig:
     """Channel of its samples."""
     frames: dict[str, str] = field(default_factory=dict)
     """For each wheel's name the frame of its contact point."""
+    publisher: str = ""
+    """The `header.source` of its samples, which others on the channel do not displace; empty: a driver of this file."""
     kinematics: Literal["skid_steer", "differential", "ackermann"] = "differential"
     """How the vehicle turns. `skid_steer`: its sides roll at different speeds and wheels slip sideways, so only the
     mean of all is used; `differential` and `ackermann`: each wheel rolls in its direction, straight ahead or as it is

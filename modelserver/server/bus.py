@@ -24,7 +24,7 @@ from collections.abc import Callable
 from typing import Final, Literal, Protocol, TypeAlias
 
 from modelserver.wire.provider import open_lcm, resolve_url
-from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, open_receiver
+from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, Sender, open_receiver
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +87,12 @@ SENSOR_QUEUE_BYTES: Final = 4 << 20
 REQUEST_QUEUE_BYTES: Final = 1 << 20
 """Bytes that wait on a channel at most: 20,000 samples of wheels. Requests wait in the receive buffer, or in liblcm."""
 
-Handler: TypeAlias = Callable[[str, bytes], None]
+MAX_SAMPLE_BYTES: Final = 1 << 20
+MAX_REQUEST_BYTES: Final = 4 << 20
+"""Longest messages that are received: a message of 15 MB would cost several ticks before it is rejected."""
+
+Handler: TypeAlias = Callable[[str, bytes, Sender], None]
+"""Channel, data, and who has sent it."""
 
 Inboxes: TypeAlias = Literal["samples", "requests", "both"]
 
@@ -97,6 +102,9 @@ class Inbox(Protocol):
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
+
+    def pop_refused(self) -> dict[str, int]:
+        """Return how many messages were too long since the last call, by channel."""
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
@@ -168,6 +176,15 @@ class ReceiverInbox:
         self.expected = 0
         self._receiver.close()
 
+    def pop_refused(self) -> dict[str, int]:
+        """See `Inbox`."""
+        refused = self._receiver.refused
+        if not refused:
+            return {}
+        found = {channel.decode("utf-8", "replace"): count for channel, count in refused.items()}
+        refused.clear()
+        return found
+
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """See `Inbox`."""
         expected, self.expected = self.expected, None
@@ -193,7 +210,7 @@ class ReceiverInbox:
         if known is not None:
             channel, handlers = known
             for handler in handlers:
-                handler(channel, message[1])
+                handler(channel, message[1], message[2])
         return 1
 
     def _pop(self) -> Message:
@@ -219,8 +236,8 @@ class LcmBus:
     def __init__(self, url: str = ""):
         self.url = resolve_url(url)
         self.publish = open_lcm(self.url).publish
-        self.sensors = ReceiverInbox(open_receiver(self.url, SENSOR_QUEUE_BYTES), SENSOR_QUEUE_BYTES)
-        self.requests = ReceiverInbox(open_receiver(self.url, REQUEST_QUEUE_BYTES))
+        self.sensors = ReceiverInbox(open_receiver(self.url, SENSOR_QUEUE_BYTES, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
+        self.requests = ReceiverInbox(open_receiver(self.url, REQUEST_QUEUE_BYTES, MAX_REQUEST_BYTES))
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)

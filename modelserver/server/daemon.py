@@ -103,6 +103,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         channel_prefix=config.lcm.channel_prefix,
         limits=config.limits,
         publisher_conflict=config.sensors.publisher_conflict,
+        publishers=vehicle.list_publishers(),
         shared_channels=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))

@@ -7,6 +7,7 @@ from collections import deque
 
 from modelserver.server.bus import Handler, Inboxes
 from modelserver.server.clock import FakeClock
+from modelserver.wire.receiver import Sender
 
 
 class FakeInbox:
@@ -15,26 +16,30 @@ class FakeInbox:
     def __init__(self, clock: FakeClock) -> None:
         self._clock = clock
         self._handlers: dict[str, list[Handler]] = {}
-        self._queue: deque[tuple[str, bytes]] = deque()
+        self._queue: deque[tuple[str, bytes, Sender]] = deque()
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
         self._handlers.setdefault(channel, []).append(handler)
 
-    def put(self, channel: str, data: bytes) -> None:
+    def put(self, channel: str, data: bytes, sender: Sender = None) -> None:
         """Queue a message for the subscribers of its channel."""
         if channel in self._handlers:
-            self._queue.append((channel, data))
+            self._queue.append((channel, data, sender))
+
+    def pop_refused(self) -> dict[str, int]:
+        """None is too long."""
+        return {}
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """Handle the queued messages, at most `limit` and for at most `seconds`; return how many."""
         count = 0
         end_ns = self._clock.monotonic_ns() + seconds * 1e9
         while self._queue and count < limit and (not count or self._clock.monotonic_ns() < end_ns):
-            channel, data = self._queue.popleft()
+            channel, data, sender = self._queue.popleft()
             count += 1
             for handler in self._handlers[channel]:
-                handler(channel, data)
+                handler(channel, data, sender)
         return count
 
     @property

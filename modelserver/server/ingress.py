@@ -14,20 +14,22 @@ of a channel are recorded and counted one by one, the others are counted togethe
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Container, Hashable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final
 
 from modelserver.core import Instant
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
 from modelserver.errors import quote
-from modelserver.messages import Event, HealthWarning, Rejected, RelativePoseSample, Sample, SwitchMode
+from modelserver.messages import Event, HealthWarning, JointsSample, Rejected, RelativePoseSample, Sample, SwitchMode
 from modelserver.named_tuples import new_tuple
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog
-from modelserver.wire.codec import decode
+from modelserver.wire.codec import decode, encode
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME
 from modelserver.wire.journal import RecordKind
+from modelserver.wire.receiver import Sender
 
 _HEADER: Final = struct.Struct(">8sq24xqi")
 """Start of every sensor message: fingerprint, header.utime, header.seq, length of header.source, which follows.
@@ -139,8 +141,11 @@ class RejectionCounter:
             self._step(Rejected(channel, reason, count), now)
 
 
-MAX_PUBLISHERS: Final = 256
-"""Sources with a detector of their own on shared channels; a vehicle has a dozen."""
+MAX_JOINTS: Final = 4096
+"""Joints with a detector of their own."""
+
+MAX_WARNINGS: Final = 16
+"""Conflicts that are reported at once."""
 
 PUBLISHER_CONFLICT: Final = "publisher_conflict"
 """Reason under which samples of a second publisher are counted."""
@@ -157,6 +162,7 @@ class PublisherConflictMonitor:
     step: passes an event to the core.
     count: counts a sample that is used all the same, by channel and reason; an ignored one is counted by the caller.
     rule: `ignore`, `use`, or empty for no detection (`LoopSettings.publisher_conflict`).
+    names: the sources that the vehicle file names, by channel.
     """
 
     def __init__(
@@ -165,7 +171,9 @@ class PublisherConflictMonitor:
         count: Callable[[str, str, Instant], object],
         log: RateLimitedLog,
         rule: str,
+        names: Mapping[str, Container[str]] = MappingProxyType({}),
     ):
+        self._names = names
         self._step = step
         self._count = count
         self._log = log
@@ -173,43 +181,74 @@ class PublisherConflictMonitor:
         self._detectors: dict[tuple[str, str], PublisherConflictDetector] = {}
         self._active: dict[str, PublisherConflictDetector] = {}
 
+    def make_detector(self, channel: str) -> PublisherConflictDetector:
+        """Return a detector for a channel, which prefers the sources that the vehicle file names for it."""
+        return PublisherConflictDetector(self._names.get(channel, ()))
+
     def is_ignored(
-        self, channel: str, detector: PublisherConflictDetector | None, sample_id: SampleId, now: Instant
+        self,
+        channel: str,
+        detector: PublisherConflictDetector,
+        sample_id: SampleId,
+        now: Instant,
+        sender: Sender,
+        subject: str = "",
     ) -> bool:
         """Process a sample; return whether it is from a second publisher and to be ignored.
 
-        `detector` is that of the channel; None for a shared channel, where each source has one.
+        `subject`: what the warning names; empty: the channel.
         """
-        if detector is None:
-            key = (channel, sample_id.source)
-            detector = self._detectors.get(key)
-            if detector is None:
-                if len(self._detectors) >= MAX_PUBLISHERS:
-                    return False
-                detector = self._detectors[key] = PublisherConflictDetector()
-        if not detector.is_conflicting(sample_id, now.monotonic_ns):
+        is_second = detector.is_conflicting(sample_id, now.monotonic_ns, sender)
+        if not is_second and detector.conflict_ns != now.monotonic_ns:
             return False
-        if not self._ignore:
+        if is_second and not self._ignore:
             self._count(channel, PUBLISHER_CONFLICT, now)
-        if channel not in self._active:
-            self._active[channel] = detector
-            text = self._format_warning(channel, detector, (now.utime - sample_id.utime) * 1e-6)
-            self._step(HealthWarning(f"channel {channel}", text), now)
-            self._log.warning(f"{channel}:publisher_conflict", "%s", text)
-        return self._ignore
+        self._warn(subject or channel, channel, detector, sample_id, now)
+        return is_second and self._ignore
+
+    def select_joints(self, channel: str, data: bytes, sample_id: SampleId, now: Instant, sender: Sender) -> bytes:
+        """Process a message of joints, of which several drivers on one channel publish some each.
+
+        Returns the message without the joints that another publisher has; empty if it has them all. Raises WireError.
+        """
+        sample: JointsSample = decode("joints_t", data)
+        joints = tuple([each for each in sample.joints if self._has_joint(channel, each.name, sample_id, now, sender)])
+        if len(joints) == len(sample.joints):
+            return data
+        return encode(replace(sample, joints=joints)) if joints else b""
+
+    def _has_joint(self, channel: str, name: str, sample_id: SampleId, now: Instant, sender: Sender) -> bool:
+        """Process a joint of a message; return whether it is used."""
+        key = (channel, name)
+        detector = self._detectors.get(key)
+        if detector is None:
+            if len(self._detectors) >= MAX_JOINTS:
+                return True
+            detector = self._detectors[key] = self.make_detector(channel)
+        return not self.is_ignored(channel, detector, sample_id, now, sender, f"{channel} {name}")
+
+    def _warn(
+        self, subject: str, channel: str, detector: PublisherConflictDetector, sample_id: SampleId, now: Instant
+    ) -> None:
+        if subject in self._active or len(self._active) >= MAX_WARNINGS:
+            return
+        self._active[subject] = detector
+        text = self._format_warning(subject, detector, (now.utime - sample_id.utime) * 1e-6)
+        self._step(HealthWarning(f"channel {subject}", text), now)
+        self._log.warning(f"{channel}:publisher_conflict", "%s", text)
 
     def clear_expired(self, now: Instant) -> None:
         """Clear the warnings on conflicts that have ended."""
-        for channel, detector in list(self._active.items()):
+        for subject, detector in list(self._active.items()):
             if now.monotonic_ns - detector.conflict_ns > CONFLICT_TIMEOUT_NS:
-                del self._active[channel]
-                self._step(HealthWarning(f"channel {channel}"), now)
+                del self._active[subject]
+                self._step(HealthWarning(f"channel {subject}"), now)
 
-    def _format_warning(self, channel: str, detector: PublisherConflictDetector, age: float) -> str:
+    def _format_warning(self, subject: str, detector: PublisherConflictDetector, age: float) -> str:
         first, second = quote(detector.source, 40), quote(detector.other_source, 40)
         who = f"two publishers with source {first}" if first == second else f"sources {first} and {second}"
         done = "the second one is ignored" if self._ignore else "both are used (sensors.publisher_conflict)"
         old = (
             f" (its stamps are {age:,.0f} s old: a recording is played onto the bus?)" if age > RECORDING_AGE_S else ""
         )
-        return f"{who} publish on {channel} at once, and {done}{old}: stop one of them"
+        return f"{who} publish on {subject} at once, and {done}{old}: stop one of them"

@@ -25,12 +25,11 @@ from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import AllOutputs, CoreState, Instant
 from modelserver.core.commands import ModelLoaded
-from modelserver.core.publisher_conflict import PublisherConflictDetector
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.query.answers import DeferredAnswer
-from modelserver.server.bus import Bus
+from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock, TickTimer
 from modelserver.server.ingress import (
     PUBLISHER_CONFLICT,
@@ -46,6 +45,7 @@ from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifi
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
+from modelserver.wire.receiver import Sender
 from modelserver.wire.snapshot import split_snapshot
 
 log = logging.getLogger(__name__)
@@ -131,7 +131,8 @@ class LoopSettings:
     period_ns: between ticks.
     sensors: what each subscribed channel carries.
     publisher_conflict: what to do with samples of a second publisher; empty = no detection.
-    shared_channels: channels with several publishers.
+    shared_channels: those of joints, of which each has a publisher.
+    publishers: the sources that the vehicle file names, by channel.
     """
 
     period_ns: int
@@ -140,6 +141,7 @@ class LoopSettings:
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     publisher_conflict: Literal["", "ignore", "use"] = ""
     shared_channels: frozenset[str] = frozenset()
+    publishers: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
 
 class Loop:
@@ -166,7 +168,7 @@ class Loop:
         self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
         self._rejections = RejectionCounter(self.step, self._journal)
         self._conflicts = PublisherConflictMonitor(
-            self.step, self._rejections.count, self._log, settings.publisher_conflict
+            self.step, self._rejections.count, self._log, settings.publisher_conflict, settings.publishers
         )
         self._sensor_channels: set[str] = set()
         self._subscribe(settings.sensors)
@@ -247,6 +249,9 @@ class Loop:
         )
         self._conflicts.clear_expired(now)
         is_report_due = now.monotonic_ns >= self.state.health_due_ns
+        for inbox in (self._bus.sensors, self._bus.requests):
+            for channel, count in inbox.pop_refused().items():
+                self.step(messages.Rejected(channel, "too_long", count), now)
         self._rejections.flush(now, is_report_due)
         self._waiting_poses = []
         try:
@@ -287,20 +292,29 @@ class Loop:
                 self._sensor_channels.add(name)
                 self._bus.sensors.subscribe(name, self._make_sensor_handler(name, channel))
 
-    def _make_sensor_handler(self, name: str, sensor: SensorChannel) -> Callable[[str, bytes], None]:
-        detector = None if name in self._settings.shared_channels else PublisherConflictDetector()
+    def _make_sensor_handler(self, name: str, sensor: SensorChannel) -> Handler:
+        is_shared = name in self._settings.shared_channels
+        detector = self._conflicts.make_detector(name)
         # a channel of samples has one publisher; any client may command a mode
         is_monitored = sensor.type_name != MODE_TYPE and self._conflicts.is_enabled
         fingerprint = fingerprint_of(sensor.type_name)
 
-        def handle(channel: str, data: bytes) -> None:
+        def handle(channel: str, data: bytes, sender: Sender) -> None:
             try:
                 now = self._clock.now()
                 # before decoding, so that a flood of ignored samples costs little
                 sample_id = peek_sample_id(data, fingerprint) if is_monitored else None
-                if sample_id is not None and self._conflicts.is_ignored(channel, detector, sample_id, now):
-                    self._rejections.drop(RecordKind.DROPPED, channel, PUBLISHER_CONFLICT, data, now)
-                    return
+                if sample_id is not None and not is_shared:
+                    if self._conflicts.is_ignored(channel, detector, sample_id, now, sender):
+                        self._rejections.drop(RecordKind.DROPPED, channel, PUBLISHER_CONFLICT, data, now)
+                        return
+                elif sample_id is not None:
+                    left = self._conflicts.select_joints(channel, data, sample_id, now, sender)
+                    if not left:
+                        self._rejections.drop(RecordKind.DROPPED, channel, PUBLISHER_CONFLICT, data, now)
+                        return
+                    # what is left of it is what the journal replays
+                    data = left
                 event = sensor.decode(data)
                 if isinstance(event, messages.SwitchMode):
                     self._handle_mode_command(channel, event, now)

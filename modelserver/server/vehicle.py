@@ -213,15 +213,28 @@ class Vehicle:
             channels[name] = SensorChannel(MODE_TYPE)
         return channels
 
+    def list_publishers(self) -> dict[str, frozenset[str]]:
+        """Return the sources that the vehicle file names, by channel: those of its sensors, else its drivers."""
+        found: dict[str, frozenset[str]] = {}
+        for each in _list_sensors(self.config):
+            name = each.source or each.publisher
+            names = frozenset((name,)) if name else frozenset(self.config.drivers)
+            found[each.channel] = found.get(each.channel, frozenset()) | names
+        return found
+
 
 class _ConfiguredSensor(NamedTuple):
-    """A sensor of the vehicle file: its key below `sensors`, its channel with prefix, its samples, its source name."""
+    """A sensor of the vehicle file: its key below `sensors`, its channel with prefix, its samples, its source name.
+
+    publisher: the source that it is to have, if the file names one.
+    """
 
     key: str
     channel: str
     latency_us: int
     sample: type[messages.Sample]
     source: str = ""
+    publisher: str = ""
 
 
 def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
@@ -239,7 +252,9 @@ def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
         ),
     ]
     return [
-        _ConfiguredSensor(key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, source)
+        _ConfiguredSensor(
+            key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, source, getattr(each, "publisher", "")
+        )
         for key, each, sample, source in listed
         if each is not None
     ]

@@ -20,8 +20,8 @@ from __future__ import annotations
 import socket
 import struct
 import weakref
-from collections import deque
-from dataclasses import dataclass
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass, field
 from typing import Final, Protocol, TypeAlias
 
 import lcm
@@ -31,14 +31,27 @@ from modelserver.wire.provider import handle_message, make_bus_error, open_lcm
 from modelserver.wire.socket_filter import set_channel_filter
 from modelserver.wire.urls import UdpAddress, parse_udp_address
 
-Message: TypeAlias = tuple[bytes, bytes]
-"""Channel and data."""
+Sender: TypeAlias = tuple[str, int] | None
+"""Address of the socket that has sent a message, which identifies its program; None where liblcm receives."""
+
+Message: TypeAlias = tuple[bytes, bytes, Sender]
+"""Channel, data, and who has sent it."""
+
+
+MAX_PARTIAL_BYTES: Final = 1 << 24
+"""Received bytes of all messages of which fragments are missing. As in liblcm."""
+
+MAX_PARTIAL: Final = 256
+"""Messages of which fragments are missing. Beyond either limit the one that has waited longest for a fragment is
+dropped."""
 
 
 class Receiver(Protocol):
     """Queue of received messages. `fileno` is readable if one may have arrived."""
 
     fileno: int
+    refused: Counter[bytes]
+    """Messages that are too long, by channel."""
 
     def subscribe(self, channel: str) -> None:
         """Receive the messages of a channel too."""
@@ -50,13 +63,16 @@ class Receiver(Protocol):
         """Leave the bus."""
 
 
-def open_receiver(url: str, queue_bytes: int = 1 << 20) -> Receiver:
-    """Join the bus to receive; `queue_bytes` per channel is what liblcm may queue. Raises BusError with hints."""
+def open_receiver(url: str, queue_bytes: int = 1 << 20, max_bytes: int = MAX_PARTIAL_BYTES) -> Receiver:
+    """Join the bus to receive. Raises BusError with hints.
+
+    `queue_bytes` per channel is what liblcm may queue; longer messages than `max_bytes` are refused.
+    """
     address = parse_udp_address(url)
     if address is None:
-        return LcmReceiver(url, queue_bytes)
+        return LcmReceiver(url, queue_bytes, max_bytes)
     try:
-        return UdpReceiver(address)
+        return UdpReceiver(address, max_bytes)
     except OSError as error:
         raise make_bus_error(url, error) from None
 
@@ -74,9 +90,6 @@ MAX_PACKET: Final = 1 << 16
 BUFFER_BYTES: Final = 4 << 20
 """Receive buffer that is requested if the URL has no recv_buf_size: messages wait there while one is handled."""
 
-MAX_PARTIAL_BYTES: Final = 1 << 24
-"""Bytes of all messages of which fragments are missing; the oldest one is dropped for a new one. As in liblcm."""
-
 MAX_IGNORED: Final = 64
 """Packets without a message that one call of `receive` reads, so that a flood of them does not hold it."""
 
@@ -84,66 +97,98 @@ MAX_IGNORED: Final = 64
 @dataclass(slots=True)
 class _PartialMessage:
     sequence: int
+    size: int
+    count: int
     channel: bytes
-    data: bytearray
-    missing: int
+    parts: dict[int, tuple[int, bytes]] = field(default_factory=dict)
+    """Offset and data of the fragments that have arrived, by number."""
+    received: int = 0
 
 
 class FragmentAssembler:
-    """Assembles long messages from their fragments; one of each sender at a time."""
+    """Assembles long messages from their fragments; one of each sender at a time.
 
-    def __init__(self) -> None:
+    Memory is that of the fragments that have arrived: to begin a long message costs no more than its first one.
+    """
+
+    def __init__(self, max_bytes: int = MAX_PARTIAL_BYTES) -> None:
         self.channels: set[bytes] = set()
         """Channels whose messages are assembled."""
-        self._partial: dict[object, _PartialMessage] = {}
+        self.refused: Counter[bytes] = Counter()
+        """Messages longer than `max_bytes`, by channel."""
+        self.partial_bytes = 0
+        """Received bytes of all messages of which fragments are missing."""
+        self._max_bytes = max_bytes
+        self._partial: OrderedDict[Sender, _PartialMessage] = OrderedDict()
 
-    def add(self, sender: object, packet: bytes) -> Message | None:
+    def add(self, sender: Sender, packet: bytes) -> Message | None:
         """Process a fragment; return the message that it completes, None if it completes none."""
         if len(packet) < _FRAGMENT_HEADER.size:
             return None
         _, sequence, size, offset, number, count = _FRAGMENT_HEADER.unpack_from(packet)
         partial = self._partial.get(sender)
-        if partial is not None and (partial.sequence, len(partial.data)) != (sequence, size):
-            del self._partial[sender]  # its other fragments are lost
+        if partial is not None and (partial.sequence, partial.size, partial.count) != (sequence, size, count):
+            self._drop(sender)  # its other fragments are lost
             partial = None
         start = _FRAGMENT_HEADER.size
         if number == 0:
             end = packet.find(0, start)
-            channel = packet[start:end]
-            if partial is None and end > start and channel in self.channels and size <= MAX_PARTIAL_BYTES:
-                self._make_room(size)
-                partial = self._partial[sender] = _PartialMessage(sequence, channel, bytearray(size), count)
+            if partial is None and end > start:
+                partial = self._begin(sender, packet[start:end], sequence, size, count)
             start = end + 1
         if partial is None:
             return None
+        self._partial.move_to_end(sender)
         length = len(packet) - start
-        if offset + length > size:
-            del self._partial[sender]
+        if offset + length > size or number >= count:
+            self._drop(sender)
             return None
-        partial.data[offset : offset + length] = packet[start:]
-        partial.missing -= 1
-        if partial.missing > 0:
+        if number in partial.parts:
             return None
-        del self._partial[sender]
-        return partial.channel, bytes(partial.data)
+        partial.parts[number] = (offset, packet[start:])
+        partial.received += length
+        self.partial_bytes += length
+        if len(partial.parts) == count:
+            self._drop(sender)
+            return _join(partial, sender)
+        while len(self._partial) > MAX_PARTIAL or self.partial_bytes > MAX_PARTIAL_BYTES:
+            self._drop(next(iter(self._partial)))
+        return None
 
-    @property
-    def partial_bytes(self) -> int:
-        """Bytes of all messages of which fragments are missing."""
-        return sum(len(each.data) for each in self._partial.values())
+    def _begin(self, sender: Sender, channel: bytes, sequence: int, size: int, count: int) -> _PartialMessage | None:
+        if channel not in self.channels:
+            return None
+        if size > self._max_bytes:
+            self.refused[channel] += 1
+            return None
+        partial = self._partial[sender] = _PartialMessage(sequence, size, count, channel)
+        return partial
 
-    def _make_room(self, size: int) -> None:
-        while self._partial and self.partial_bytes + size > MAX_PARTIAL_BYTES:
-            del self._partial[next(iter(self._partial))]
+    def _drop(self, sender: Sender) -> None:
+        self.partial_bytes -= self._partial.pop(sender).received
+
+
+def _join(partial: _PartialMessage, sender: Sender) -> Message | None:
+    """Return a message of which all fragments are there; None if they leave a gap, or overlap."""
+    at = 0
+    for number in range(partial.count):
+        offset, data = partial.parts[number]
+        if offset != at:
+            return None
+        at += len(data)
+    if at != partial.size:
+        return None
+    return partial.channel, b"".join(partial.parts[number][1] for number in range(partial.count)), sender
 
 
 class UdpReceiver:
     """Receiver on a multicast group, whose queue is the socket's receive buffer. Raises OSError."""
 
-    def __init__(self, address: UdpAddress):
+    def __init__(self, address: UdpAddress, max_bytes: int = MAX_PARTIAL_BYTES):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         weakref.finalize(self, self._socket.close)
-        self._assembler = FragmentAssembler()
+        self._assembler = FragmentAssembler(max_bytes)
+        self.refused = self._assembler.refused
         try:
             set_channel_filter(self._socket, ())  # before the first packet
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -177,7 +222,7 @@ class UdpReceiver:
                 end = packet.find(0, _CHANNEL_AT)
                 channel = packet[_CHANNEL_AT:end]
                 if end > 0 and channel in self._assembler.channels:
-                    return channel, packet[end + 1 :]
+                    return channel, packet[end + 1 :], sender
             elif magic == _FRAGMENT:
                 message = self._assembler.add(sender, packet)
                 if message is not None:
@@ -231,8 +276,10 @@ class LcmReceiver:
     one in messages by a moving average of their length. Beyond it liblcm drops messages.
     """
 
-    def __init__(self, url: str, queue_bytes: int):
+    def __init__(self, url: str, queue_bytes: int, max_bytes: int = MAX_PARTIAL_BYTES):
         self._bus = open_lcm(url)
+        self._max_bytes = max_bytes
+        self.refused: Counter[bytes] = Counter()
         self._queue_bytes = queue_bytes
         self._subscriptions: list[lcm.LCMSubscription] = []
         self.fileno = self._bus.fileno()
@@ -243,9 +290,13 @@ class LcmReceiver:
         limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
         # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
         received, subscriptions, name = self._received, self._subscriptions, channel.encode()
+        refused, max_bytes = self.refused, self._max_bytes
 
         def handle(_: str, data: bytes) -> None:
-            received.append((name, data))
+            if len(data) > max_bytes:
+                refused[name] += 1
+            else:
+                received.append((name, data, None))
             if limit.update(len(data)):
                 subscriptions[index].set_queue_capacity(limit.capacity)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 
 import lcm
@@ -18,7 +18,7 @@ from modelserver.server.bus import SENSOR_QUEUE_BYTES, Bus, Inbox, LcmBus, Recei
 from modelserver.server.clock import Clock, FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.wire.channels import CHANNELS
-from modelserver.wire.receiver import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, MIN_QUEUED, Message, QueueLimit
+from modelserver.wire.receiver import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, MIN_QUEUED, Message, QueueLimit, Sender
 
 ODD_CHANNELS = ["A.B", "A*", "A+", "(A)", "[A]", "A|B", "A-B", "^A$", "A{2}", "A?", "A\\B", "A/B", "#A", "A B", "."]
 
@@ -32,7 +32,7 @@ class Rig:
         self.received: list[tuple[str, bytes]] = []
 
     def subscribe(self, channel: str, inbox: Inbox | None = None) -> None:
-        (inbox or self.bus.sensors).subscribe(channel, lambda name, data: self.received.append((name, data)))
+        (inbox or self.bus.sensors).subscribe(channel, lambda name, data, sender: self.received.append((name, data)))
 
     def drain_until(self, done: Callable[[], bool], inbox: Inbox | None = None) -> bool:
         """Drain and wait until `done` or a timeout."""
@@ -148,7 +148,7 @@ def test_given_handlers_then_they_run_within_drain_only(rig: Rig) -> None:
 
 def test_given_both_inboxes_then_each_has_its_own_queue(rig: Rig) -> None:
     rig.subscribe("A", rig.bus.sensors)
-    rig.bus.requests.subscribe("A", lambda name, data: rig.received.append(("request", data)))
+    rig.bus.requests.subscribe("A", lambda name, data, sender: rig.received.append(("request", data)))
     rig.bus.publish("A", b"1")
     assert rig.drain_until(lambda: rig.received == [("A", b"1")])
     assert rig.drain_until(lambda: rig.received == [("A", b"1"), ("request", b"1")], rig.bus.requests)
@@ -165,7 +165,7 @@ def test_given_a_handler_that_publishes_then_its_message_is_received_too(rig: Ri
     rig.subscribe("ECHO")
     echoed = []
 
-    def echo(channel: str, data: bytes) -> None:
+    def echo(channel: str, data: bytes, sender: Sender) -> None:
         rig.bus.publish("ECHO", data)
         echoed.append(data)
 
@@ -179,7 +179,7 @@ def test_given_a_handler_that_publishes_then_its_message_is_received_too(rig: Ri
 
 
 def test_given_a_handler_that_raises_then_the_messages_after_it_are_not_lost(rig: Rig) -> None:
-    def failing(channel: str, data: bytes) -> None:
+    def failing(channel: str, data: bytes, sender: Sender) -> None:
         if data == b"1":
             raise RuntimeError("on purpose")
         rig.received.append((channel, data))
@@ -278,7 +278,7 @@ def test_given_long_messages_that_are_not_handled_then_few_of_them_are_queued(ri
     bus = rig.bus
     assert isinstance(bus, LcmBus)
     taken: list[int] = []
-    bus.sensors.subscribe("GPS", lambda channel, data: taken.append(len(data)))
+    bus.sensors.subscribe("GPS", lambda channel, data, sender: taken.append(len(data)))
     publisher = lcm.LCM(bus.url)
     long, most = bytes(60_000), SENSOR_QUEUE_BYTES // 60_000
     end = time.monotonic() + TIMEOUT_S
@@ -303,6 +303,7 @@ class FullReceiver:
 
     def __init__(self, messages: list[Message]):
         self.messages = deque(messages)
+        self.refused: Counter[bytes] = Counter()
 
     def subscribe(self, channel: str) -> None: ...
 
@@ -313,24 +314,24 @@ class FullReceiver:
 
 
 def test_given_more_messages_than_a_drain_handles_then_the_rest_is_queued_in_order() -> None:
-    receiver = FullReceiver([(b"A", bytes([n])) for n in range(10)])
+    receiver = FullReceiver([(b"A", bytes([n]), None) for n in range(10)])
     inbox = ReceiverInbox(receiver, 4 << 20)
     received: list[int] = []
-    inbox.subscribe("A", lambda channel, data: received.append(data[0]))
+    inbox.subscribe("A", lambda channel, data, sender: received.append(data[0]))
     assert inbox.drain(3) == 3
     assert (received, len(receiver.messages), inbox.is_queueing) == ([0, 1, 2], 0, True)
-    receiver.messages.append((b"A", bytes([10])))
+    receiver.messages.append((b"A", bytes([10]), None))
     assert inbox.drain(100) == 8
     assert (received, inbox.is_queueing) == (list(range(11)), False)
 
 
 def test_given_a_flood_that_is_not_handled_then_its_channel_queues_so_many_bytes_and_displaces_no_other() -> None:
-    flood: list[Message] = [(b"A", bytes(60_000))] * 200
-    receiver = FullReceiver([*flood, (b"B", b"1")])
+    flood: list[Message] = [(b"A", bytes(60_000), None)] * 200
+    receiver = FullReceiver([*flood, (b"B", b"1", None)])
     inbox = ReceiverInbox(receiver, SENSOR_QUEUE_BYTES)
     received: list[tuple[str, int]] = []
     for channel in "AB":
-        inbox.subscribe(channel, lambda name, data: received.append((name, len(data))))
+        inbox.subscribe(channel, lambda name, data, sender: received.append((name, len(data))))
     assert inbox.drain(1) == 1
     assert not receiver.messages
     while inbox.drain(1000):
@@ -339,8 +340,8 @@ def test_given_a_flood_that_is_not_handled_then_its_channel_queues_so_many_bytes
 
 
 def test_given_an_inbox_without_a_queue_then_what_a_drain_leaves_stays_in_the_receiver() -> None:
-    receiver = FullReceiver([(b"A", b"1")] * 5)
+    receiver = FullReceiver([(b"A", b"1", None)] * 5)
     inbox = ReceiverInbox(receiver)
-    inbox.subscribe("A", lambda channel, data: None)
+    inbox.subscribe("A", lambda *_: None)
     assert inbox.drain(2) == 2
     assert (len(receiver.messages), inbox.is_queueing) == (3, False)

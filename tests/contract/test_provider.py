@@ -168,7 +168,7 @@ class OwnListener(DaemonListener):
 def test_given_what_has_left_the_bus_then_its_descriptors_are_closed(lcm_url: str) -> None:
     def use_all() -> None:
         bus = LcmBus(lcm_url)
-        bus.sensors.subscribe("GPS", lambda channel, data: bus.wait(0.0))
+        bus.sensors.subscribe("GPS", lambda *_: bus.wait(0.0))
         bus.close()
         with Platform(lcm_url) as platform:
             platform.subscribe_pose(print).close()

@@ -120,7 +120,7 @@ limits: {history_s: 10, waiting_requests: 0, wait_ms: 0, queued_requests: 1, req
     assert config.sensors.wheels.frames == {"left": "A:L"}
     wheels, aiding = config.sensors.wheels, config.sensors.aiding
     assert (wheels.kinematics, wheels.latency) == ("skid_steer", 0.05)
-    assert config.sensors.gps == GpsConfig("gps/front", "A:G", 0.12, "A:H")
+    assert config.sensors.gps == GpsConfig("gps/front", "A:G", 0.12, second_frame="A:H")
     assert aiding == {
         "visual odometry": AidingConfig("VO", "relative_pose", 0.1),
         "map": AidingConfig("MAP", "absolute_pose"),

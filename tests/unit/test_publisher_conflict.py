@@ -175,3 +175,45 @@ def test_given_a_slow_driver_that_restarts_then_its_new_sequence_is_used() -> No
     before = make_sequence(40, 30, every_ms=250.0)
     after = make_sequence(0, 30, at_ms=before[-1][0] + 700.0, every_ms=250.0)
     assert not any(find_conflicts(before + after))
+
+
+def test_given_a_first_one_that_is_slower_than_any_sensor_then_a_steady_one_takes_the_channel() -> None:
+    stranger = make_sequence(0, 10, "stranger", every_ms=2000.0)
+    driver = make_sequence(100, 80, "gps", at_ms=1.0, every_ms=200.0)
+    samples = merge(stranger, driver)
+    found = find_conflicts(samples)
+    used = [t for second, (t, header) in zip(found, samples, strict=True) if header.source == "gps" and not second]
+    assert 5000.0 <= used[0] < 6500.0
+    assert len(used) == sum(t >= used[0] for t, _ in driver)
+    late = [
+        second for second, (t, header) in zip(found, samples, strict=True) if header.source == "stranger" and t > 7000.0
+    ]
+    assert all(late)
+
+
+def test_given_a_receiver_of_one_fix_a_second_then_a_quick_stranger_does_not_take_its_channel() -> None:
+    driver = make_sequence(0, 30, "gps", every_ms=1000.0)
+    samples = merge(driver, make_sequence(0, 2000, "stranger", at_ms=500.0, every_ms=10.0))
+    assert count_used(samples, driver) == len(driver)
+
+
+@pytest.mark.parametrize("first", ["named", "stranger"])
+def test_given_a_named_source_then_it_has_the_channel_also_as_the_second(first: str) -> None:
+    detector = PublisherConflictDetector({"named"})
+    begins = {"named": 0.0 if first == "named" else 1000.0, "stranger": 1000.0 if first == "named" else 0.0}
+    samples = merge(*(make_sequence(0, 400, source, at_ms) for source, at_ms in begins.items()))
+    found = find_conflicts(samples, detector)
+    assert not any(second for second, (_, header) in zip(found, samples, strict=True) if header.source == "named")
+    strangers = [second for second, (t, header) in zip(found, samples, strict=True) if header.source != "named"]
+    assert sum(strangers) == (400 if first == "named" else 200)
+
+
+def test_given_two_senders_of_one_source_then_the_first_one_has_the_channel_whatever_their_numbers() -> None:
+    detector = PublisherConflictDetector()
+    found = {1: [], 2: []}
+    for n in range(400):
+        for sender in (1, 2):
+            header = SensorHeader(START + 5000 * n + sender, "imu", n + sender)
+            found[sender].append(detector.is_conflicting(header, n * 5 * MS + sender, sender))
+    assert not any(found[1])
+    assert all(found[2])

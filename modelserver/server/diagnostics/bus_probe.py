@@ -24,6 +24,7 @@ from modelserver.server.diagnostics.machine import read_bus_facts
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, to_subscription_pattern
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import handle_message, open_lcm
+from modelserver.wire.receiver import Sender
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +139,7 @@ class DuplicateServerMonitor:
         """Subscribe to the channel of the own health reports."""
         inbox.subscribe(f"{prefix}MODELSERVER_HEALTH", self.on_health)
 
-    def on_health(self, channel: str, data: bytes) -> None:
+    def on_health(self, channel: str, data: bytes, sender: Sender = None) -> None:
         """Process a health report, the own one or another server's."""
         now = self._clock.monotonic_ns()
         if now - self._window_ns >= 1_000_000_000:

@@ -30,7 +30,7 @@ from modelserver.errors import QueryError, Status, WireError
 from modelserver.geometry import names
 from modelserver.named_tuples import new_tuple
 from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
-from modelserver.server.bus import Bus
+from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_text
@@ -46,6 +46,7 @@ from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
 from modelserver.wire.codec import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache, decode, encode, read_request_header
 from modelserver.wire.journal import RecordKind
+from modelserver.wire.receiver import Sender
 
 log = logging.getLogger(__name__)
 
@@ -241,8 +242,8 @@ class RequestHandler:
     def cache(self, output: messages.SendReply, encoded: bytes) -> None:
         """Cache a reply that has just been sent, if it answers the current request and does not depend on time."""
         current = self._current
-        if current is not None and current.type_name == CACHED_TYPE and current.client:
-            self._model_cache().add(current.data, current.client, output.reply, encoded)
+        if current is not None and current.type_name == CACHED_TYPE and current.reply_channel:
+            self._model_cache().add(current.data, current.reply_channel, output.reply, encoded)
 
     def defer(self, answer: DeferredAnswer) -> None:
         """Begin a deferred answer; one is in progress at a time."""
@@ -273,19 +274,21 @@ class RequestHandler:
                 return True
         return True
 
-    def _receiver(self, type_name: str) -> Callable[[str, bytes], None]:
+    def _receiver(self, type_name: str) -> Handler:
         signed = type_name == SIGNED_TYPE
         scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
 
-        def receive(channel: str, data: bytes) -> None:
+        def receive(channel: str, data: bytes, sender: Sender) -> None:
             now_ns = monotonic_ns()
             name = SIGNED_CLIENT if signed else client_of(data)
-            client = scheduler.client(name, now_ns)
-            request = new_tuple(QueuedRequest, (name, channel, type_name, data))
+            # anyone may write another client's reply channel
+            key = name if signed or sender is None else sender
+            client = scheduler.client(key, name, now_ns)
+            request = new_tuple(QueuedRequest, (key, name, channel, type_name, data))
             if self._only_cached:
                 may_answer = type_name == CACHED_TYPE and scheduler.may_exceed and not scheduler.queued
                 if may_answer and self._send_cached(name, channel, data):
-                    scheduler.charge(name, 1.0, now_ns)
+                    scheduler.charge(key, 1.0, now_ns)
                     return
             elif self._is_first and scheduler.admit(client, now_ns):
                 self._is_first = False
@@ -361,7 +364,7 @@ class RequestHandler:
 
     def _answer(self, queued: QueuedRequest) -> None:
         """Answer a request, also a malformed one or one whose handling fails."""
-        client, channel, type_name, data = queued
+        _, client, channel, type_name, data = queued
         context = self._context
         try:
             if type_name == SIGNED_TYPE:

@@ -1,7 +1,8 @@
 """Request scheduling: per-client queues, rate limiters, and the share of time that requests may take. Pure.
 
-Each client (reply channel) has a bounded queue of requests, a second one for deferred requests (long answers), and two
-token buckets: requests per second, and bytes of deferred replies per second.
+Each client (the address that sends, or its reply channel where that is not known) has a bounded queue of requests, a
+second one for deferred requests (long answers), and two token buckets: requests per second, and bytes of deferred
+replies per second.
 
 Priority: requests of clients within their rate come first, round robin over the clients; then those of clients beyond
 their rate, round robin as well. The scheduler is work-conserving: work beyond the rates is done while there is time.
@@ -20,8 +21,9 @@ their own, rejections with a reply. Beyond these bounds requests are dropped and
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.errors import quote
@@ -110,6 +112,9 @@ REJECTIONS_TOTAL: Final = 256
 MAX_REPLY_BYTES: Final = 800_000
 """Bytes of the largest legal reply, rounded up: it always fits the burst of the byte limiter."""
 
+ClientKey: TypeAlias = Hashable
+"""What identifies a client: the address of its socket, or its reply channel."""
+
 SIGNED_CLIENT: Final = b"\0signed"
 """The client of signed envelopes: no reply channel can have this name, so no flood of requests delays commands."""
 
@@ -118,9 +123,10 @@ REPORTED_CLIENTS: Final = 3
 
 
 class QueuedRequest(NamedTuple):
-    """A waiting request: its client, channel, wire type and bytes."""
+    """A waiting request: its client, reply channel, channel, wire type and bytes."""
 
-    client: bytes
+    client: ClientKey
+    reply_channel: bytes
     channel: str
     type_name: str
     data: bytes
@@ -140,7 +146,7 @@ class DeferredRequest(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class ClientQueue:
-    """The requests of one client, and its token buckets."""
+    """The requests of one client, and its token buckets. name: its last reply channel."""
 
     name: bytes
     tokens: float
@@ -167,7 +173,7 @@ class RequestScheduler:
         self._burst = max(1.0, limits.client_hz * BURST_S)
         self._tokens_per_ns = limits.client_hz * 1e-9
         self._burst_bytes = max(float(MAX_REPLY_BYTES), limits.client_reply_bytes)
-        self._clients: dict[bytes, ClientQueue] = {}
+        self._clients: dict[ClientKey, ClientQueue] = {}
         self._others = ClientQueue(b"", self._burst, self._burst_bytes, now_ns, now_ns, now_ns)
         self._within: deque[ClientQueue] = deque()
         self._beyond: deque[ClientQueue] = deque()
@@ -202,9 +208,11 @@ class RequestScheduler:
             self._refill(client, now_ns)
             self._append(client)
 
-    def client(self, name: bytes, now_ns: int) -> ClientQueue:
-        """Return the queue of a client that sends a request, and count the request."""
-        client = self._clients.get(name) or self._add_client(name, now_ns)
+    def client(self, key: ClientKey, name: bytes, now_ns: int) -> ClientQueue:
+        """Return the queue of a client that sends a request with reply channel `name`, and count the request."""
+        client = self._clients.get(key) or self._add_client(key, name, now_ns)
+        if client.name != name and client is not self._others:
+            client.name = name
         client.received += 1
         client.seen_ns = now_ns
         return client
@@ -262,12 +270,12 @@ class RequestScheduler:
             self._append(client)
         return request
 
-    def charge(self, name: bytes, effort: float, now_ns: int) -> None:
+    def charge(self, key: ClientKey, effort: float, now_ns: int) -> None:
         """Charge a client for effort beyond that of a typical request.
 
         Its tokens may become negative, so that its next requests are beyond the rate.
         """
-        client = self._find(name)
+        client = self._find(key)
         self._refill(client, now_ns)
         client.tokens = max(client.tokens - effort, -self._burst)
 
@@ -304,9 +312,9 @@ class RequestScheduler:
             return deferred
         return None
 
-    def count_dropped(self, name: bytes) -> bool:
+    def count_dropped(self, key: ClientKey) -> bool:
         """Count a dropped request; return whether its client gets an error reply."""
-        client = self._find(name)
+        client = self._find(key)
         client.dropped += 1
         if client.rejections >= REJECTIONS_PER_CLIENT or self._rejections >= REJECTIONS_TOTAL:
             return False
@@ -352,10 +360,10 @@ class RequestScheduler:
     def _append(self, client: ClientQueue) -> None:
         (self._within if client.tokens >= 1.0 else self._beyond).append(client)
 
-    def _find(self, name: bytes) -> ClientQueue:
-        return self._clients.get(name) or self._others
+    def _find(self, key: ClientKey) -> ClientQueue:
+        return self._clients.get(key) or self._others
 
-    def _add_client(self, name: bytes, now_ns: int) -> ClientQueue:
+    def _add_client(self, key: ClientKey, name: bytes, now_ns: int) -> ClientQueue:
         if len(self._clients) >= self._max_clients:
             if now_ns < self._sweep_ns:
                 return self._others
@@ -369,7 +377,7 @@ class RequestScheduler:
                 del self._clients[each]
             if not silent:
                 return self._others
-        client = self._clients[name] = ClientQueue(name, self._burst, self._burst_bytes, now_ns, now_ns, now_ns)
+        client = self._clients[key] = ClientQueue(name, self._burst, self._burst_bytes, now_ns, now_ns, now_ns)
         return client
 
     def _describe(self, client: ClientQueue) -> str:

@@ -175,7 +175,7 @@ def test_given_a_time_of_day_that_steps_then_ticks_go_on_by_monotonic_time(step_
 
 def test_given_stop_then_run_returns() -> None:
     rig = Rig()
-    rig.bus.sensors.subscribe("IMU", lambda channel, data: rig.loop.stop())
+    rig.bus.sensors.subscribe("IMU", lambda *_: rig.loop.stop())
     rig.send(imu(START))
     rig.loop.run()
     rig.loop.run()
@@ -253,7 +253,7 @@ def test_given_a_flood_of_samples_then_ticks_come_in_time() -> None:
     for n in range(count):
         rig.send(imu(START - S + n))
     rig.send(GetBodyList(ME))
-    rig.bus.sensors.subscribe("IMU", lambda channel, data: rig.clock.advance(100e-6))
+    rig.bus.sensors.subscribe("IMU", lambda *_: rig.clock.advance(100e-6))
     rig.turns(count * 100_000 // MAX_SAMPLES_NS + 1 + round(count * 100e-6 / 0.02))
     assert rig.loop.state.traffic["sensor:imu"].count == count
     assert len(rig.poses) >= count * 100e-6 / 0.02 - 1

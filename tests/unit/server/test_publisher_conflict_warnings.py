@@ -15,16 +15,23 @@ from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
+from modelserver.wire.receiver import Sender
 
 
 class Rig:
     """A loop that detects publisher conflicts, and one IMU."""
 
-    def __init__(self, rule: Any = "ignore"):
+    def __init__(self, rule: Any = "ignore", publishers: dict[str, frozenset[str]] | None = None):
         self.clock = FakeClock(START)
         self.bus = FakeBus(self.clock)
         sensors = {"IMU": SensorChannel("imu_t"), "JOINTS": SensorChannel("joints_t")}
-        settings = LoopSettings(20_000_000, sensors, publisher_conflict=rule, shared_channels=frozenset({"JOINTS"}))
+        settings = LoopSettings(
+            20_000_000,
+            sensors,
+            publisher_conflict=rule,
+            shared_channels=frozenset({"JOINTS"}),
+            publishers=publishers or {},
+        )
         self.loop = Loop(self.bus, self.clock, start_core(ScriptedLocalizer()), settings)
         self.number = 0
 
@@ -38,10 +45,16 @@ class Rig:
                 self.put(other, 90_000 + self.number, self.clock.utime() - 1 - round(age_s * 1e6))
             self.loop.run_once()
 
-    def put(self, source: str, seq: int, utime: int) -> None:
+    def put(self, source: str, seq: int, utime: int, sender: Sender = None) -> None:
         sample = imu(utime, source)
         header = SensorHeader(utime, source, seq)
-        self.bus.sensors.put("IMU", encode(type(sample)(header, sample.angular_velocity, sample.specific_force)))
+        data = encode(type(sample)(header, sample.angular_velocity, sample.specific_force))
+        self.bus.sensors.put("IMU", data, sender)
+
+    def publish_joints(self, source: str, number: int, *names: str) -> None:
+        header = SensorHeader(START + number * 1000, source, number)
+        sample = JointsSample(header, tuple(JointSample(name, 0.1) for name in names))
+        self.bus.sensors.put("JOINTS", encode(sample))
 
     @property
     def health(self) -> Health:
@@ -101,12 +114,64 @@ def test_given_a_name_with_control_characters_then_warning_and_log_are_clean(cap
 def test_given_several_drivers_of_joints_then_they_share_the_channel() -> None:
     rig = Rig()
     for n in range(20):
-        for source in ("arm", "axis"):
-            header = SensorHeader(START + n * 1000, source, n)
-            rig.bus.sensors.put("JOINTS", encode(JointsSample(header, (JointSample("Mounted", 0.1),))))
+        rig.publish_joints("arm", n, "Shoulder", "Elbow")
+        rig.publish_joints("axis", n, "Mounted")
     rig.loop.run_once()
     assert not any(why == "publisher_conflict" for _, why in rig.loop.state.rejected)
     assert rig.loop.state.traffic["sensor:axis"].count == 20
+
+
+@pytest.mark.parametrize("rule", ["ignore", "use"])
+def test_given_two_drivers_of_one_joint_then_it_has_one_of_them_and_their_other_joints_are_used(rule: str) -> None:
+    rig = Rig(rule)
+    for n in range(20):
+        rig.publish_joints("axis", n, "Mounted")
+        rig.publish_joints("arm", n, "Mounted", "Elbow")
+        rig.publish_joints("intruder", n, "Mounted")
+    rig.loop.run_once()
+    assert rig.loop.state.rejected["JOINTS", "publisher_conflict"] == (20 if rule == "ignore" else 40)
+    text = rig.loop.state.warnings["channel JOINTS Mounted"]
+    assert text.startswith("sources 'axis' and 'arm' publish on JOINTS Mounted at once")
+    assert "channel JOINTS Elbow" not in rig.loop.state.warnings
+    assert rig.loop.state.traffic["sensor:arm"].count == 20
+    assert ("sensor:intruder" in rig.loop.state.traffic) is (rule == "use")
+
+
+def test_given_a_stranger_that_was_first_then_the_source_that_the_vehicle_file_names_takes_the_channel() -> None:
+    rig = Rig(publishers={"IMU": frozenset({"imu"})})
+    rig.put("intruder", 1, rig.clock.utime())
+    rig.loop.run_once()
+    rig.publish(50, other="intruder")
+    assert rig.accepted == 1 + 50
+    assert "sources 'imu' and 'intruder'" in rig.loop.state.warnings["channel IMU"]
+    assert set(rig.loop.state.rejected) == {("IMU", "publisher_conflict")}
+
+
+def test_given_a_stranger_whose_numbers_are_ahead_by_one_then_every_sample_of_the_driver_is_used() -> None:
+    rig = Rig()
+    for n in range(1, 301):
+        rig.clock.advance(0.005)
+        rig.put("imu", n, rig.clock.utime(), ("10.0.0.1", 4000))
+        rig.put("imu", n + 1, rig.clock.utime() + 1, ("10.0.0.9", 5000))
+        rig.loop.run_once()
+    assert rig.accepted == 300
+    # counted together once a second
+    assert set(rig.loop.state.rejected) == {("IMU", "publisher_conflict")}
+
+
+def test_given_a_restarted_driver_then_it_is_used_at_once_though_its_address_is_another() -> None:
+    rig = Rig()
+    for n in range(1, 101):
+        rig.clock.advance(0.01)
+        rig.put("imu", n, rig.clock.utime(), ("10.0.0.1", 4000))
+    rig.loop.run_once()
+    rig.clock.advance(0.5)
+    for n in range(1, 101):
+        rig.clock.advance(0.01)
+        rig.put("imu", n, rig.clock.utime(), ("10.0.0.1", 4001))
+    rig.loop.run_once()
+    assert rig.accepted == 200
+    assert not rig.loop.state.rejected
 
 
 def test_given_the_vehicle_file_then_a_second_publisher_is_ignored_unless_configured_otherwise(tmp_path: Any) -> None:

@@ -18,6 +18,7 @@ from modelserver.messages import (
     GetTransformation,
     GetTransformations,
     RequestHeader,
+    TimeQuery,
 )
 from modelserver.server.bus import Inboxes
 from modelserver.server.clock import FakeClock
@@ -26,6 +27,7 @@ from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
+from modelserver.wire.receiver import Sender
 
 pytestmark = pytest.mark.slow
 
@@ -41,15 +43,15 @@ class TimedInbox(FakeInbox):
 
     def __init__(self, clock: FakeClock):
         super().__init__(clock)
-        self.arrivals: list[tuple[int, int, str, bytes]] = []
+        self.arrivals: list[tuple[int, int, str, bytes, Sender]] = []
 
-    def at(self, time_ns: int, channel: str, data: bytes) -> None:
-        heapq.heappush(self.arrivals, (time_ns, len(self.arrivals), channel, data))
+    def at(self, time_ns: int, channel: str, data: bytes, sender: Sender = None) -> None:
+        heapq.heappush(self.arrivals, (time_ns, len(self.arrivals), channel, data, sender))
 
     def arrive(self) -> None:
         while self.arrivals and self.arrivals[0][0] <= self._clock.monotonic_ns():
-            _, _, channel, data = heapq.heappop(self.arrivals)
-            self.put(channel, data)
+            _, _, channel, data, sender = heapq.heappop(self.arrivals)
+            self.put(channel, data, sender)
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         count = 0
@@ -108,8 +110,10 @@ class Rig:
         """Since the beginning."""
         return (self.clock.monotonic_ns() - BEGIN_NS) * 1e-9
 
-    def send(self, seconds: float, request: Any, channel: str = "PLATFORM_GET_TRANSFORMATION") -> None:
-        self.inbox.at(BEGIN_NS + round(seconds * 1e9), channel, encode(request))
+    def send(
+        self, seconds: float, request: Any, channel: str = "PLATFORM_GET_TRANSFORMATION", sender: Sender = None
+    ) -> None:
+        self.inbox.at(BEGIN_NS + round(seconds * 1e9), channel, encode(request), sender)
 
     def run(self, seconds: float) -> None:
         while self.seconds < seconds:
@@ -278,3 +282,20 @@ def test_given_a_reply_channel_that_may_not_be_used_then_a_long_request_is_count
     assert dict(rig.loop.state.rejected) == {("PLATFORM_GET_TRANSFORMATIONS", "reply_channel"): 1}
     assert [channel for channel, _ in rig.bus.published if channel.startswith("REPLY")] == ["REPLY_TEST"]
     assert rig.loop._requests.waiting == 0
+
+
+def test_given_a_flood_under_the_reply_channel_of_another_client_then_that_one_gets_its_replies() -> None:
+    rig = Rig(run_delay=lambda: None)
+    victim, stranger = ("10.0.0.1", 4000), ("10.0.0.9", 5000)
+    replies: list[int] = []
+    rig.bus.on_reply = lambda channel, data: replies.append(
+        decode("get_transformation_reply_t", data).header.request_id
+    )
+    flood = GetTransformation(RequestHeader(7, "REPLY_A"), *FRAMES[:2], TimeQuery())
+    mine = [GetTransformation(RequestHeader(1000 + n, "REPLY_A"), *FRAMES[:2], TimeQuery()) for n in range(20)]
+    for n in range(20_000):
+        rig.send(0.1 + n * 50e-6, flood, sender=stranger)
+    for n, request in enumerate(mine):
+        rig.send(0.2 + n * 0.04, request, sender=victim)
+    rig.run(1.3)
+    assert [each for each in replies if each >= 1000] == [1000 + n for n in range(20)]

@@ -32,12 +32,12 @@ S = 1_000 * MS
 
 
 def item(number: int, client: bytes = b"") -> QueuedRequest:
-    return QueuedRequest(client, "CHANNEL", "type", str(number).encode())
+    return QueuedRequest(client, client, "CHANNEL", "type", str(number).encode())
 
 
 def send(scheduler: RequestScheduler, client: bytes, number: int = 0, now_ns: int = 0) -> bool:
     """Enqueue a request of a client; return whether none was dropped."""
-    dropped = scheduler.enqueue(scheduler.client(client, now_ns), item(number, client), now_ns)
+    dropped = scheduler.enqueue(scheduler.client(client, client, now_ns), item(number, client), now_ns)
     if dropped is not None:
         scheduler.count_dropped(dropped.client)
     return dropped is None
@@ -86,7 +86,7 @@ def test_given_any_requests_then_the_queues_are_bounded_and_each_is_served_or_dr
     scheduler = RequestScheduler(LimitsConfig(queued_requests=queued), 0)
     dropped = []
     for number, client in enumerate(clients):
-        out = scheduler.enqueue(scheduler.client(client, 0), item(number), 0)
+        out = scheduler.enqueue(scheduler.client(client, client, 0), item(number), 0)
         if out is not None:
             dropped.append(int(out.data))
         assert scheduler.queued <= queued
@@ -103,7 +103,7 @@ def test_given_full_queues_then_each_client_that_comes_gets_its_part() -> None:
     for _ in range(1000):
         for client in (b"a", b"b", b"c", b"d", b"e"):
             send(scheduler, client)
-    lengths = [len(scheduler.client(client, 0).requests) for client in (b"a", b"b", b"c", b"d", b"e")]
+    lengths = [len(scheduler.client(client, client, 0).requests) for client in (b"a", b"b", b"c", b"d", b"e")]
     assert lengths == [12] * 5
 
 
@@ -196,23 +196,23 @@ def test_given_ever_new_names_then_the_earlier_clients_keep_their_queues() -> No
 
 def test_given_silent_clients_then_others_take_their_places() -> None:
     scheduler = RequestScheduler(LimitsConfig(), 0, max_clients=2)
-    a, b = scheduler.client(b"a", 0), scheduler.client(b"b", 0)
-    other = scheduler.client(b"c", 0)
+    a, b = scheduler.client(b"a", b"a", 0), scheduler.client(b"b", b"b", 0)
+    other = scheduler.client(b"c", b"c", 0)
     assert other not in (a, b)
-    assert scheduler.client(b"d", CLIENT_IDLE_NS) is other
-    late = scheduler.client(b"d", CLIENT_IDLE_NS + SWEEP_NS + 1)
+    assert scheduler.client(b"d", b"d", CLIENT_IDLE_NS) is other
+    late = scheduler.client(b"d", b"d", CLIENT_IDLE_NS + SWEEP_NS + 1)
     assert late is not other
-    assert scheduler.client(b"a", CLIENT_IDLE_NS + SWEEP_NS + 1) is not a
+    assert scheduler.client(b"a", b"a", CLIENT_IDLE_NS + SWEEP_NS + 1) is not a
 
 
 def test_given_dropped_requests_then_a_bounded_number_gets_a_reply_and_their_clients_are_reported() -> None:
     scheduler = RequestScheduler(LimitsConfig(queued_requests=1), 0)
     for name, count in ((b"REPLY_A", 9000), (b"REPLY_B", 20), (b"\x1b[31m\n" * 3, 10), (b"REPLY_C", 5), (b"", 1)):
-        scheduler.client(name, 0)
+        scheduler.client(name, name, 0)
         replies = sum(scheduler.count_dropped(name) for _ in range(count))
         assert replies == min(count, REJECTIONS_PER_CLIENT)
         for _ in range(count - 1):
-            scheduler.client(name, 0)
+            scheduler.client(name, name, 0)
     assert scheduler.report(S - 1) is None
     report = scheduler.report(S)
     assert report is not None
@@ -228,7 +228,7 @@ def test_given_dropped_requests_of_many_clients_then_the_replies_are_bounded_for
     replies = 0
     for number in range(60):
         name = str(number).encode()
-        scheduler.client(name, 0)
+        scheduler.client(name, name, 0)
         replies += sum(scheduler.count_dropped(name) for _ in range(100))
     assert replies == REJECTIONS_TOTAL
 
@@ -250,7 +250,7 @@ def begin_deferred(scheduler: RequestScheduler, now_ns: int = 0) -> list[int]:
 def test_given_deferred_requests_then_clients_are_served_round_robin_and_their_queues_are_bounded() -> None:
     scheduler = RequestScheduler(LimitsConfig(), 0)
     for name in (b"a", b"b"):
-        scheduler.client(name, 0)
+        scheduler.client(name, name, 0)
     assert [scheduler.enqueue_deferred(make_deferred(n, b"a")) for n in range(3)] == [True] * DEFERRED_PER_CLIENT + [
         False
     ]
@@ -259,7 +259,7 @@ def test_given_deferred_requests_then_clients_are_served_round_robin_and_their_q
     count = 0
     for number in range(40):
         name = str(number).encode()
-        scheduler.client(name, 0)
+        scheduler.client(name, name, 0)
         count += scheduler.enqueue_deferred(make_deferred(number, name))
     assert count == DEFERRED_TOTAL == scheduler.deferred
 
@@ -267,7 +267,7 @@ def test_given_deferred_requests_then_clients_are_served_round_robin_and_their_q
 def test_given_replies_beyond_the_bytes_a_second_then_they_wait_and_others_do_not() -> None:
     scheduler = RequestScheduler(LimitsConfig(client_reply_bytes=1e6), 0)
     for name in (b"large", b"small"):
-        scheduler.client(name, 0)
+        scheduler.client(name, name, 0)
     sent = 0
     for step in range(10_000):
         now = step * MS
@@ -283,14 +283,14 @@ def test_given_replies_beyond_the_bytes_a_second_then_they_wait_and_others_do_no
 
 def test_given_the_largest_reply_and_the_least_rate_then_it_fits() -> None:
     scheduler = RequestScheduler(LimitsConfig(client_reply_bytes=1e4), 0)
-    scheduler.client(b"a", 0)
+    scheduler.client(b"a", b"a", 0)
     scheduler.enqueue_deferred(make_deferred(1, b"a", MAX_REPLY_BYTES))
     assert begin_deferred(scheduler) == [1]
 
 
 def test_given_deferred_work_then_it_is_charged_before_it_begins() -> None:
     scheduler = make_contended(LimitsConfig(client_hz=100.0))
-    scheduler.client(b"a", 0)
+    scheduler.client(b"a", b"a", 0)
     scheduler.enqueue_deferred(make_deferred(1, b"a", 100, 30.0))
     assert begin_deferred(scheduler) == [1]
     send(scheduler, b"a", 2)

@@ -6,6 +6,7 @@ import random
 import socket
 import struct
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -20,24 +21,26 @@ from modelserver.wire import receiver as module
 from modelserver.wire.provider import resolve_url
 from modelserver.wire.receiver import (
     MAX_IGNORED,
+    MAX_PARTIAL,
     MAX_PARTIAL_BYTES,
     FragmentAssembler,
     LcmReceiver,
     Message,
     Receiver,
+    Sender,
     UdpReceiver,
     open_receiver,
 )
 from modelserver.wire.urls import UdpAddress, parse_udp_address
 
 
-def wait_for(receiver: Receiver) -> Message:
-    """Return the next message."""
+def wait_for(receiver: Receiver) -> tuple[bytes, bytes]:
+    """Return the channel and the data of the next message."""
     end = time.monotonic() + TIMEOUT_S
     while time.monotonic() < end:
         message = receiver.receive()
         if message is not None:
-            return message
+            return message[:2]
     raise TimeoutError("no message")
 
 
@@ -77,7 +80,7 @@ def test_given_messages_that_liblcm_sends_then_those_of_the_channels_are_receive
 
 
 def test_given_no_route_then_the_error_names_what_to_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def reject(address: object) -> None:
+    def reject(*_: object) -> None:
         raise OSError(19, "No such device")
 
     monkeypatch.setattr(module, "UdpReceiver", reject)
@@ -127,6 +130,9 @@ def split(channel: bytes, data: bytes, sequence: int = 1, length: int = 4) -> li
     ]
 
 
+ONE = ("10.0.0.1", 1)
+
+
 def make_assembler() -> FragmentAssembler:
     assembler = FragmentAssembler()
     assembler.channels = {b"A"}
@@ -138,47 +144,104 @@ def test_given_fragments_of_two_senders_then_both_messages_are_assembled(
     first: bytes, second: bytes, order: random.Random
 ) -> None:
     assembler = make_assembler()
-    waiting = {"first": split(b"A", first), "second": split(b"A", second)}
-    found = {}
+    a, b = ("10.0.0.1", 1), ("10.0.0.1", 2)
+    waiting = {a: split(b"A", first), b: split(b"A", second)}
+    found: dict[Sender, Message] = {}
     while any(waiting.values()):
         sender = order.choice([each for each in waiting if waiting[each]])
         message = assembler.add(sender, waiting[sender].pop(0))
         if message is not None:
             found[sender] = message
-    assert found == {"first": (b"A", first), "second": (b"A", second)}
+    assert found == {a: (b"A", first, a), b: (b"A", second, b)}
 
 
 def test_given_a_lost_fragment_then_only_its_message_is_lost() -> None:
     assembler = make_assembler()
     lost = [split(b"A", b"12345678", 1)[0], split(b"A", b"12345678", 2)[1]]
-    assert [assembler.add(1, each) for each in (*lost, *split(b"A", b"abcdefgh", 3))] == [
+    assert [assembler.add(ONE, each) for each in (*lost, *split(b"A", b"abcdefgh", 3))] == [
         None,
         None,
         None,
-        (b"A", b"abcdefgh"),
+        (b"A", b"abcdefgh", ONE),
     ]
 
 
 def test_given_fragments_of_another_channel_then_none_is_assembled() -> None:
     assembler = make_assembler()
-    assert [assembler.add(1, each) for each in split(b"B", b"12345678")] == [None, None]
+    assert [assembler.add(ONE, each) for each in split(b"B", b"12345678")] == [None, None]
 
 
 @given(st.lists(st.binary(max_size=30).map(lambda data: b"LC03" + data) | st.sampled_from(split(b"A", b"12345678"))))
 def test_given_any_fragments_then_each_message_has_the_length_in_its_header(packets: list[bytes]) -> None:
     assembler = make_assembler()
     for packet in packets:
-        message = assembler.add(1, packet)
+        message = assembler.add(ONE, packet)
         assert message is None or len(message[1]) == int.from_bytes(packet[8:12], "big")
 
 
-def test_given_first_fragments_of_many_long_messages_then_their_memory_is_bounded() -> None:
+def test_given_the_beginnings_of_many_long_messages_then_they_take_no_memory_and_a_whole_one_is_received() -> None:
     assembler = make_assembler()
-    size = MAX_PARTIAL_BYTES // 4
-    for sender in range(20):
-        head = struct.pack(">4sIIIHH", b"LC03", 1, size, 0, 0, 2)
-        assert assembler.add(sender, head + b"A\0" + bytes(10)) is None
+    tracemalloc.start()
+    try:
+        for port in range(1000):
+            head = struct.pack(">4sIIIHH", b"LC03", 1, MAX_PARTIAL_BYTES - 1, 0, 0, 300)
+            assert assembler.add(("10.0.0.2", port), head + b"A\0" + bytes(1000)) is None
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    finally:
+        tracemalloc.stop()
+    assert assembler.partial_bytes <= MAX_PARTIAL * 1000
+    *rest, last = [assembler.add(ONE, each) for each in split(b"A", b"12345678")]
+    assert (rest, last) == ([None], (b"A", b"12345678", ONE))
+
+
+def test_given_fragments_of_many_senders_in_turn_then_the_one_that_goes_on_is_received() -> None:
+    assembler = make_assembler()
+    mine = split(b"A", bytes(100), length=1)
+    found = []
+    for number, fragment in enumerate(mine):
+        found.append(assembler.add(ONE, fragment))
+        for port in range(100):
+            assembler.add(("10.0.0.2", 100 * number + port), split(b"A", bytes(100), length=50)[0])
+    assert found[-1] == (b"A", bytes(100), ONE)
+
+
+def test_given_received_bytes_beyond_the_limit_then_the_messages_that_waited_longest_are_dropped() -> None:
+    assembler = make_assembler()
+    for port in range(400):
+        assert assembler.add(("10.0.0.2", port), split(b"A", bytes(130_000), length=65_000)[0]) is None
     assert assembler.partial_bytes <= MAX_PARTIAL_BYTES
-    too_long = struct.pack(">4sIIIHH", b"LC03", 1, MAX_PARTIAL_BYTES + 1, 0, 0, 2)
-    assert assembler.add("other", too_long + b"A\0") is None
-    assert assembler.partial_bytes == MAX_PARTIAL_BYTES
+
+
+def test_given_a_message_that_is_too_long_then_it_is_refused_at_its_first_fragment_and_counted() -> None:
+    assembler = FragmentAssembler(100)
+    assembler.channels = {b"A"}
+    assert [assembler.add(ONE, each) for each in split(b"A", bytes(101), length=50)] == [None] * 3
+    assert assembler.refused == {b"A": 1}
+    assert assembler.add(ONE, split(b"A", bytes(100), 2, length=100)[0]) == (b"A", bytes(100), ONE)
+
+
+def test_given_a_fragment_twice_in_place_of_another_then_no_message_has_a_hole() -> None:
+    assembler = make_assembler()
+    first, second, third = split(b"A", b"1234567890AB")
+    assert [assembler.add(ONE, each) for each in (first, second, second)] == [None] * 3
+    assert assembler.add(ONE, third) == (b"A", b"1234567890AB", ONE)
+    # fragments that overlap
+    overlapping = third[:12] + (4).to_bytes(4, "big") + third[16:]
+    assert [assembler.add(ONE, each) for each in (first, second, overlapping)] == [None] * 3
+
+
+def test_given_two_programs_on_the_bus_then_each_message_has_its_sender() -> None:
+    with reserved_url() as url:
+        address = parse_udp_address(url)
+        assert address is not None
+        with closing(UdpReceiver(address)) as receiver:
+            receiver.subscribe("A")
+            senders = []
+            for publisher in (lcm.LCM(url), lcm.LCM(url)):
+                for _ in range(2):
+                    publisher.publish("A", b"data")
+                    end = time.monotonic() + TIMEOUT_S
+                    while (message := receiver.receive()) is None:
+                        assert time.monotonic() < end
+                    senders.append(message[2])
+        assert senders[0] == senders[1] != senders[2] == senders[3]
