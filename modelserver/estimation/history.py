@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Final, Protocol
 
 import numpy as np
@@ -49,24 +49,46 @@ class DeferredEstimate(Protocol):
         ...
 
 
+BLOCK: Final = 256
+"""Estimates of a block: what a history copies at most when one is replaced."""
+
+
+class _Block:
+    """Up to `BLOCK` estimates and their times, which only grow."""
+
+    __slots__ = ("estimates", "times")
+
+    times: array[int]
+    estimates: list[Estimate | DeferredEstimate]
+
+    def __init__(self) -> None:
+        self.times = array("q")
+        self.estimates = []
+
+    def copy(self, count: int) -> _Block:
+        """Return a block with the first estimates."""
+        other = _Block()
+        other.times, other.estimates = self.times[:count], self.estimates[:count]
+        return other
+
+
 class History:
     """Estimates of the last seconds, by time. Immutable: `append` returns the next history.
 
-    Successive histories share one list and differ in their range of it. Appending to an older one, whose list has grown
-    since, copies the range; the usual append to the newest one copies nothing.
+    Successive histories share their blocks and differ in their range of them; all but the last block are full.
+    Appending to an older one, whose last block has grown since, copies that block; the usual append to the newest one
+    copies nothing.
     """
 
-    __slots__ = ("_end", "_estimates", "_horizon", "_start", "_times")
+    __slots__ = ("_blocks", "_end", "_horizon", "_start")
 
-    _times: array[int]
-    _estimates: list[Estimate | DeferredEstimate]
+    _blocks: tuple[_Block, ...]
     _start: int
     _end: int
     _horizon: int
 
     def __init__(self, seconds: float):
-        self._times = array("q")
-        self._estimates = []
+        self._blocks = ()
         self._start = 0
         self._end = 0
         self._horizon = round(seconds * 1e6)
@@ -77,24 +99,44 @@ class History:
     @property
     def first(self) -> int:
         """The oldest time covered. Only when not empty."""
-        return self._times[self._start]
+        return self._blocks[self._start // BLOCK].times[self._start % BLOCK]
 
     @property
     def last(self) -> int:
         """The newest time covered. Only when not empty."""
-        return self._times[self._end - 1]
+        return self._time(self._end - 1)
 
     @property
     def newest(self) -> Estimate:
         """The newest estimate. Only when not empty."""
         return self._at(self._end - 1)
 
+    def _time(self, index: int) -> int:
+        return self._blocks[index // BLOCK].times[index % BLOCK]
+
     def _at(self, index: int) -> Estimate:
-        found = self._estimates[index]
+        estimates, place = self._blocks[index // BLOCK].estimates, index % BLOCK
+        found = estimates[place]
         if not isinstance(found, Estimate):
-            # stored in the list that successors share: it is the same for all of them
-            found = self._estimates[index] = found.resolve()
+            # stored in the block that successors share: it is the same for all of them
+            found = estimates[place] = found.resolve()
         return found
+
+    def _find(self, utime: int, bisect: Callable[[array[int], int, int, int], int]) -> int:
+        """Return the index that a bisection of all times gives."""
+        start, end, blocks = self._start, self._end, self._blocks
+        if end <= start:
+            return start
+        low, high = start // BLOCK, (end - 1) // BLOCK
+        while low < high:
+            middle = (low + high + 1) // 2
+            # whether it is in this block or after it
+            if bisect(blocks[middle].times, utime, 0, 1):
+                low = middle
+            else:
+                high = middle - 1
+        offset = low * BLOCK
+        return offset + bisect(blocks[low].times, utime, max(start - offset, 0), min(end - offset, BLOCK))
 
     def append(self, estimate: Estimate | DeferredEstimate) -> History:
         """Return the history with a further estimate.
@@ -104,43 +146,49 @@ class History:
         """
         extended = History.__new__(History)
         extended._horizon = self._horizon
-        start, end, times, estimates, utime = self._start, self._end, self._times, self._estimates, estimate.utime
-        while end > start and times[end - 1] >= utime:
+        start, end, blocks, utime = self._start, self._end, self._blocks, estimate.utime
+        while end > start and self._time(end - 1) >= utime:
             end -= 1
         oldest = utime - self._horizon
-        while start < end and times[start] < oldest:
+        while start < end and self._time(start) < oldest:
             start += 1
-        if end != len(times) or (start > 1024 and start > end - start):
-            # an older history is extended, or most of the list has expired: copy the range
-            times, estimates = times[start:end], estimates[start:end]
-            start, end = 0, end - start
-        times.append(utime)
-        estimates.append(estimate)
-        extended._times, extended._estimates = times, estimates
-        extended._start, extended._end = start, end + 1
+        if expired := start // BLOCK:
+            blocks = blocks[expired:]
+            start, end = start - expired * BLOCK, end - expired * BLOCK
+        number, used = divmod(end, BLOCK)
+        if not used:
+            blocks = (*blocks[:number], _Block())
+        elif used != len(blocks[number].times):
+            # the rest of the block is that of another history
+            blocks = (*blocks[:number], blocks[number].copy(used))
+        else:
+            blocks = blocks[: number + 1]
+        blocks[number].times.append(utime)
+        blocks[number].estimates.append(estimate)
+        extended._blocks, extended._start, extended._end = blocks, start, end + 1
         return extended
 
     def is_too_soon(self, utime: int) -> bool:
         """Return whether an estimate for a time would follow the newest too soon to be stored."""
         end = self._end
-        return end > self._start and 0 < utime - self._times[end - 1] < MIN_STEP_US
+        return end > self._start and 0 < utime - self._time(end - 1) < MIN_STEP_US
 
     def with_duration(self, seconds: float) -> History:
         """Return the same history, with another duration from the next estimate on."""
         other = History.__new__(History)
-        other._times, other._estimates = self._times, self._estimates
-        other._start, other._end, other._horizon = self._start, self._end, round(seconds * 1e6)
+        other._blocks, other._start, other._end = self._blocks, self._start, self._end
+        other._horizon = round(seconds * 1e6)
         return other
 
     def copy_recent(self, seconds: float) -> History:
-        """Return a copy of the last seconds, in lists that no successor extends."""
-        other = History.__new__(History)
-        start = self._start
-        if self._end > start:
-            oldest = self._times[self._end - 1] - round(seconds * 1e6)
-            start = bisect_left(self._times, oldest, start, self._end)
-        other._times, other._estimates = self._times[start : self._end], self._estimates[start : self._end]
-        other._start, other._end, other._horizon = 0, self._end - start, self._horizon
+        """Return a copy of the last seconds, in blocks that no successor extends."""
+        other = self.with_duration(self._horizon * 1e-6)
+        if self._end > self._start:
+            first, start = divmod(self._find(self.last - round(seconds * 1e6), bisect_left), BLOCK)
+            number, used = divmod(self._end, BLOCK)
+            last = (self._blocks[number].copy(used),) if used else ()
+            other._blocks = (*self._blocks[first:number], *last)
+            other._start, other._end = start, self._end - first * BLOCK
         return other
 
     def at(self, utime: int) -> Estimate:
@@ -150,7 +198,7 @@ class History:
         epochs are not comparable.
         """
         self.check_span(utime)
-        after = bisect_right(self._times, utime, self._start, self._end)
+        after = self._find(utime, bisect_right)
         before = self._at(after - 1)
         if before.utime == utime or after == self._end:
             return before
@@ -163,7 +211,7 @@ class History:
         and M. Golay, 1964), or at the ends of the history of as long before or after it; the variance is that of the
         residuals. Of too few estimates for that it is their difference, with variance nan. None where unknown.
         """
-        after = min(max(bisect_left(self._times, utime, self._start, self._end), self._start + 1), self._end - 1)
+        after = min(max(self._find(utime, bisect_left), self._start + 1), self._end - 1)
         if after <= self._start:
             return None
         a, b = self._at(after - 1), self._at(after)
@@ -171,8 +219,8 @@ class History:
         if a.motion is None or b.motion is None or a.pose_epoch != b.pose_epoch or not span <= MAX_DIFFERENCE_SPAN_S:
             return None
         begin = max(min(utime - SLOPE_WINDOW_US // 2, self.last - SLOPE_WINDOW_US), self.first)
-        first = bisect_left(self._times, begin, self._start, self._end)
-        last = bisect_right(self._times, begin + SLOPE_WINDOW_US, self._start, self._end) - 1
+        first = self._find(begin, bisect_left)
+        last = self._find(begin + SLOPE_WINDOW_US, bisect_right) - 1
         count = min(last - first + 1, SLOPE_POINTS)
         if count >= SLOPE_LEAST_POINTS:
             near = [self._at(first + (last - first) * k // (count - 1)) for k in range(count)]
@@ -185,9 +233,9 @@ class History:
 
     def hold(self, utime: int) -> Estimate:
         """Return the newest estimate not after a time (hold-last-value). Raises TooOldError."""
-        if self._times[self._start] > utime:
+        if self.first > utime:
             raise TooOldError(self._describe_span(utime, "before"))
-        return self._at(bisect_right(self._times, utime, self._start, self._end) - 1)
+        return self._at(self._find(utime, bisect_right) - 1)
 
     def bracket(self, utimes: npt.NDArray[np.int64]) -> tuple[list[Estimate], npt.NDArray[np.intp]]:
         """Return the estimates around times within the history, and for each time the index of the one before it.
@@ -204,7 +252,7 @@ class History:
         if not len(utimes):
             return
         for number, index in enumerate(self._find_indices(utimes)[1].tolist()):
-            if not isinstance(self._estimates[index], Estimate):
+            if not isinstance(self._blocks[index // BLOCK].estimates[index % BLOCK], Estimate):
                 self._at(index)
                 yield
             elif not number % 1000:
@@ -212,14 +260,15 @@ class History:
 
     def _find_indices(self, utimes: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return the index of the estimate before each time, and the indices of all estimates around the times."""
-        times = np.frombuffer(self._times[self._start : self._end], dtype=np.int64)
+        times = np.concatenate([np.frombuffer(each.times, dtype=np.int64) for each in self._blocks])
+        times = times[self._start : self._end]
         before = np.maximum(np.searchsorted(times, utimes, side="right") - 1, 0)
         needed = np.unique(np.concatenate((before, np.minimum(before + 1, len(times) - 1))))
         return before + self._start, needed + self._start
 
     def next_after(self, utime: int) -> Estimate | None:
         """Return the oldest estimate newer than a time, None where there is none."""
-        after = bisect_right(self._times, utime, self._start, self._end)
+        after = self._find(utime, bisect_right)
         return None if after == self._end else self._at(after)
 
     def check_span(self, utime: int) -> None:

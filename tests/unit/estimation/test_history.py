@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 
+import numpy as np
 import pytest
 from support_samples import ORIGIN, START
 
@@ -115,12 +117,56 @@ def test_given_a_clock_that_steps_forward_then_what_is_beyond_the_horizon_is_dro
 
 def test_given_more_than_the_horizon_then_only_that_much_is_held_and_memory_stays_bounded() -> None:
     held = History(2.0)
-    for n in range(20_000):
-        held = held.append(estimate(n * 0.01))
+    tracemalloc.start()
+    try:
+        for n in range(20_000):
+            held = held.append(estimate(n * 0.01))
+        # some 300 bytes for each of the 201 and of a block
+        assert tracemalloc.get_traced_memory()[0] < 600_000
+    finally:
+        tracemalloc.stop()
     assert len(held) == 201
     assert held.first == held.last - 2 * S
-    assert len(held._times) < 4 * 1024
-    assert len(held._estimates) == len(held._times)
+
+
+def test_given_a_long_history_when_its_last_estimate_is_replaced_then_little_is_copied() -> None:
+    held = History(1e6)
+    for n in range(100_000):
+        held = held.append(estimate(n))
+    again = estimate(99_999)
+    tracemalloc.start()
+    try:
+        replaced = held.append(again)
+        assert tracemalloc.get_traced_memory()[0] < 30_000
+    finally:
+        tracemalloc.stop()
+    assert replaced.newest is again
+    assert held.newest is not again
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_given_any_order_and_branches_then_each_history_is_what_a_list_would_be(seed: int) -> None:
+    source, horizon = random.Random(seed), 700.0
+    known: list[tuple[History, list[int]]] = [(History(horizon), [])]
+    for _ in range(3000):
+        held, listed = known[-1] if source.random() < 0.97 else source.choice(known)
+        newest = listed[-1] if listed else 0
+        at = newest + (1 if source.random() < 0.9 else source.randint(-400, 3))
+        listed = [each for each in listed if at - horizon <= each < at] + [at]
+        known = [*known[-20:], (held.append(estimate(at)), listed)]
+    for held, listed in known[1:]:
+        stored = [START + each * S for each in listed]
+        assert (len(held), held.first, held.last) == (len(stored), stored[0], stored[-1])
+        for _ in range(20):
+            utime = source.randint(stored[0], stored[-1])
+            before = max(each for each in stored if each <= utime)
+            assert held.hold(utime).utime == before
+            after = held.next_after(utime)
+            assert (after and after.utime) == min((each for each in stored if each > utime), default=None)
+            found, indices = held.bracket(np.array([utime], dtype=np.int64))
+            assert found[indices[0]].utime == before
+        recent = held.copy_recent(50.0)
+        assert (recent.first, recent.last) == (min(each for each in stored if each >= stored[-1] - 50 * S), stored[-1])
 
 
 def test_given_a_time_between_two_then_position_and_rotation_lie_between() -> None:
