@@ -172,6 +172,19 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
         yield Problem(Severity.WARNING, what, driver.source_map.locate("drivers", driver.name, "wheels", name), fix)
 
 
+def find_backward_counters(driver: DriverSettings) -> Iterator[Problem]:
+    """Yield the wheels whose count falls as they roll forward."""
+    for name, wheel in getattr(driver.device_settings, "wheels", {}).items():
+        if wheel.count is not None and wheel.count.meters_per_count < 0.0:
+            why = (
+                f"wheel {name} rolls backward as its count rises: meters_per_count is {wheel.count.meters_per_count:g}"
+            )
+            source = driver.source_map.locate("drivers", driver.name, "wheels", name)
+            yield Problem(
+                Severity.WARNING, why, source, "right for an encoder that is mounted mirrored, else drop the sign"
+            )
+
+
 def find_unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Iterator[Problem]:
     """Yield the joints that are no constraints of the geometry."""
     settings = driver.device_settings

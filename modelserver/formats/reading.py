@@ -16,6 +16,7 @@ import numpy as np
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_key
 from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.plausibility import is_far
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion
 
@@ -117,6 +118,13 @@ class ElementReader:
     def check_position(self, position: Sequence[float], line: int = 0) -> bool:
         """Return whether each coordinate is at most `MAX_POSITION`; otherwise report an error."""
         if all(abs(value) <= MAX_POSITION for value in position):
+            if is_far(position):
+                far = math.hypot(*position)
+                self.warning(
+                    f"{far:g} m from where it is measured looks like millimeters",
+                    f"positions are in meters; {far / 1000.0:g} m?",
+                    line,
+                )
             return True
         message = f"the position {max(position, key=abs):g} m is out of reach; the limit is {MAX_POSITION:g} m"
         self.error(message, "positions are in meters; look for a slip in the exponent", line)

@@ -12,6 +12,7 @@ from modelserver.formats.reading import MAX_POSITION, ElementReader, label, pars
 from modelserver.formats.xml_document import get_line, get_name, get_tag, iterate_children
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.plausibility import looks_like_degrees
 from modelserver.geometry.shape import Material, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 
@@ -96,10 +97,6 @@ class UrdfElement(ElementReader):
         return value or None
 
 
-LARGEST_ANGLE = 2.0 * math.pi + 0.01
-"""Radians beyond which an angle was hardly written as such; from 4 on also whole numbers."""
-
-
 def read_origin(parts: dict[str, UrdfElement]) -> Pose | None:
     """Read the pose of an <origin>, the identity for none; roll, pitch, yaw are in radians."""
     at = parts.get("origin")
@@ -113,7 +110,7 @@ def read_origin(parts: dict[str, UrdfElement]) -> Pose | None:
     angles = at.read_numbers("rpy", 3, (0.0, 0.0, 0.0))
     if position is None or angles is None or not at.check_position(position):
         return None
-    degrees = [angle for angle in angles if abs(angle) > LARGEST_ANGLE or (abs(angle) >= 4.0 and angle.is_integer())]
+    degrees = [angle for angle in angles if looks_like_degrees(angle)]
     if degrees:
         at.warning(
             f"rpy is in radians, and {degrees[0]:g} rad looks like degrees",

@@ -8,15 +8,21 @@ several has a mapping by coordinate: `limits: {x: [-1, 1], turn_deg: [-90, 90]}`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from modelserver.errors import quote, suggest_name
+from modelserver.errors import Severity, quote, suggest_name
 from modelserver.formats.reading import MAX_POSITION
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode
 from modelserver.geometry.inertia import RigidInertia, Rows
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.parts import Sigma
+from modelserver.geometry.plausibility import (
+    LARGEST_SIGMA,
+    LARGEST_SURVEY_SIGMA,
+    looks_like_degrees,
+    looks_like_radians,
+)
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
@@ -78,12 +84,23 @@ def _read_rotation(at: YamlMapping, key: str) -> Quaternion | None:
     angles = at.read_numbers(node, 3, key, "degrees" if degrees else "radians")
     if angles is None:
         return None
-    largest = max(angles, key=abs)
-    if not degrees and abs(largest) > math.tau:
-        message = f"rpy has {largest:.6g} rad, which is {abs(largest) / math.tau:.3g} turns"
-        at.warning(message, "where degrees were meant, write rpy_deg", node.line)
+    check_unit(at, angles, key, node.line)
     roll, pitch, yaw = map(math.radians, angles) if degrees else angles
     return so3.from_rpy(roll, pitch, yaw)
+
+
+def check_unit(at: YamlMapping, angles: Iterable[float], key: str, line: int) -> None:
+    """Warn of angles that look like those of the other unit."""
+    is_degrees = key.endswith("_deg")
+    is_other = looks_like_radians if is_degrees else looks_like_degrees
+    found = next((each for each in angles if math.isfinite(each) and is_other(each)), None)
+    if found is None:
+        return
+    if is_degrees:
+        fix = f"write {key.removesuffix('_deg')}, or {math.degrees(found):.6g}"
+        at.warning(f"{key}: {found:g} deg looks like radians", fix, line)
+    else:
+        at.warning(f"{key}: {found:g} rad looks like degrees", f"write {key}_deg", line)
 
 
 def _read_matrix(at: YamlMapping) -> Pose | None:
@@ -142,6 +159,12 @@ def read_sigma(owner: YamlMapping) -> SigmaDefaults | None:
     found = {key: _read_deviations(at, node, key, units[key]) for key, node in at.fields.items()}
     if degrees := found.get("rpy_deg"):
         found["rpy"] = so3.to_vector3(map(math.radians, degrees))
+    elif (turn := max(found.get("rpy") or (0.0,))) >= LARGEST_SURVEY_SIGMA:
+        at.warning(
+            f"rpy: a sigma of {turn:g} rad ({math.degrees(turn):.0f} deg)",
+            "write rpy_deg where degrees are meant",
+            at.line_of("rpy"),
+        )
     return None if None in found.values() else SigmaDefaults(found.get("xyz"), found.get("rpy"))
 
 
@@ -212,7 +235,8 @@ class _YamlJointReader:
 
     @property
     def has_errors(self) -> bool:
-        return len(self.at.builder.problems) > self.problem_count
+        new = self.at.builder.problems[self.problem_count :]
+        return any(each.severity is Severity.ERROR for each in new)
 
     def read(self) -> Joint | None:
         at = self.at
@@ -297,7 +321,16 @@ class _YamlJointReader:
             return {}
         node, name = (degrees, f"{key}_deg") if plain is None else (plain, key)
         value = None if node is None else read(node, name)
+        if value is not None and degrees is not None:
+            check_unit(at, value, name, degrees.line)
         value = value if degrees is None else _to_radians(value)
+        if key == "sigma" and value and self.is_angle[""] and value[0] >= LARGEST_SIGMA:
+            line = 0 if node is None else node.line
+            at.warning(
+                f"a sigma of {value[0]:g} rad ({math.degrees(value[0]):.0f} deg) of a joint",
+                "write sigma_deg where degrees are meant",
+                line,
+            )
         return {} if value is None else {"": value}
 
     def read_by_coordinate(self, key: str, node: YamlNode, read: _Read, omitted: _Values | None) -> dict[str, _Values]:

@@ -177,7 +177,7 @@ class _GeometryReader:
             self.template_uses.update(
                 v.text.strip() for body in bodies for k, v in body.pairs if k.text.strip() == "template"
             )
-            for name, key, value in top.enter(fields["bodies"], "bodies").pairs:
+            for name, key, value in self.list_bodies(top.enter(fields["bodies"], "bodies")):
                 self.read_body(name, key, value)
         elif not any(problem.severity is Severity.ERROR for problem in builder.problems):
             top.error("there are no bodies", "add bodies:, with a name and frames: for each")
@@ -188,6 +188,25 @@ class _GeometryReader:
             if not template.is_used:
                 source = Location(top.file, template.line, "templates")
                 builder.add_problem(Severity.NOTE, f"no body uses template {label(name)}", source)
+
+    def list_bodies(self, bodies: YamlMapping) -> list[tuple[str, YamlNode, YamlNode]]:
+        """Return the bodies; a key of one that stands beside it, not within, is an error and read as the body's."""
+        found: list[tuple[str, YamlNode, YamlNode]] = []
+        for name, key, value in bodies.pairs:
+            is_empty = bool(found) and (found[-1][2].is_null or found[-1][2].kind is NodeKind.MAPPING)
+            if name not in ("frames", "inertia", "visuals", "collisions") or not is_empty:
+                found.append((name, key, value))
+                continue
+            body, body_key, content = found[-1]
+            whole = YamlNode(NodeKind.MAPPING, content.line)
+            whole.pairs = [*content.pairs, (key, value)]
+            found[-1] = (body, body_key, whole)
+            self.builder.add_error(
+                f"{name} stands beside the body {label(body)}, not within it",
+                Location(bodies.file, key.line, f"body {label(body)}"),
+                f"indent {name} and what is below it further than {label(body)}",
+            )
+        return found
 
     def read_templates(self, templates: YamlMapping) -> None:
         for name, key, value in templates.pairs:

@@ -26,6 +26,7 @@ from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
+from modelserver.geometry.plausibility import find_reversed
 from modelserver.geometry.shape import Shape
 from modelserver.geometry.topology import Topology, full_name
 from modelserver.transforms.pose import Pose
@@ -339,7 +340,8 @@ class _ModelReview:
         return tuple(valid)
 
     def _check_end(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Location) -> bool:
-        fix = "write it as Body:Frame, with the names in the file"
+        listed = format_names([*bodies][: MAX_LISTED + 1])
+        fix = f"write it as Body:Frame; bodies are: {listed}" if bodies else "write it as Body:Frame"
         try:
             body, frame = names.split(end)
         except ValueError:
@@ -350,7 +352,9 @@ class _ModelReview:
             elif not bodies[body].has_frame(frame):
                 problem = f"names frame {quote(frame)}, which body {body} does not have"
                 known = [each.name for each in bodies[body].frames[: MAX_LISTED + 1]]
-                fix = f"body {body} has: {format_names(known)}"
+                fix = (
+                    f"body {body} has: {format_names(known)}" if known else f"add {frame} to the frames of body {body}"
+                )
             else:
                 return True
         near = self._suggest_end(end, bodies)
@@ -394,7 +398,8 @@ class _ModelReview:
                 message = f"body {body} is an orphan: no constraints lead to the root body {root[0]}; {end}"
                 fix = f"add a constraint that joins it to {root[0]} or to what is mounted there"
                 self.add_problem(Severity.WARNING, message, self.locations[body], fix)
-        for closing in topology.find_loop_closures():
+        closures = tuple(topology.find_loop_closures())
+        for closing in closures:
             found = loops.compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
             self.add_problem(
@@ -403,6 +408,16 @@ class _ModelReview:
                 f"{_describe_misclosure(found)}; answers take the shortest path",
                 sources[closing.constraint],
                 _suggest_fix(found) if bad else "",
+            )
+        # what closes a loop begins anywhere
+        for each in () if closures else find_reversed(bodies.values(), constraints):
+            far, near = each.from_.partition(":")[0], each.to.partition(":")[0]
+            self.add_problem(
+                Severity.WARNING,
+                f"constraint {each.name} goes from {far} to {near}, which is nearer to {root[0]}: its pose is measured "
+                f"from {far}",
+                sources[each.name],
+                "exchange From and To if it was measured from the vehicle",
             )
         if self.repair:
             valid = set(root)

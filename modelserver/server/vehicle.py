@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from modelserver import core, errors, messages
 from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
@@ -24,6 +25,7 @@ from modelserver.formats import FileExamination, examine_file
 from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
+from modelserver.geometry.plausibility import is_far
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.signing.key_files import read_keys
@@ -281,7 +283,7 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
     model = geometry.model
     if model is None and geometry.problems:
         raise errors.GeometryError(geometry.problems)
-    if model is None or problems:
+    if model is None or has_error(problems):
         raise errors.ConfigError(problems)
     mounts = None
     gps, imu = config.sensors.gps, config.sensors.imu
@@ -308,7 +310,7 @@ def examine_vehicle(
             problems.append(_make_problem(file, "geometry", why))
     if geometry.partial_model is not None:
         problems += find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
-    if geometry.model is not None and not problems:
+    if geometry.model is not None and not has_error(problems):
         problems += _find_dynamics_problems(config, geometry.model, file)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
@@ -324,6 +326,11 @@ def examine_vehicle(
     except GeodesyError as error:
         problems.append(_make_problem(file, "origin.initial_utm", str(error)))
     return geometry, tuple(add_lines(problems, file))
+
+
+def has_error(problems: Iterable[errors.Problem]) -> bool:
+    """Return whether one of the problems is an error."""
+    return any(each.severity is errors.Severity.ERROR for each in problems)
 
 
 def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> errors.Problem:
@@ -367,7 +374,49 @@ def find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole
             why = f"joint {joints[0].name} moves {frame} relative to the vehicle; localization needs a rigid mount"
             fix = "name a frame that is fixed to the vehicle, or make the constraint fixed"
             problems.append(_make_problem(file, key, why, fix))
+    if not problems:
+        problems += _find_improbable_mounts(config, model, file)
     return problems
+
+
+SAME_PLACE: Final = 0.01
+"""Meters within which two wheels of a vehicle do not stand."""
+
+_SIDES: Final = {"left": 1.0, "right": -1.0}
+
+
+def _find_improbable_mounts(config: VehicleConfig, model: Model, file: str) -> Iterator[errors.Problem]:
+    """Yield wheels in one place, wheels on the other side than their name has, and sensors far from the vehicle."""
+
+    def locate(frame: str) -> tuple[float, float, float]:
+        return model.get_transformation(frame, config.base_frame).pose.xyz
+
+    def warn(key: str, why: str, fix: str) -> errors.Problem:
+        return errors.Problem(errors.Severity.WARNING, why, errors.Location(file, element=key), fix)
+
+    sensors = config.sensors
+    for key, sensor in (("gps", sensors.gps), ("imu", sensors.imu)):
+        if sensor is not None and is_far(place := locate(sensor.frame)):
+            far = math.hypot(*place)
+            what = f"{sensor.frame} is {far:g} m from {config.base_frame}"
+            yield warn(f"sensors.{key}.frame", what, f"positions are in meters; {far / 1000.0:g} m?")
+    wheels = sensors.wheels.frames if sensors.wheels is not None else {}
+    places = {name: locate(frame) for name, frame in wheels.items()}
+    for (a, at), (b, other) in combinations(places.items(), 2):
+        if math.dist(at, other) < SAME_PLACE:
+            where = "in one frame" if wheels[a] == wheels[b] else "in one place"
+            why = f"the wheels {a} and {b} stand {where}, {wheels[b]}"
+            yield _make_problem(
+                file, f"sensors.wheels.frames.{b}", why, "name the frame of its own contact point for each"
+            )
+            return
+    for name, (_, y, _) in places.items():
+        named = [sign for side, sign in _SIDES.items() if side in name.lower()]
+        if len(named) == 1 and y * named[0] < -SAME_PLACE:
+            actual = "left" if y > 0.0 else "right"
+            why = f"the wheel {name} stands {abs(y):g} m to the {actual} of {config.base_frame}"
+            fix = f"y is positive to the left: exchange the frames, or correct {wheels[name]}"
+            yield warn(f"sensors.wheels.frames.{name}", why, fix)
 
 
 def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:

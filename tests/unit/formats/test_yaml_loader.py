@@ -59,8 +59,8 @@ def test_a_pose_may_be_written_in_each_way(text):
 def test_radians_beyond_a_turn_are_warned_of_as_degrees():
     model = read(with_mast("{rpy: [0, -10, 0]}"))
     (problem,) = (each for each in model.problems if each.severity is Severity.WARNING)
-    assert problem.message == "rpy has -10 rad, which is 1.59 turns"
-    assert problem.fix == "where degrees were meant, write rpy_deg"
+    assert problem.message == "rpy: -10 rad looks like degrees"
+    assert problem.fix == "write rpy_deg"
     assert not [each for each in read(with_mast("{rpy: [0, -6.2, 0]}")).problems if each.severity is Severity.WARNING]
 
 

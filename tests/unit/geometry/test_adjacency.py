@@ -167,8 +167,8 @@ def test_given_an_unconstrained_frame_then_what_hung_on_it_is_an_orphan_that_ans
     builder = ModelBuilder.from_model(model)
     assert builder.remove_constraints(model.frame("Left:Mount")) == ("LeftFixed",)
     left = builder.build()
-    assert [str(each.severity) for each in left.problems] == ["warning", "warning"]
-    assert [each.message.split(":")[0] for each in left.problems] == [
+    assert {str(each.severity) for each in left.problems} == {"warning"}
+    assert [each.message.split(":")[0] for each in left.problems if "orphan" in each.message] == [
         "body Left is an orphan",
         "body Lamp is an orphan",
     ]
@@ -181,7 +181,7 @@ def test_given_an_unconstrained_frame_then_what_hung_on_it_is_an_orphan_that_ans
 
     repaired = builder.build(repair=True)
     assert repaired.get_body_list() == ["Cart", "Right"]
-    assert all("removed" in each.message for each in repaired.problems)
+    assert all("removed" in each.message for each in repaired.problems if "orphan" in each.message)
 
 
 def test_given_several_constraints_then_one_is_removed_by_name_or_all_are() -> None:

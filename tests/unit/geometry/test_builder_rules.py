@@ -190,7 +190,7 @@ def test_given_several_constraints_on_a_frame_when_not_strict_then_all_count(rep
     builder.add_body("Lamp", source=at(20)).add_frame("Foot")
     builder.add_body("Horn", source=at(21)).add_frame("Foot")
     builder.add_constraint("LampFixed", "Cart:Top", "Lamp:Foot", Pose((0, 1, 0)), source=at(22))
-    builder.add_constraint("HornFixed", "Horn:Foot", "Cart:Top", Pose((0, 1, 0)), source=at(23))
+    builder.add_constraint("HornFixed", "Cart:Top", "Horn:Foot", Pose((0, -1, 0)), source=at(23))
     model = builder.build(repair=repair)
     assert model.problems == ()
     assert len(model.constraints) == 4

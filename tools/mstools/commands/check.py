@@ -80,7 +80,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     """Return the model of a vehicle file, None if it has an error, and all problems. Raises OSError."""
     # imported here: a geometry file needs no configuration libraries and no geodesy
     from modelserver.config.vehicle_file import add_lines, load_partly
-    from modelserver.server.vehicle import examine_vehicle, load_vehicle
+    from modelserver.server.vehicle import examine_vehicle, has_error, load_vehicle
 
     try:
         config, problems = load_partly(file, blank=True)
@@ -96,7 +96,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
         # valid, but rarely intended
         words = "no localization sensor is configured, so there is no pose"
         more.append(Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md"))
-    if geometry.model is not None and config.base_frame and not of_vehicle:
+    if geometry.model is not None and config.base_frame and not has_error(of_vehicle):
         try:
             vehicle = load_vehicle(config, file, strict)
             if not any(each.element.partition(".")[0] == "sensors" for each in problems):

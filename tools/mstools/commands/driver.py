@@ -63,10 +63,11 @@ def find_misnamed(
     vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.factory import find_unknown_joint, find_unknown_wheels
+    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
 
     wheels = vehicle.sensors.wheels
     for driver in drivers:
+        yield from find_backward_counters(driver)
         # the server does not receive a driver on another channel
         if wheels is not None and driver.channel in ("", wheels.channel):
             yield from find_unknown_wheels(driver, wheels.frames)
