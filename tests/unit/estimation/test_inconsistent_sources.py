@@ -24,6 +24,7 @@ pytestmark = pytest.mark.slow
 EIGHTS = figure_eight(speed=3.0, radius=8.0, stationary=4.0, laps=6)
 BEGIN, END, SECONDS = 60.0, 90.0, 120.0
 EARTH_RADIUS = 6.37e6
+HEADING_LEVEL = math.radians(20.0)
 
 Shift = Callable[[float], complex]
 
@@ -121,6 +122,8 @@ def test_given_sources_as_they_are_modeled_then_nothing_is_found_and_every_pose_
     assert all(row.valid for row in rows)
     # 5.6 sigma of the error of fixes, and a little for what is not explained
     assert max(row.estimate.horizontal_protection_level for row in rows) < 3.0
+    # some deg of the heading, and by what a gyro might turn it for seconds unseen
+    assert max(row.estimate.heading_protection_level for row in rows) < HEADING_LEVEL
 
 
 @pytest.mark.parametrize("rate", [0.3, 0.5j, -1.0])
@@ -207,6 +210,10 @@ def test_given_one_outlier_then_nothing_is_found_and_the_pose_stays() -> None:
     assert list_events(found) == []
     assert len(found.decisions("gps_position", Verdict.REJECTED)) == 1
     assert all(row.valid and row.off < 1.0 for row in found.between(BEGIN))
+    # it teaches nothing about the noise of fixes
+    usual = drive_with(move_fixes(lambda _: 0j))
+    pairs = zip(found.between(BEGIN + 5.0), usual.between(BEGIN + 5.0), strict=True)
+    assert all(a.estimate.horizontal_protection_level < 1.02 * b.estimate.horizontal_protection_level for a, b in pairs)
 
 
 def test_given_fixes_that_are_off_for_seconds_then_they_are_not_used_and_soon_trusted_again() -> None:

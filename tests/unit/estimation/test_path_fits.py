@@ -283,6 +283,18 @@ def test_given_a_heading_that_walks_then_its_path_is_uncertain_across_itself_by_
     assert east + north == pytest.approx(1e-8 * seconds / 3.0 * abs(way) ** 2, rel=1e-3)
 
 
+def test_given_wheels_that_slip_then_the_path_is_uncertain_by_its_length_and_by_its_time() -> None:
+    *_, end = drive(20.0, Fault())
+    start = end.monitor.newest[0]._replace(heading_variance=0.0, rate_variance=0.0, scale_variance=0.0)
+    end_node = end.node._replace(lost=start.lost, unmeasured=start.unmeasured)
+    found = compare_window(start, end_node, NOISE._replace(heading=0.0), SETTINGS)
+    seconds, driven = end_node.seconds - start.seconds, end_node.distance - start.distance
+    # white noises that last slip_time: one of the way, one of the time
+    along = SETTINGS.slip_ratio**2 * driven**2 * SETTINGS.slip_time / seconds
+    aside = SETTINGS.side_sigma**2 * SETTINGS.slip_time * seconds
+    assert found.covariance == pytest.approx((along + aside, along + aside, 0.0))
+
+
 def test_given_fixes_that_hardly_move_then_their_direction_shows_no_heading() -> None:
     *_, end = drive(20.0, Fault())
     start = end.monitor.newest[0]
