@@ -32,6 +32,7 @@ from modelserver.signing.key_files import read_keys
 from modelserver.signing.signatures import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import get_type_name
+from modelserver.wire.urls import leaves_machine
 
 if TYPE_CHECKING:
     from modelserver.estimation.modes import LocalizerConfig
@@ -321,11 +322,27 @@ def examine_vehicle(
     if config.localization.mode_channel and not config.commands.key_file:
         why = f"mode commands must be signed: {KEY_HINT}"
         problems.append(_make_problem(file, "localization.mode_channel", why))
+    if text := find_unsigned_drive(config):
+        is_written = config.commands.drive == "unsigned"
+        severity = errors.Severity.NOTE if is_written else errors.Severity.WARNING
+        place = errors.Location(file, element="commands")
+        fix = f"{KEY_HINT}; or write ttl=0 in lcm.url, or drive: unsigned to accept it"
+        problems.append(errors.Problem(severity, text, place, fix))
     try:
         get_configured_origin(config)
     except GeodesyError as error:
         problems.append(_make_problem(file, "origin.initial_utm", str(error)))
     return geometry, tuple(add_lines(problems, file))
+
+
+def find_unsigned_drive(config: VehicleConfig) -> str:
+    """Return who can drive the vehicle without a signature, empty if nobody on another machine can."""
+    drives = [name for name, driver in config.drivers.items() if driver.get("command")]
+    if not drives or config.commands.is_drive_signed or not leaves_machine(config.lcm.url):
+        return ""
+    return (
+        f"every host on the network of {config.lcm.url} can drive the vehicle through driver {drives[0]}: no signature"
+    )
 
 
 def has_error(problems: Iterable[errors.Problem]) -> bool:

@@ -105,6 +105,12 @@ class UdpAddress:
     buffer: int = 0
 
 
+def leaves_machine(url: str) -> bool:
+    """Return whether messages on a bus reach other machines; empty: the default, which is local."""
+    address = parse_udp_address(url) if url else None
+    return address is not None and address.ttl > 0
+
+
 def parse_udp_address(url: str) -> UdpAddress | None:
     """Parse an LCM URL; None for another provider than udpm, and for an invalid URL."""
     default = UdpAddress()

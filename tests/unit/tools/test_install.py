@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.errors import ConfigError, ModelServerError
+from modelserver.errors import ConfigError, ModelServerError, Severity
 from modelserver.signing.key_files import generate_key, write_key
 from mstools.cli import main
 from mstools.commands import install
+from mstools.commands.check import check_vehicle
 from mstools.deployment import steps as install_steps
 from mstools.deployment.files import (
     SerialDriver,
@@ -32,6 +33,7 @@ from mstools.deployment.plan import SYSCTL, SystemFacts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 OWN_KEY = "commands.key"
+NOTE, WARNING = Severity.NOTE, Severity.WARNING
 TEMPLATES = install.read_templates()
 
 Output = tuple[int, str, str]
@@ -495,3 +497,34 @@ def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> 
 )
 def test_given_a_limit_then_it_is_raised_where_it_is_too_low(facts: SystemFacts, count: int) -> None:
     assert len(render_sysctl(4_194_304, facts)) == count
+
+
+LOCAL, REMOTE = "udpm://239.255.76.67:7667?ttl=0", "udpm://239.255.76.67:7667?ttl=1"
+
+
+def write_bus(vehicle: Path, url: str, commands: str) -> None:
+    text = re.sub(r"(?m)^(lcm|commands):.*\n(?:[ #].*\n)*", "", vehicle.read_text())
+    vehicle.write_text(f'{text}\nlcm: {{url: "{url}"}}\n{commands}')
+
+
+@pytest.mark.parametrize(
+    ("url", "commands", "is_refused"),
+    [
+        (LOCAL, "", False),
+        (REMOTE, "", True),
+        (REMOTE, "commands: {drive: unsigned}\n", False),
+        (REMOTE, "commands: {reload: true, key_file: commands.key}\n", False),
+    ],
+)
+def test_given_a_vehicle_that_any_host_can_drive_then_it_is_installed_only_if_that_is_written_down(
+    run: Callable[..., Output], vehicle: Path, url: str, commands: str, is_refused: bool
+) -> None:
+    write_bus(vehicle, url, commands)
+    if "key_file" in commands:
+        write_key(vehicle.parent / "commands.key", generate_key("own"))
+    code, _, err = run("install", "--vehicle", str(vehicle), "--dry-run", "--serial", "gps=usb-X_1-if00")
+    assert ("can drive the vehicle through driver raptor: no signature" in err) is is_refused
+    assert code == (1 if is_refused else 0), err
+    _, problems = check_vehicle(str(vehicle))
+    found = [each.severity for each in problems if "can drive the vehicle" in each.message]
+    assert found == ([] if url == LOCAL or "key_file" in commands else [NOTE if commands else WARNING])

@@ -71,7 +71,8 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
 
     Raises ConfigError with all problems; ModelServerError, OSError.
     """
-    from modelserver.config.vehicle_file import load_partly
+    from modelserver.config.vehicle_file import KEY_HINT, load_partly
+    from modelserver.server.vehicle import find_unsigned_drive
 
     gathered = ProblemCollector()
     with gathered.collect("this installation"):
@@ -112,6 +113,8 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
     if made is not None:
         with gathered.collect("commands.key_file"):
             install_files.render_credential_drop_in(made.installed_key)
+        if made.config.commands.drive != "unsigned" and (text := find_unsigned_drive(made.config)):
+            gathered.add("commands.drive", text, f"{KEY_HINT}; or write drive: unsigned to accept it")
         with gathered.collect("--serial"):
             install_files.check_serial(serial, made.serial_of(names))
     gathered.raise_any()
