@@ -130,7 +130,7 @@ class Ros:
     def text(self, words: str) -> Any:
         return self.make(TYPES["text"], data=words)
 
-    def write(self, path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:
+    def write(self, path: Path, messages: Iterable[tuple[str, int, Any]], *, in_mcap: bool = False) -> Path:
         """Write a bag of messages (topic, receive time in ns, message) and return its path."""
         if self.version == 1:
             from rosbags.rosbag1 import Writer as Writer1
@@ -138,9 +138,10 @@ class Ros:
             writer: Any = Writer1(path)
             serialize = self.store.serialize_ros1
         else:
+            from rosbags.rosbag2 import StoragePlugin
             from rosbags.rosbag2 import Writer as Writer2
 
-            writer = Writer2(path, version=9)
+            writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP if in_mcap else StoragePlugin.SQLITE3)
             serialize = self.store.serialize_cdr
         with writer:
             topics: dict[str, Any] = {}

@@ -111,6 +111,28 @@ def test_given_a_bag_of_ros_2_when_imported_then_it_reads_alike(tmp_path: Path) 
     assert [each.speed for each in wheels.wheels] == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("in_mcap", [True, False])
+@pytest.mark.parametrize("given", ["file", "folder"])
+def test_given_a_recording_of_ros_2_without_its_metadata_then_it_reads_alike_as_file_and_as_folder(
+    tmp_path: Path, given: str, in_mcap: bool
+) -> None:
+    ros = Ros(2)
+    messages = [("/fix", START_NS, ros.fix()), ("/odom", START_NS + 1000, ros.odom(speed=1.0))]
+    bag = ros.write(tmp_path / "two", messages, in_mcap=in_mcap)
+    (bag / "metadata.yaml").unlink()
+    (file,) = bag.iterdir()
+    import_bag(file if given == "file" else bag, tmp_path / "a.lcm")
+    gps, wheels = (decode(TYPE_NAMES[each.channel], each.data) for each in events(tmp_path / "a.lcm"))
+    assert gps.latitude_deg == 42.0
+    assert [each.speed for each in wheels.wheels] == [1.0, 1.0]
+
+
+def test_given_a_folder_without_a_recording_then_it_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(RecordingError, match=r"no metadata\.yaml, no \.mcap and no \.db3 file in it"):
+        import_bag(tmp_path, tmp_path / "a.lcm")
+
+
 # --- which topics -------------------------------------------------------------------------------------------
 
 

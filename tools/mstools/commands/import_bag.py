@@ -27,7 +27,7 @@ from mstools.recordings.bag_messages import (
     TopicKind,
 )
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
-from mstools.recordings.mcap_log import is_mcap, open_mcap
+from mstools.recordings.mcap_log import is_mcap, is_ros_mcap, open_mcap
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import show_progress
@@ -140,7 +140,7 @@ def import_bag(
         raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
     part = log_path.with_name(f".{log_path.name}.{os.getpid()}.part")
     try:
-        if is_mcap(bag_path):
+        if is_mcap(bag_path) and not is_ros_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
         else:
             with open_bag(bag_path) as bag:
@@ -162,8 +162,8 @@ def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) ->
         }
         if not reports:
             raise RecordingError(
-                f"{mcap_path}: no LCM messages (/lcm/...): modelserver export writes them without --no-raw. A ROS 2 "
-                "recording is given by its folder"
+                f"{mcap_path}: no LCM messages (/lcm/...), and none of ROS 2; modelserver export writes those of LCM "
+                "without --no-raw"
             )
         if has_kinds:
             raise RecordingError(f"{mcap_path}: --topic goes with a ROS bag; this file has the messages as they were")

@@ -52,7 +52,7 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag: a ROS 1 file, or the folder of a ROS 2 recording. Raises RecordingError, OSError."""
+    """Open a bag: a ROS 1 file, or the file or folder of a ROS 2 recording. Raises RecordingError, OSError."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -68,12 +68,22 @@ def open_bag(path: Path) -> Iterator[Bag]:
     reader = None
     with _explain_errors(path, "on opening it"):
         # ROS 2 bags may lack their type definitions; those of ROS itself have been stable
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader = AnyReader(_list_files(path), default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     try:
         yield Bag(path, reader)
     finally:
         reader.close()
+
+
+def _list_files(path: Path) -> list[Path]:
+    """Return what to read of a bag: itself, or the files of a folder that has lost its metadata.yaml."""
+    if path.is_file() or (path / "metadata.yaml").exists():
+        return [path]
+    for suffix in (".mcap", ".db3"):
+        if found := sorted(each for each in path.iterdir() if each.suffix == suffix and each.is_file()):
+            return found
+    raise RecordingError(f"{path}: no bag: there is no metadata.yaml, no .mcap and no .db3 file in it")
 
 
 @contextmanager

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 from modelserver.errors import RecordingError
+from mstools.recordings.bag_reader import open_bag
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 ENCODING: Final = "lcm"
+ROS_ENCODING: Final = "cdr"
 TOPIC_PREFIX: Final = "/lcm/"
 
 
@@ -23,7 +25,10 @@ class RecordedMessage(NamedTuple):
 
 
 class McapLog:
-    """An MCAP file: `channels` has the LCM channels with their types and counts of messages."""
+    """An MCAP file: `channels` has the LCM channels with their types and counts of messages.
+
+    has_ros: whether it has messages of ROS 2.
+    """
 
     def __init__(self, path: Path, file: IO[bytes]):
         from mcap.reader import make_reader
@@ -33,6 +38,7 @@ class McapLog:
         if summary is None:
             raise RecordingError(f"{path}: the MCAP file has no summary: it was not closed; `mcap recover` repairs it")
         counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
+        self.has_ros = any(each.message_encoding == ROS_ENCODING for each in summary.channels.values())
         self.channels: dict[str, tuple[str, int]] = {}
         for number, each in summary.channels.items():
             if each.message_encoding == ENCODING and each.topic.startswith(TOPIC_PREFIX):
@@ -53,6 +59,20 @@ def is_mcap(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return file.read(len(MAGIC)) == MAGIC
+
+
+def is_ros_mcap(path: Path) -> bool:
+    """Return whether a path is an MCAP file of ROS 2, also one whose end is missing. Raises OSError."""
+    if not is_mcap(path):
+        return False
+    try:
+        with open_mcap(path) as mcap:
+            return mcap.has_ros and not mcap.channels
+    except RecordingError:
+        # the reader of bags reads one that was not closed
+        with suppress(RecordingError), open_bag(path) as bag:
+            return bool(bag.topics)
+    return False
 
 
 @contextmanager
