@@ -3,6 +3,8 @@
 Causality: the estimate for a time t uses the events that precede, in the log, the first one whose arrival (the log's
 timestamp, not the sample's stamp) is t or later. It is the answer to a client that asks at t with policy PREDICTED:
 predicted beyond the newest sample, or interpolated if a sample with a later stamp has arrived.
+
+Where all stamps are on another axis than the log's times, those are moved to the axis of the stamps (`stamp_axis`).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from modelserver.geometry import names
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.requests.signed_commands import MODE_TYPE
+from modelserver.server.stamp_axis import StampAxis, align
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms.so3 import Quaternion
 from modelserver.wire.channels import SIGNED
@@ -84,6 +87,7 @@ class OfflineRun:
     unconfigured_channels: channels of the log that the vehicle file does not name.
     rejected: rejected messages and samples by channel or source, and reason.
     position: bytes of the log read so far.
+    axis: how the stamps are off the log's times.
     """
 
     vehicle: Vehicle
@@ -98,6 +102,7 @@ class OfflineRun:
     first_utime: int = 0
     last_utime: int = 0
     position: int = 0
+    axis: StampAxis = field(default_factory=StampAxis)
     _state: CoreState | None = None
 
     def __post_init__(self) -> None:
@@ -112,7 +117,7 @@ class OfflineRun:
         ticks = iter(times) if times is not None else None
         due: int | None = None
         number = 0
-        for event in self.log:
+        for event in align(self.log, channels, self.axis):
             if self._state is None:
                 self.first_utime = event.utime
                 self._state = self._start(_instant(event.utime))

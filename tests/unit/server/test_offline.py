@@ -217,3 +217,48 @@ def test_given_a_row_when_written_then_tenths_of_a_millimeter_survive() -> None:
     )
     assert TrackRow(T0, invalid=3).to_csv() == "1700000000000000,nan,nan,nan,nan,nan,nan,nan,0,3,,,,,,,,,"
     assert row.to_csv().count(",") == CSV_HEADER.count(",")
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "known"),
+    [
+        (-1_700_000_000.0, "(from 0 on, as of a simulation"),
+        (3600.0, "3,600.0 s (1 h: a time zone?) ahead of"),
+        (-7200.3, "(2 h: a time zone?) behind"),
+        (18.0, "18.0 s (GPS time instead of UTC?) ahead of"),
+        (-0.999 * T0 * 1e-6, "(milliseconds instead of microseconds?) behind"),
+        (999.0 * T0 * 1e-6, "(nanoseconds instead of microseconds?) ahead of"),
+        (-40.0, "all stamps are 40.0 s behind their receipt"),
+    ],
+)
+def test_given_stamps_on_another_axis_then_the_log_is_evaluated_on_it_and_the_amount_is_reported(
+    offset_s: float, known: str
+) -> None:
+    offset = round(offset_s * 1e6) + 1000 * (offset_s < -1e9)
+    run = OfflineRun(vehicle(), [gps(n * 100, n * 100 + offset) for n in range(5)], "V:Base")
+    rows = list(run.rows([T0 + offset + 150, T0 + offset + 350]))
+    assert [row.easting - 1000.0 for row in rows] == [2, 4]
+    (sentence,) = run.axis.describe()
+    assert known in sentence
+    assert "evaluated on the axis of the stamps" in sentence
+
+
+def test_given_one_source_with_another_clock_then_that_one_is_named_and_nothing_is_moved() -> None:
+    log = [event for n in range(5) for event in (gps(n * 100), absolute_pose(n * 100 + 50, -3_600_000_000))]
+    run = OfflineRun(vehicle(), log, "V:Base")
+    assert [row.utime for row in run.rows([T0 + 150])] == [T0 + 150]
+    assert run.axis.describe() == [
+        "the stamps on MAP are 3,600.0 s (1 h: a time zone?) behind their receipt: the clock of that source is off"
+    ]
+
+
+def test_given_stamps_that_are_late_by_seconds_then_they_are_as_they_are() -> None:
+    run = OfflineRun(vehicle(), [gps(n * 100, n * 100 - 3_000_000) for n in range(5)], "V:Base")
+    list(run.rows([T0]))
+    assert run.axis.describe() == []
+
+
+def absolute_pose(arrival: int, offset: int) -> LogEvent:
+    header = SensorHeader(T0 + arrival + offset, "map")
+    data = encode(AbsolutePoseSample(header, "V:Base", "World:UTM", (1.0, 2.0, 3.0)))
+    return LogEvent(0, T0 + arrival, "MAP", data, arrival)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
+from modelserver.server.stamp_axis import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
 from mstools.recordings.bag_messages import (
     CONVERTERS,
@@ -237,6 +239,7 @@ def _write(
     """Write the messages of the chosen topics; return the seconds between the first and the last."""
     converters = {name: CONVERTERS[kind](options) for name, kind in chosen.items()}
     unstamped = dict.fromkeys(chosen, 0)
+    offsets: dict[str, list[float]] = {name: [] for name in chosen}
     total = sum(each.count for each in bag.topics if each.name in chosen)
     for name, kind in chosen.items():
         reports[name].channel = f"{prefix}{kind.upper()}"
@@ -252,6 +255,8 @@ def _write(
                 if utime <= 0:
                     utime = arrived
                     unstamped[name] += 1
+                elif len(offsets[name]) < LOOKED_AT:
+                    offsets[name].append((utime - arrived) * 1e-6)
                 header = SensorHeader(utime, chosen[name].value, report.written, arrived)
                 sample = converters[name].convert(header, message)
                 out.write_event(arrived, report.channel, codec.encode(sample))
@@ -264,8 +269,13 @@ def _write(
         out.close()
     if not done:
         raise RecordingError("the bag has no messages")
+    axis = StampAxis({name: statistics.median(values) for name, values in offsets.items() if values}, last * 1e-6)
     for name, each in converters.items():
         reports[name].notes += each.notes()
+        offset = axis.by_channel.get(name, 0.0)
+        if abs(offset) > LARGEST_DELAY_S:
+            whose = "all stamps are" if axis.common else "the stamps of this source alone are"
+            reports[name].notes.append(f"{whose} {axis.format(offset)} their receipt")
         if unstamped[name]:
             reports[name].notes.append(f"{unstamped[name]} messages without a stamp got their receive time")
     return (last - first) * 1e-6

@@ -238,6 +238,8 @@ def replay_offline(
         text = counts.to_text(run, wall, bool(poses))
         on_stderr = "-" in (poses, decisions, report)
         typer.echo(json.dumps(counts.as_data(run, wall)) if as_json else text, err=on_stderr)
+        for sentence in run.axis.describe():
+            typer.echo(f"{log}: {sentence}", err=True)
         if times and poses:
             _warn_of_times(times, run, at_times)
         if not run.samples:

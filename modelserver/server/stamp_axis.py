@@ -1,0 +1,104 @@
+"""The stamps of a recording beside the times of their receipt: one axis or two, and known amounts between them. Pure.
+
+A simulation stamps from 0 s and is recorded by the clock of the wall; a recorder may run an hour off. If all sources
+are off by one amount the recording is sound: its receive times are moved to the axis of the stamps. If one is off
+alone, it is that one's clock.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Final
+
+from modelserver.server.ingress import SensorChannel, peek_sample_id
+from modelserver.wire.codec import fingerprint_of
+from modelserver.wire.eventlog import LogEvent
+
+LARGEST_DELAY_S: Final = 5.0
+"""Largest difference of stamp and receipt that buses and latencies explain, seconds."""
+
+SPREAD_S: Final = 2.0
+"""Within which the sources of one clock agree, seconds."""
+
+LOOKED_AT: Final = 4000
+"""Events that are looked at: some ten seconds of a vehicle's sensors."""
+
+SINCE_START_S: Final = 1e9
+"""Seconds since 1970 that no clock has that was ever set: 2001."""
+
+LEAP_S: Final = 18.0
+"""GPS time less UTC since 2017."""
+
+
+@dataclass(slots=True)
+class StampAxis:
+    """Offsets of stamps from receipt: of each channel, and of all together where they agree; seconds, 0 for none.
+
+    received_s: the time of receipt, seconds since 1970.
+    """
+
+    by_channel: Mapping[str, float] = field(default_factory=dict)
+    received_s: float = 0.0
+
+    @property
+    def common(self) -> float:
+        """What all sources are off by; 0 if they are not, or not by one amount."""
+        values = list(self.by_channel.values())
+        if not values or max(values) - min(values) > SPREAD_S:
+            return 0.0
+        middle = statistics.median(values)
+        return middle if abs(middle) > LARGEST_DELAY_S else 0.0
+
+    def describe(self) -> list[str]:
+        """Describe what is off, a sentence for each; empty if nothing is."""
+        if self.common:
+            return [f"all stamps are {self.format(self.common)} their receipt: evaluated on the axis of the stamps"]
+        return [
+            f"the stamps on {channel} are {self.format(offset)} their receipt: the clock of that source is off"
+            for channel, offset in self.by_channel.items()
+            if abs(offset) > LARGEST_DELAY_S
+        ]
+
+    def format(self, offset: float) -> str:
+        """Format an offset with what it is known as, e.g. `3,600.0 s (1 h: a time zone?) behind`."""
+        size, stamp_s = abs(offset), self.received_s + offset
+        hours = round(size / 3600.0)
+        known = ""
+        if abs(size - LEAP_S) < 0.5:
+            known = " (GPS time instead of UTC?)"
+        elif 1 <= hours <= 14 and abs(size - 3600.0 * hours) < SPREAD_S:
+            known = f" ({hours} h: a time zone?)"
+        elif abs(1000.0 * stamp_s / max(self.received_s, 1.0) - 1.0) < 0.01:
+            known = " (milliseconds instead of microseconds?)"
+        elif abs(stamp_s / max(1000.0 * self.received_s, 1.0) - 1.0) < 0.01:
+            known = " (nanoseconds instead of microseconds?)"
+        elif stamp_s < SINCE_START_S < self.received_s:
+            known = " (from 0 on, as of a simulation, or of a unit since its start?)"
+        return f"{size:,.1f} s{known} {'ahead of' if offset > 0.0 else 'behind'}"
+
+
+def measure(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel]) -> StampAxis:
+    """Return the median offset of the stamps of each channel of sensors."""
+    offsets: dict[str, list[float]] = {}
+    received_s = 0.0
+    for event in events:
+        received_s = event.utime * 1e-6
+        channel = channels.get(event.channel)
+        found = None if channel is None else peek_sample_id(event.data, fingerprint_of(channel.type_name))
+        if found is not None:
+            offsets.setdefault(event.channel, []).append((found.utime - event.utime) * 1e-6)
+    return StampAxis({name: statistics.median(values) for name, values in offsets.items()}, received_s)
+
+
+def align(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel], axis: StampAxis) -> Iterator[LogEvent]:
+    """Yield events with their receipt on the axis of the stamps; what is found is written to `axis`."""
+    waiting = iter(events)
+    first = [event for event, _ in zip(waiting, range(LOOKED_AT), strict=False)]
+    found = measure(first, channels)
+    axis.by_channel, axis.received_s = found.by_channel, found.received_s
+    offset = round(axis.common * 1e6)
+    for event in chain(first, waiting):
+        yield event._replace(utime=event.utime + offset) if offset else event
