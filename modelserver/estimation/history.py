@@ -181,14 +181,18 @@ class History:
         return other
 
     def copy_recent(self, seconds: float) -> History:
-        """Return a copy of the last seconds, in blocks that no successor extends."""
-        other = self.with_duration(self._horizon * 1e-6)
+        """Return a copy of the last seconds, in blocks that no successor extends and that hold nothing else."""
+        other = History(0.0)
+        other._horizon = self._horizon
         if self._end > self._start:
-            first, start = divmod(self._find(self.last - round(seconds * 1e6), bisect_left), BLOCK)
-            number, used = divmod(self._end, BLOCK)
-            last = (self._blocks[number].copy(used),) if used else ()
-            other._blocks = (*self._blocks[first:number], *last)
-            other._start, other._end = start, self._end - first * BLOCK
+            first = self._find(self.last - round(seconds * 1e6), bisect_left)
+            blocks: list[_Block] = []
+            for index in range(first, self._end):
+                if not (index - first) % BLOCK:
+                    blocks.append(_Block())
+                blocks[-1].times.append(self._time(index))
+                blocks[-1].estimates.append(self._blocks[index // BLOCK].estimates[index % BLOCK])
+            other._blocks, other._end = tuple(blocks), self._end - first
         return other
 
     def at(self, utime: int) -> Estimate:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from typing import Final
 
 from modelserver.server.ingress import SensorChannel, peek_sample_id
@@ -96,7 +96,7 @@ def measure(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel]) -
 def align(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel], axis: StampAxis) -> Iterator[LogEvent]:
     """Yield events with their receipt on the axis of the stamps; what is found is written to `axis`."""
     waiting = iter(events)
-    first = [event for event, _ in zip(waiting, range(LOOKED_AT), strict=False)]
+    first = list(islice(waiting, LOOKED_AT))
     found = measure(first, channels)
     axis.by_channel, axis.received_s = found.by_channel, found.received_s
     offset = round(axis.common * 1e6)

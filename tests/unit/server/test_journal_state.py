@@ -79,7 +79,7 @@ def test_given_a_state_when_read_back_then_values_are_shared_as_they_were(tmp_pa
     _, back = journal_state.decode_run(journal_state.encode_run(RunState(rig.vehicle.config, state)))
 
     def counts(state: CoreState) -> tuple[int, int, int, bool]:
-        held = state.history._estimates
+        held = [each for block in state.history._blocks for each in block.estimates]
         rig = state.localizer.config.setup.rig  # type: ignore[union-attr]
         setups, states = {id(each.setup) for each in held}, {id(each.state) for each in held}  # type: ignore[union-attr]
         covariances = {id(each.state.nav.covariance) for each in held}  # type: ignore[union-attr]

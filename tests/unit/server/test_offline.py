@@ -32,6 +32,7 @@ from modelserver.messages import (
 )
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.offline import CSV_HEADER, OfflineRun, TrackRow
+from modelserver.server.stamp_axis import LOOKED_AT
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent
@@ -262,3 +263,8 @@ def absolute_pose(arrival: int, offset: int) -> LogEvent:
     header = SensorHeader(T0 + arrival + offset, "map")
     data = encode(AbsolutePoseSample(header, "V:Base", "World:UTM", (1.0, 2.0, 3.0)))
     return LogEvent(0, T0 + arrival, "MAP", data, arrival)
+
+
+def test_given_more_events_than_are_looked_at_then_none_is_lost() -> None:
+    run = OfflineRun(vehicle(), (gps(n) for n in range(LOOKED_AT + 3)), "V:Base")
+    assert count_samples(run, 10 * LOOKED_AT) == [LOOKED_AT + 3]
