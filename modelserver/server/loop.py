@@ -41,6 +41,7 @@ from modelserver.server.ingress import (
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
+from modelserver.server.requests.scheduler import RunDelay
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
@@ -83,7 +84,7 @@ class Hooks:
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
     gauges: reads resources of the process for the health report, given the number of waiting requests.
-    run_delay: reads the run-queue delay of the loop's thread, nanoseconds; None if unknown.
+    run_delay: reads the run-queue delay of the loop's thread; None if unknown.
     on_tick: called after each tick without error.
     verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
     journal: records everything that is handled and published; one that nothing begins records nothing.
@@ -96,7 +97,7 @@ class Hooks:
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
     gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
-    run_delay: Callable[[], int | None] = lambda: None
+    run_delay: Callable[[], RunDelay | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
     journal: JournalQueue = field(default_factory=JournalQueue)

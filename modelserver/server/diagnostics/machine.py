@@ -20,6 +20,7 @@ from typing import Final
 from modelserver.errors import BusError
 from modelserver.messages import Gauges
 from modelserver.server.diagnostics.checks import BusFacts, ClockFacts, NetworkInterface
+from modelserver.server.requests.scheduler import RunDelay
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from modelserver.wire.urls import UdpAddress, parse_udp_address
 
@@ -37,9 +38,10 @@ def read_resident_bytes(statm: Path = STATM) -> int:
     return (_read_int(statm, 1) or 0) * os.sysconf("SC_PAGE_SIZE")
 
 
-def read_run_delay(schedstat: Path = SCHEDSTAT) -> int | None:
-    """Read the run-queue delay of this thread: how long it was ready without a processor, ns; None if unknown."""
-    return _read_int(schedstat, 1)
+def read_run_delay(schedstat: Path = SCHEDSTAT) -> RunDelay | None:
+    """Read the run-queue delay of this thread: how long it was ready without a processor; None if unknown."""
+    delay, slices = _read_int(schedstat, 1), _read_int(schedstat, 2)
+    return None if delay is None or slices is None else RunDelay(delay, slices)
 
 
 _SIOCGIFFLAGS: Final = 0x8913

@@ -41,6 +41,7 @@ from modelserver.server.requests.scheduler import (
     DeferredRequest,
     QueuedRequest,
     RequestScheduler,
+    RunDelay,
 )
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
@@ -114,7 +115,7 @@ class RequestHandler:
         prefix: str,
         limits: LimitsConfig,
         verifier: CommandVerifier | None = None,
-        run_delay: Callable[[], int | None] = lambda: None,
+        run_delay: Callable[[], RunDelay | None] = lambda: None,
     ):
         self._context = context
         self._bus = bus

@@ -14,6 +14,7 @@ from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.requests.scheduler import RunDelay
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.journal import RecordKind
 
@@ -36,7 +37,7 @@ class Noted(JournalQueue):
 class Rig:
     """A loop on a fake bus whose clock advances only while the loop waits."""
 
-    def __init__(self, run_delay: Callable[[], int | None] = lambda: None) -> None:
+    def __init__(self, run_delay: Callable[[], RunDelay | None] = lambda: None) -> None:
         self.clock = FakeClock(START, 10_000_000_000)
         self.bus = FakeBus(self.clock)
         self.journal = Noted()
@@ -92,7 +93,7 @@ def test_given_prepared_replies_then_none_is_counted_as_answered() -> None:
 
 def test_given_a_contended_processor_then_nothing_is_prepared() -> None:
     # half of the time the thread was ready to run and had no processor
-    rig = Rig(lambda: rig.clock.monotonic_ns() // 2)
+    rig = Rig(lambda: RunDelay(rig.clock.monotonic_ns() // 2, 0))
     rig.bus.sensors.put("IMU", encode(imu(START)))
     rig.idle(20)
     rig.ask(*FRAMES[:2])

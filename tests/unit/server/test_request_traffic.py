@@ -25,6 +25,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus, FakeInbox
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.requests.scheduler import RunDelay
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.receiver import Sender
@@ -92,7 +93,9 @@ class TimedBus(FakeBus):
 class Rig:
     """A loop on a timed bus, with ticks at 100 Hz."""
 
-    def __init__(self, answer_s: float = 200e-6, run_delay: Callable[[], int | None] = lambda: None, **limits: Any):
+    def __init__(
+        self, answer_s: float = 200e-6, run_delay: Callable[[], RunDelay | None] = lambda: None, **limits: Any
+    ):
         self.clock = FakeClock(START, BEGIN_NS)
         self.bus = TimedBus(self.clock, answer_s)
         state = start_core(ScriptedLocalizer())
@@ -192,7 +195,7 @@ def test_given_a_processor_that_others_want_then_the_client_gets_the_share_of_th
     hz: float, share: float, rate: float
 ) -> None:
     # half of the time the thread was ready to run and had no processor; a reply takes 0.2 ms
-    delay = lambda: (rig.clock.monotonic_ns() - BEGIN_NS) // 2  # noqa: E731
+    delay = lambda: RunDelay((rig.clock.monotonic_ns() - BEGIN_NS) // 2, 0)  # noqa: E731
     rig = Rig(run_delay=delay, client_hz=hz, request_share=share)
     begin = rig.seconds
     count = len(lone_client(rig, 4000))
