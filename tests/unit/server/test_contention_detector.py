@@ -67,7 +67,7 @@ def test_given_a_system_without_run_queue_delays_then_late_ticks_alone_count() -
     detector.add_tick(LATE_TICK_NS, BEGIN)
     assert not detector.is_contended(BEGIN)
     detector.add_tick(LATE_TICK_NS + 1, BEGIN)
-    # the machine may have stood still
+    # the machine may have been suspended
     assert not detector.is_contended(BEGIN)
     detector.add_tick(LATE_TICK_NS + 1, BEGIN + CONTENTION_NS)
     assert not detector.is_contended(BEGIN + CONTENTION_NS)
