@@ -262,6 +262,59 @@ def test_given_text_then_it_is_written_and_a_wrong_one_is_not(page: EditedPage) 
     assert "not done" in page.message
 
 
+@pytest.mark.parametrize(
+    ("typed", "number"),
+    [
+        ("-0.2", -0.2),
+        ("1e-1", 0.1),
+        ("-2.5E+0", -2.5),
+        ("0,25", 0.25),
+        ("\u22120.3", -0.3),
+        ("\u20130.4", -0.4),
+        (" +0.5 ", 0.5),
+        (".5", 0.5),
+    ],
+)
+def test_given_a_number_in_any_notation_then_it_is_what_was_typed(page: EditedPage, typed: str, number: float) -> None:
+    page.editor.select(LENS)
+    page.fields._fields["xyz"].texts = (typed, "0", "0.06")
+    assert page.set() == ""
+    assert page.model.frame(LENS.name).pose.xyz == (number, 0.0, 0.06)
+
+
+@pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1,2", "1.000,5", "--1", "nan", "inf"])
+def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
+    page.editor.select(LENS)
+    before, field = page.session.document.text, page.fields._fields["xyz"]
+    field.texts = (typed, "0", "0.06")
+    assert "color" in field._problem.content
+    assert "x (m)" in page.set()
+    assert page.session.document.text == before
+    assert field.texts[0] == typed
+    field.texts = ("0.1", "0", "0.06")
+    assert field._problem.content == ""
+
+
+def test_given_a_typed_number_when_another_item_is_selected_then_it_is_set(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    page.fields._fields["xyz"].texts = ("0.123", "0", "0.06")
+    page.editor.select(NOD)
+    assert page.editor._item == NOD
+    assert page.model.frame(LENS.name).pose.xyz == (0.123, 0.0, 0.06)
+
+
+def test_given_what_is_no_number_when_another_item_is_selected_then_it_stays_selected_and_nothing_is_lost(
+    page: EditedPage,
+) -> None:
+    page.editor.select(LENS)
+    page.fields._fields["xyz"].texts = ("1/3", "0", "0.06")
+    page.editor.select(NOD)
+    assert page.editor._item == LENS
+    assert (page.editor._kind.value, page.editor._name.value) == (ItemKind.FRAME, LENS.name)
+    assert page.fields._fields["xyz"].texts[0] == "1/3"
+    assert "'1/3' is not a number" in page.message
+
+
 def test_given_frames_that_coincide_then_the_constraint_is_placed(page: EditedPage) -> None:
     page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FLEALateral"))
     place = page.editor._place
@@ -283,7 +336,7 @@ def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page:
     others = ["Raptor:FrontLeftCorner", "Raptor:FrontRightCorner", "Raptor:RearLeftCorner", "Raptor:CabFrontRailCenter"]
     for (frame, distance), name in zip(place._rows, others, strict=False):
         frame.value = name
-        distance.value = float(np.linalg.norm(true - page.model.frame(name).pose.xyz))
+        distance.value = [float(np.linalg.norm(true - page.model.frame(name).pose.xyz))]
     place._measure()
     assert page.message == ""
     frame = page.model.frame(item.name)

@@ -138,6 +138,10 @@ class Editor:
 
     def select(self, item: GeometryItem) -> None:
         """Select what is edited."""
+        if self._item is not None and item != self._item and not self._fields.commit():
+            # what was typed is not lost: it stays until it can be set
+            self._kind.value, self._name.value = self._item.kind, self._item.name
+            return
         items = self._session.document.list_items()
         if item not in items:
             return
@@ -250,10 +254,10 @@ class Editor:
         self._refresh()
         return True
 
-    def _change_item(self, change: Change, new: GeometryItem | None = None) -> None:
-        """Make a change of what is selected."""
+    def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
+        """Make a change of what is selected; return whether it could be made."""
         assert self._item is not None
-        self._change(f"edit {self._item.name}", change, new)
+        return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
         name = self._new.value.strip()
@@ -314,7 +318,9 @@ class Editor:
     # --- saving and applying
 
     def _ask_save(self) -> None:
-        """Show what would be saved."""
+        """Show what would be saved, with what was typed and not set yet."""
+        if not self._fields.commit():
+            return
         diff, shown = self._session.make_diff(), self._session.document
         modal = self._gui.add_modal(f"Save {self._session.file.path.name}")
         with modal:

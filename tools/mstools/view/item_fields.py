@@ -9,10 +9,10 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from modelserver.errors import QueryError, quote
-from modelserver.formats.reading import parse_number
 from modelserver.formats.writing import format_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
@@ -24,9 +24,7 @@ from modelserver.transforms.so3 import Vector3
 from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.session import EditSession
 from mstools.edit.yaml_text import EditError
-
-PRECISION: Final = 6
-"""Decimals of a field."""
+from mstools.view.number_fields import PRECISION, NumberFields, parse_typed
 
 SAME: Final = 10.0**-PRECISION
 """A number that differs by less from what a field was given was not changed in it."""
@@ -34,7 +32,8 @@ SAME: Final = 10.0**-PRECISION
 NO_LEADER: Final = "-"
 _INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
 
-ChangeItem = Callable[[Callable[[GeometryDocument], GeometryDocument], GeometryItem | None], None]
+ChangeItem = Callable[[Callable[[GeometryDocument], GeometryDocument], GeometryItem | None], bool]
+"""Makes a change and selects an item; returns whether it could be made."""
 
 
 class Snap(StrEnum):
@@ -106,7 +105,7 @@ class ItemFields:
             if old is not None:
                 # last: a page hides a folder that was empty for a moment, and may never show it again
                 old.remove()
-        self._form.on_submit(lambda _: self._actions.put(self.set))
+        self._form.on_submit(lambda _: self._actions.put(self._submit))
 
     def _add_fields(self, item: GeometryItem) -> None:
         document = self._session.document
@@ -123,7 +122,7 @@ class ItemFields:
         if isinstance(self._part, Constraint):
             self._add_joint(self._part.joint)
         self._add("description", self._gui.add_text("Description", self._get_description(item)))
-        self._gui.add_button("Set").on_click(lambda _: self._actions.put(self.set))
+        self._gui.add_button("Set").on_click(lambda _: self._actions.put(self._submit))
 
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:
@@ -135,25 +134,21 @@ class ItemFields:
     def _add(self, key: str, field: Any) -> None:
         self._fields[key], self._given[key] = field, field.value
 
-    def _add_vector(self, key: str, label: str, values: Sequence[float], step: float) -> None:
-        field = self._gui.add_vector3(
-            label, so3.to_vector3([round(each, PRECISION) + 0.0 for each in values]), step=step
-        )
-        # the step of the arrows would round what is typed
-        field.precision = PRECISION
-        self._add(key, field)
+    def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
+        self._add(key, NumberFields(self._gui, labels, values, self._actions))
         self._given[key] = tuple(values)
 
     def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
         degrees = [math.degrees(each) for each in pose.rpy]
-        self._add_vector("xyz", "x, y, z (m)", pose.xyz, 0.001)
-        self._add_vector("rpy", "roll, pitch, yaw (deg)", degrees, 0.1)
+        self._add_vector("xyz", ("x (m)", "y (m)", "z (m)"), pose.xyz)
+        self._add_vector("rpy", ("roll (deg)", "pitch (deg)", "yaw (deg)"), degrees)
         self._add(
             "has_sigma", self._gui.add_checkbox("Sigma", sigma is not None, hint="Standard deviations are stated")
         )
         known = sigma or Sigma()
-        self._add_vector("sigma_xyz", "sigma (m)", known.position, 0.001)
-        self._add_vector("sigma_rpy", "sigma (deg)", [math.degrees(each) for each in known.rotation], 0.1)
+        turns = np.degrees(known.rotation).tolist()
+        self._add_vector("sigma_xyz", [f"sigma {axis} (m)" for axis in "xyz"], known.position)
+        self._add_vector("sigma_rpy", [f"sigma {axis} (deg)" for axis in ("roll", "pitch", "yaw")], turns)
 
     def _add_ends(self, constraint: Constraint) -> None:
         frames = tuple(list_frames(self._session.document))
@@ -166,7 +161,7 @@ class ItemFields:
         if not joint.is_movable:
             return
         if joint.type in TYPES_WITH_AXIS:
-            self._add_vector("axis", "axis", joint.axis, 0.1)
+            self._add_vector("axis", [f"axis {axis}" for axis in "xyz"], joint.axis)
         if joint.count > 1:
             gui.add_markdown("Limits and more of a joint with several coordinates: under *As text*.")
             return
@@ -201,14 +196,27 @@ class ItemFields:
 
     # --- what is set
 
-    def set(self) -> None:
-        """Set what was changed in the fields."""
+    def _submit(self) -> None:
+        self.set()
+
+    def commit(self) -> bool:
+        """Set what was typed, if anything was; return whether nothing is left that cannot be set."""
+        return self._item is None or not self._is_typed() or self.set()
+
+    def _is_typed(self) -> bool:
+        try:
+            return any(self._differs(key) for key in self._fields if key != "template")
+        except EditError:
+            return True
+
+    def set(self) -> bool:
+        """Set what was changed in the fields; return whether that could be done."""
         item = self._item
         assert item is not None
         plain = item.name.rpartition(":")[2]
         name = self._fields["name"].value.strip()
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name) if name != plain else None
-        self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
+        return self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
 
     def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
         in_template = self.in_template
@@ -308,7 +316,7 @@ class ItemFields:
             if len(exact) == count:
                 return exact
         try:
-            numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_number(each) for each in parts]
+            numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(each) for each in parts]
         except ValueError as error:
             raise EditError(f"{key.replace('_', ' ')}: {error}") from None
         return tuple([math.radians(each) if is_angle else each for each in numbers])

@@ -25,6 +25,7 @@ from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, 
 from mstools.edit.session import EditSession
 from mstools.edit.yaml_text import EditError
 from mstools.view.item_fields import ChangeItem, find_part, list_frames
+from mstools.view.number_fields import NumberFields
 from mstools.view.panels import escape_markdown, format_table
 
 MAX_DISTANCES: Final = 6
@@ -53,13 +54,11 @@ class PlacePanel:
             self._position_only: Any = gui.add_checkbox("Position only", False)
             coincide = gui.add_button("Place there")
         with gui.add_folder("Distances from frames"):
-            self._rows: list[tuple[Any, Any]] = []
+            self._rows: list[tuple[Any, NumberFields]] = []
             for number in range(1, MAX_DISTANCES + 1):
                 frame = gui.add_dropdown(f"From {number}", (NO_FRAME,))
-                self._rows.append((frame, gui.add_number(f"distance {number} (m)", 0.0, step=0.001, min=0.0)))
-                self._rows[-1][1].precision = DIGITS
-            self._sigma: Any = gui.add_number("sigma (m)", 0.002, step=0.001, min=0.0)
-            self._sigma.precision = DIGITS
+                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
+            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
             self._mirrored: Any = gui.add_checkbox("On the other side", False, hint="Three distances fit two positions")
             by_distances = gui.add_button("Place by distances")
             self._result = gui.add_markdown("")
@@ -121,17 +120,18 @@ class PlacePanel:
                 raise EditError("fix the errors first; a position is computed from a geometry without any")
             if item.kind is not ItemKind.FRAME:
                 raise EditError("select the frame to which the distances were measured")
-            given = [(frame.value, distance.value) for frame, distance in self._rows if frame.value != NO_FRAME]
+            given = [(frame.value, distance.value[0]) for frame, distance in self._rows if frame.value != NO_FRAME]
             points, P = list_measured_points(model, item.name, [name for name, _ in given])
             distances = np.array([distance for _, distance in given], float)
-            sigmas = np.full(len(given), float(self._sigma.value))
+            (sigma_m,) = self._sigma.value
+            sigmas = np.full(len(given), sigma_m)
             start = model.frame(item.name).pose
             fit = locate_by_distances(points, distances, sigmas, start.xyz, P)
             if self._mirrored.value:
                 if fit.mirrored is None:
                     raise EditError("the distances fit on one side only")
                 fit = locate_by_distances(points, distances, sigmas, fit.mirrored, P)
-            self._result.content = _describe(fit, [name for name, _ in given], float(self._sigma.value))
+            self._result.content = _describe(fit, [name for name, _ in given], sigma_m)
             old = model.frame(item.name).sigma or Sigma()
             sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), old.rotation)
             return _write(document, item, Placement(Pose(fit.position, start.wxyz), sigma), start)
