@@ -48,6 +48,7 @@ def assert_alike(found, sampled):
     assert np.linalg.eigvalsh(found).min() > -1e-20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", PLACES)
 def test_compose_agrees_with_monte_carlo(where):
     X_AB, X_BC = PLACES[where]

@@ -75,6 +75,7 @@ def read(data: bytes) -> None:
     assert peak < 4_000_000 + MOST_MEMORY * len(data)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_given_bytes_of_a_run_that_were_changed_then_nothing_but_a_recording_error_comes_of_it(
@@ -87,6 +88,7 @@ def test_given_bytes_of_a_run_that_were_changed_then_nothing_but_a_recording_err
     read(run[: data.draw(st.integers(0, len(run)))])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_given_tokens_of_a_run_that_were_changed_then_nothing_but_a_recording_error_comes_of_it(

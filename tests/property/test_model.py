@@ -58,6 +58,7 @@ def test_breadth_first_is_shortest(seed, bodies, extra):
             assert out.split(":")[0] == into.split(":")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "bodies", "extra"), TREES + LOOPED)
 def test_answers_are_the_products_along_the_shortest_path(seed, bodies, extra):
     rng = random.Random(seed)
@@ -109,6 +110,7 @@ def test_orphans_answer_inside_their_own_assembly_only(assemblies):
             model.get_transformation(interest, reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_covariance_along_a_path_agrees_with_monte_carlo(seed):
     rng = random.Random(seed)

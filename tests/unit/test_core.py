@@ -745,6 +745,7 @@ def bits(events: list[tuple[Event, Instant]], publish: str) -> list[bytes]:
     return published
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("publish", ["timer", "event"])
 def test_given_the_same_events_then_the_outputs_are_the_same_bit_for_bit(publish: str) -> None:
     events = journal()

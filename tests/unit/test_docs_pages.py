@@ -79,6 +79,7 @@ def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other
     assert keys <= find_names(pages.fill(read("vehicle-file.md"))) <= keys | sections
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [FixSettings, FilterSettings, RawSettings])
 def test_given_settings_of_localization_then_their_page_has_each_with_default_and_meaning(
     pages: ModuleType, kind: type
@@ -147,6 +148,7 @@ def test_given_a_setting_without_a_description_then_the_build_fails(pages: Modul
         pages.read_settings(Bare)
 
 
+@pytest.mark.slow
 def test_given_a_supplement_then_the_code_has_no_description_of_its_own(
     pages: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:

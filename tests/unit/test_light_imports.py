@@ -81,6 +81,7 @@ def test_check_loads_nothing_heavy(cart):
     assert (loaded, run.returncode) == ([], 0), run.stderr
 
 
+@pytest.mark.slow
 def test_the_service_and_its_filter_load_pyproj_alone_of_what_is_heavy():
     loaded, run = heavy_after("import modelserver.server.daemon, modelserver.estimation.filter.localizer")
     assert (loaded, run.returncode) == (["pyproj"], 0), run.stderr

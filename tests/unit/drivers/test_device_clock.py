@@ -70,6 +70,7 @@ def devices(rate: float, tick: float, delay: Delay) -> list[Device]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tick", [1.0, 6553.6, 10_000.0])
 @pytest.mark.parametrize("rate", [4.0, 20.0, 100.0])
 def test_given_delays_to_20_ms_and_drift_to_100_ppm_then_the_instant_is_right_to_2_ms(rate: float, tick: float) -> None:
@@ -252,6 +253,7 @@ def test_given_a_receiver_that_learns_of_a_leap_second_then_it_is_believed_after
     assert sigma < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [-1e-3, -3e-4, 3e-4, 1e-3])
 def test_given_a_clock_that_is_off_by_more_than_a_crystal_then_that_is_learned_and_sigma_covers(drift: float) -> None:
     device = Device(DeviceClock(), 15, drift=drift, delay=small).run(60.0, 20.0)
@@ -260,6 +262,7 @@ def test_given_a_clock_that_is_off_by_more_than_a_crystal_then_that_is_learned_a
     assert max(error for error, _ in device.after(40.0)) < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slew", [-1e-4, -2e-5, 2e-5, 1e-4])
 def test_given_a_clock_whose_drift_changes_then_sigma_covers_most(slew: float) -> None:
     device = Device(DeviceClock(), 16, delay=small).run(100.0, 4.0)

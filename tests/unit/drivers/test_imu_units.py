@@ -175,6 +175,7 @@ def test_given_each_unit_then_the_axes_of_its_reference_are_named() -> None:
         assert found is reference
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("to_host", [split_in_half, add_noise(3, 8), lambda data: split_randomly(data, len(data))])
 def test_given_split_or_noisy_bytes_then_nearly_every_sample_is_published(
@@ -193,6 +194,7 @@ def test_given_another_baud_rate_then_it_is_found(connect: Callable[..., Line]) 
     assert line.phases[-1] is EndpointPhase.STREAMING
 
 
+@pytest.mark.slow
 @both
 def test_given_an_unplugged_unit_when_it_is_back_then_samples_are_published_again(connect: Callable[..., Line]) -> None:
     line = connect(seconds=60.0).open().run(5.0)
@@ -206,6 +208,7 @@ def test_given_an_unplugged_unit_when_it_is_back_then_samples_are_published_agai
     assert len(line.samples) > before + 800
 
 
+@pytest.mark.slow
 @both
 def test_given_a_restarted_unit_then_it_is_set_up_again(connect: Callable[..., Line]) -> None:
     line = connect(device_baud=115200, baud=115200)

@@ -94,6 +94,7 @@ def check(errors: list[tuple[float, float, float]]) -> None:
     assert covered >= 0.95 * len(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [4.0, 20.0])
 def test_given_a_way_of_0_to_20_ms_then_a_fix_is_stamped_within_2_ms_and_its_sigma_covers_it(rate_hz: float) -> None:
     errors = []
@@ -111,6 +112,7 @@ def test_given_a_way_of_0_to_20_ms_then_a_fix_is_stamped_within_2_ms_and_its_sig
     check(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [-1e-4, 1e-4])
 def test_given_a_way_of_0_to_20_ms_then_an_inertial_sample_is_stamped_within_2_ms_and_its_sigma_covers_it(
     drift: float,

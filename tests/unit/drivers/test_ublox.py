@@ -121,6 +121,7 @@ def test_given_no_end_of_the_epoch_then_it_is_published_after_the_hold_or_with_t
     assert line.driver.counts["repeated"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to_host", [split_in_half, add_noise(3), lambda data: split_randomly(data, len(data))])
 def test_given_split_or_noisy_bytes_then_nearly_every_epoch_is_published(to_host: object) -> None:
     line = connect(seconds=30.0, to_host=to_host).open().run(25.0)
@@ -136,6 +137,7 @@ def test_given_another_baud_rate_then_it_is_found() -> None:
     assert line.status_text.splitlines()[-1].startswith("streaming: ZED-F9P")
 
 
+@pytest.mark.slow
 def test_given_an_unplugged_line_when_it_is_back_then_fixes_are_published_again() -> None:
     line = connect(seconds=60.0).open().run(8.0)
     line.is_broken = True
@@ -148,6 +150,7 @@ def test_given_an_unplugged_line_when_it_is_back_then_fixes_are_published_again(
     assert line.phases[-1] is EndpointPhase.STREAMING
 
 
+@pytest.mark.slow
 def test_given_a_restart_when_its_setup_is_lost_then_it_is_set_up_again() -> None:
     samples = drive(60.0)
     device = FaultInjector(lambda: UbloxEmulator(samples), (parse_fault("restart@8:2"),))

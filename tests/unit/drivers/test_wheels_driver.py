@@ -95,6 +95,7 @@ def test_given_the_settings_then_the_sigmas_and_the_delay_are_reported() -> None
     assert left.speed_sigma == 0.05
 
 
+@pytest.mark.slow
 def test_given_a_counter_that_wraps_several_times_then_the_way_is_whole() -> None:
     wire = connect(200.0, lambda t: 5.0, hz=20.0, first_count=60_000)
     wire.run(201.0)
@@ -313,6 +314,7 @@ BO_ 2566834688 Axle: 8 A
         assert measured.steering == 0.0
 
 
+@pytest.mark.slow
 def test_given_pulses_without_sign_then_the_direction_gives_it() -> None:
     count = CountMap("WheelCounts.FrontLeftCount", METERS_PER_COUNT, wrap=1000, counts_up_only=True)
     settings = wheels_settings(wheels={"front_left": wheel("Left", count=count, is_steered=False)})

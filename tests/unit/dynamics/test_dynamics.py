@@ -448,6 +448,7 @@ def test_given_many_bodies_then_the_covariance_comes_in_steps():
     assert found[0] == pytest.approx(dynamics.center_covariance(q, sigma, "B1:Base"))
 
 
+@pytest.mark.slow
 def test_given_import_of_the_package_then_pinocchio_is_not_loaded():
     code = "import sys, modelserver.dynamics, modelserver.server.daemon; print('pinocchio' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

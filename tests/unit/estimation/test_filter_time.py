@@ -332,6 +332,7 @@ def test_given_a_filter_started_from_raw_mode_then_older_samples_are_rejected_an
     assert {note.reason for note in notes if isinstance(note, Decision)} == {"too_old"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [Mode.NO_WHEELS, Mode.NO_GPS, Mode.NO_IMU, Mode.DEAD_RECKONING])
 def test_given_a_command_for_another_mode_of_the_filter_then_nothing_jumps_and_the_mode_is_reported(mode):
     found = process_all(localizer(), select_events(0.0, WARM))

@@ -115,6 +115,7 @@ def test_given_a_clock_that_steps_forward_then_what_is_beyond_the_horizon_is_dro
     assert times(history(0, 1, 2).append(estimate(61.5))) == [2, 61.5]
 
 
+@pytest.mark.slow
 def test_given_more_than_the_horizon_then_only_that_much_is_held_and_memory_stays_bounded() -> None:
     held = History(2.0)
     tracemalloc.start()
@@ -129,6 +130,7 @@ def test_given_more_than_the_horizon_then_only_that_much_is_held_and_memory_stay
     assert held.first == held.last - 2 * S
 
 
+@pytest.mark.slow
 def test_given_a_long_history_when_its_last_estimate_is_replaced_then_little_is_copied() -> None:
     held = History(1e6)
     for n in range(100_000):

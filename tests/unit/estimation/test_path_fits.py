@@ -192,6 +192,7 @@ def test_given_fixes_that_drifted_at_a_rate_then_a_fit_excludes_it_only_where_it
     assert not fit._replace(drift_sigma=60.0 * rate).excludes(rate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_given_fixes_that_begin_to_drift_then_three_minutes_on_average_do_not_excuse_them(seed: int) -> None:
     fits = []

@@ -123,6 +123,7 @@ def test_a_rejected_fix_changes_no_pose(degrees):
         assert (estimate.enu, estimate.utm, estimate.invalid) == (before.enu, before.utm, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gps_hz", [1.0, 20.0])
 def test_a_jump_is_confirmed_only_after_a_time(gps_hz):
     drive = Drive(40.0, speed=constant(2.0), yaw_rate=constant(0.05))

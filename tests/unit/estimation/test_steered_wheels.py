@@ -302,6 +302,7 @@ def _create_transform():
     return transform
 
 
+@pytest.mark.slow
 def test_given_wheels_that_steer_when_the_service_restarts_then_they_show_that_the_vehicle_did_not_move():
     run = drive(simulation((*TO_A_STOP, DrivePhase(200.0))), 40.0, transform=_create_transform())
     used = run.decisions("wheel_speed", Verdict.USED)

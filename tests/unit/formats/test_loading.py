@@ -104,6 +104,7 @@ def test_an_unknown_form_is_rejected_with_those_known(tmp_path):
         save_model(load_model(path), "sdf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "spared"), [(YAML, "lxml"), (miro(), "yaml")])
 def test_nothing_heavy_is_imported(tmp_path, text, spared):
     path = tmp_path / "vehicle"

@@ -155,6 +155,7 @@ def test_given_three_distances_then_the_mirrored_position_is_reported() -> None:
     assert locate_by_distances(POINTS, distances, np.full(4, 0.001), above.mirrored).mirrored is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(0.3, 0.4, 0.9), (2.0, 1.0, 1.0), (0.4, 0.4, -0.6)])
 def test_given_noise_then_the_covariance_is_consistent(place: tuple[float, float, float]) -> None:
     random = np.random.default_rng(3)
@@ -170,6 +171,7 @@ def test_given_noise_then_the_covariance_is_consistent(place: tuple[float, float
     assert np.mean(nees) == pytest.approx(3.0, abs=0.4)
 
 
+@pytest.mark.slow
 def test_given_a_place_in_the_plane_then_the_sigma_across_it_covers_the_error() -> None:
     random = np.random.default_rng(4)
     normal = np.cross(POINTS[1], POINTS[2])

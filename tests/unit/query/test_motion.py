@@ -225,6 +225,7 @@ def add_gyro_noise(seed: int) -> History:
     return history
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("at", "largest"), [(AT, 0.1), (1.59, 0.6)], ids=["within", "newest"])
 def test_given_noisy_turn_rates_then_accelerations_away_from_the_imu_are_usable_and_their_covariance_is_right(
     at: float, largest: float
@@ -280,6 +281,7 @@ def test_given_a_measured_joint_then_the_covariance_of_its_acceleration_is_unkno
     assert np.abs(bolted).max() == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interest", "reference"), [("Rover:Mast", UTM), (UTM, "Rover:Mast")])
 def test_given_errors_of_the_vehicles_accelerations_then_their_covariance_follows_the_path(
     interest: str, reference: str

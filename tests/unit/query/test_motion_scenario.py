@@ -57,6 +57,7 @@ def instants() -> list[float]:
     return [round(each * S) / S for each in whole.tolist()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("interest", "reference"), [(SCAN, UTM), (UTM, SCAN), (DEEP, UTM), ("Finger:Tip", UTM), (DEEP, SCAN), (SCAN, BASE)]
 )

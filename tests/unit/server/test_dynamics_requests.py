@@ -219,6 +219,7 @@ def test_given_no_pinocchio_then_the_vehicle_file_is_rejected_with_what_to_insta
         load_vehicle(load_config(path), str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "loaded"), [("", "False"), ("dynamics: {}\n", "True")])
 def test_given_vehicle_file_then_pinocchio_is_loaded_only_with_the_section(tmp_path, section, loaded) -> None:
     path = write_vehicle(tmp_path, VEHICLE + section, GEOMETRY)

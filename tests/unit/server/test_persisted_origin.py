@@ -181,6 +181,7 @@ OriginStore(Path(sys.argv[1]), "cart").save(make_origin(500000.0, 5000000.0, 0.0
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["sync", "rename"])
 def test_given_a_kill_half_way_then_the_old_origin_is_intact(store: OriginStore, when: str) -> None:
     store.save(ORIGIN)

@@ -67,6 +67,7 @@ class Rig:
         return accepted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rule", "used"), [("ignore", 57), ("use", 64), ("", 64)])
 def test_given_another_source_on_the_channel_then_the_first_owns_it(
     rule: str, used: int, caplog: pytest.LogCaptureFixture

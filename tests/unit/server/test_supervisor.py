@@ -111,6 +111,7 @@ def test_given_a_vehicle_without_sensors_then_the_watchdog_is_pinged() -> None:
     assert "no localization sensor" in watched.notifications[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["gps/refuse:stale", "gps/late", "gps/ignore", "gps/reject:gate"])
 def test_given_rejected_samples_then_the_watchdog_is_pinged_since_a_restart_would_not_help(source: str) -> None:
     assert pings(Watched().runs(30.0, source)) >= 30

@@ -42,6 +42,7 @@ def times(count: int = 300) -> list[float]:
     return np.linspace(-0.5, PLAN.duration + 0.5, count).tolist()
 
 
+@pytest.mark.slow
 def test_each_quantity_is_the_derivative_of_the_one_before(drive):
     h = 1e-4
     X = Pose(LEVER)

@@ -38,6 +38,7 @@ def test_stop_and_go_stops_and_goes():
     assert min(rates) < -0.1 < 0.1 < max(rates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [20.0, 60.0, 120.0])
 def test_a_drive_in_town_takes_its_time_within_its_limits(seconds):
     for seed in range(20):

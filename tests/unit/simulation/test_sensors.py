@@ -297,6 +297,7 @@ def test_the_vehicle_controller_measures_the_speed_and_the_angle_of_the_equivale
     assert max(abs(each.steering_angle) for each in statuses) > 0.2
 
 
+@pytest.mark.slow
 def test_unsteered_and_steered_wheels_follow_the_path_of_their_contact_points():
     """Against positions: a steered wheel rolls the length of its contact point's way."""
     steered = frozenset(("front_left", "front_right"))
@@ -375,6 +376,7 @@ def test_the_same_seed_gives_the_same_samples_and_another_seed_others():
     assert one != other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [0.003, 0.25, 3.7])
 def test_samples_do_not_depend_on_the_chunks_requested(chunk):
     whole = noisy()

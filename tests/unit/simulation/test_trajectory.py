@@ -41,6 +41,7 @@ def test_each_quantity_is_the_derivative_of_the_one_before(drive):
         assert slope("speed") == pytest.approx(here.forward_acceleration, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_position_is_continuous_and_exact_across_knots_and_phases(drive):
     """Against Simpson's rule on ten thousand steps of the velocity."""
     n = 10_000

@@ -343,6 +343,7 @@ angles = st.tuples(st.floats(-179.0, 179.0), st.floats(-89.0, 89.0), st.floats(-
 sigmas = st.none() | st.tuples(*[st.floats(0.0, 1.0).map(lambda value: round(value, 4))] * 3)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data(), st.sampled_from(sorted(FILES)))
 def test_given_any_changes_then_the_model_is_what_they_state(data: st.DataObject, file: str) -> None:

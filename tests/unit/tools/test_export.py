@@ -64,6 +64,7 @@ def pose_of(transform: Any) -> Pose:
     return Pose((p.x, p.y, p.z), (q.w, q.x, q.y, q.z))
 
 
+@pytest.mark.slow
 def test_given_a_log_then_the_frames_are_where_a_query_of_the_log_places_them(log: Path, mcap: Path) -> None:
     platform = LogPlatform(log)
     world: dict[int, Pose] = {}

@@ -105,6 +105,7 @@ def false_daemon(status: Status) -> Iterator[str]:
                 bus.unsubscribe(each)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", [Status.OK, Status.UNKNOWN_FRAME, Status.FORBIDDEN, Status.REJECTED])
 @pytest.mark.parametrize("arguments", [
     ["bodies"], ["frames", "A"], ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],

@@ -507,6 +507,7 @@ def write_bus(vehicle: Path, url: str, commands: str) -> None:
     vehicle.write_text(f'{text}\nlcm: {{url: "{url}"}}\n{commands}')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("url", "commands", "is_refused"),
     [

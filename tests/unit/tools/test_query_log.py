@@ -102,6 +102,7 @@ def test_given_a_correction_after_the_time_then_it_counts(run: Command, tmp_path
     assert output(out).is_close(vehicle(2.0), 1e-9, 1e-9)
 
 
+@pytest.mark.slow
 def test_given_another_geometry_later_then_each_time_has_its_own(run: Command, tmp_path: Path) -> None:
     other = rover(Sigma((0.5, 0.5, 0.5)))
     events = list(drive(2.0))

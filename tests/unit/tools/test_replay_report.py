@@ -103,6 +103,7 @@ def test_given_a_report_beside_poses_and_decisions_then_these_are_as_without_it(
     assert (tmp_path / "r.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_given_raw_mode_then_there_is_a_page_without_innovations(tmp_path: Path, run: Run) -> None:
     config = write_raw_mode_vehicle(HUSKY, tmp_path)
     log = write_log(tmp_path / "drive.lcm", drive(20.0))

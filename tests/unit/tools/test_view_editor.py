@@ -73,6 +73,7 @@ def page(tmp_path: Path) -> Iterator[EditedPage]:
     opened.close()
 
 
+@pytest.mark.slow
 def test_given_all_items_then_their_fields_without_a_change_change_nothing(page: EditedPage) -> None:
     before = page.session.document.text
     for item in page.session.document.list_items():
@@ -119,6 +120,7 @@ def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: E
     assert page.editor._problem_texts.content.startswith(("none", "- and"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "joint"),
     [
@@ -168,6 +170,7 @@ def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> No
     assert page.constraint("SpeedLanFixed").joint == Joint()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -251,6 +254,7 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     assert "reserved" in page.message
 
 
+@pytest.mark.slow
 def test_given_text_then_it_is_written_and_a_wrong_one_is_not(page: EditedPage) -> None:
     page.editor.select(LENS)
     assert page.editor._text.value.startswith("Lens:\n  xyz: [0.05, 0, 0.06]")
@@ -262,6 +266,7 @@ def test_given_text_then_it_is_written_and_a_wrong_one_is_not(page: EditedPage) 
     assert "not done" in page.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "number"),
     [
@@ -282,6 +287,7 @@ def test_given_a_number_in_any_notation_then_it_is_what_was_typed(page: EditedPa
     assert page.model.frame(LENS.name).pose.xyz == (number, 0.0, 0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1,2", "1.000,5", "--1", "nan", "inf"])
 def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
     page.editor.select(LENS)
