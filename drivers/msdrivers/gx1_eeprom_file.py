@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from pathlib import Path
 
 from modelserver.errors import ModelServerError, quote
@@ -43,6 +44,7 @@ def read_eeprom(path: Path) -> Eeprom:
 
 def write_eeprom(path: Path, eeprom: Eeprom) -> None:
     """Write the memory to a file, which is whole at any time. Raises OSError."""
-    beside = path.with_name(f"{path.name}.new")
-    beside.write_text("".join(f"{2 * n} {word}\n" for n, word in enumerate(eeprom.words)), encoding="ascii")
-    os.replace(beside, path)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as draft:
+        new = Path(draft) / path.name
+        new.write_text("".join(f"{2 * n} {word}\n" for n, word in enumerate(eeprom.words)), encoding="ascii")
+        os.replace(new, path)

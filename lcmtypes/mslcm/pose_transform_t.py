@@ -66,7 +66,7 @@ class pose_transform_t(object):
     OUT_OF_LIMITS = 64
     """ A joint on the path is beyond its limits. """
     JOINT_DEFAULT = 128
-    """ No sample of a joint on the path was received; its default is assumed. """
+    """ No sample of a joint on the path was received; its position is assumed. """
     LOOP = 256
     """ The loop of constraints has another path; this is the shortest. """
 

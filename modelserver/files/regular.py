@@ -3,6 +3,8 @@
 Opening a FIFO waits for a writer, reading a device may never end, and opening a serial port changes its control lines.
 So the type of a file is checked before it is opened, and again after (it may have been replaced in between). Symbolic
 links are followed. Files of /proc have size 0 and content, so the read itself is bounded as well as the stated size.
+
+Nothing is written through a symbolic link of another user: in a folder that all may write, it would choose the file.
 """
 
 from __future__ import annotations
@@ -39,6 +41,13 @@ class FileTooLargeError(OSError):
         super().__init__(
             errno.EFBIG, f"the file is too large: {_format_size(size)}; the limit is {_format_size(limit)}", path
         )
+
+
+class ForeignLinkError(OSError):
+    """A file is to be written through a symbolic link of another user."""
+
+    def __init__(self, path: str):
+        super().__init__(errno.ELOOP, "a symbolic link of another user leads elsewhere; write to another place", path)
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
@@ -79,6 +88,19 @@ def read_start(path: str | os.PathLike[str], length: int) -> bytes:
     """
     with open_regular(path) as file:
         return _read(file, length)
+
+
+def check_links(path: str | os.PathLike[str]) -> None:
+    """Check the symbolic links on the way to a file that is to be written, itself included.
+
+    Raises ForeignLinkError for one of another user. Links of root are the system's own.
+    """
+    trusted = {os.geteuid(), 0}
+    name = os.path.abspath(path)
+    while name != "/":
+        if os.path.islink(name) and os.lstat(name).st_uid not in trusted:
+            raise ForeignLinkError(name)
+        name = os.path.dirname(name)
 
 
 def _read(file: BinaryIO, length: int) -> bytes:

@@ -77,7 +77,7 @@ _QUALITY_TEXT = {
     Quality.CORRELATION_UNKNOWN: "the covariance is an upper bound",
     Quality.REVERSING: "the vehicle is assumed to drive backwards",
     Quality.OUT_OF_LIMITS: "a joint on the path is beyond its limits",
-    Quality.JOINT_DEFAULT: "no sample of a joint on the path was received; its default is assumed",
+    Quality.JOINT_DEFAULT: "no sample of a joint on the path was received; its position is assumed",
     Quality.LOOP: "the loop of constraints has another path; this is the shortest",
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -23,14 +24,17 @@ from modelserver.files.regular import (
     read_start,
 )
 from modelserver.formats import load_model
-from modelserver.server.journal.segments import files_of
+from modelserver.server.journal.segments import Ring, files_of
+from modelserver.server.persistence.directory import write_atomically
 from modelserver.signing.key_files import read_keys
 from modelserver.wire.eventlog import LogFile
 from msdrivers.factory import make_driver
 from msdrivers.gx1_eeprom_file import read_eeprom
 from msdrivers.raw_log import open_for_reading, open_for_writing
 from msdrivers.settings import SourceMap, read_driver
+from mstools.commands.import_bag import import_bag
 from mstools.commands.replay import read_times
+from mstools.terminal.output import write_file
 
 
 @contextmanager
@@ -157,3 +161,53 @@ def test_given_a_fifo_when_checked_then_check_ends_with_what_is_wrong(tmp_path: 
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "this is a FIFO (named pipe), not a geometry file" in done.stdout + done.stderr
+
+
+# --- symbolic links of other users ----------------------------------------------------------------------------------
+
+
+def plant_link(link: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a symbolic link that belongs to another user than the test's."""
+    link.symlink_to(target)
+    if os.geteuid() == 0:
+        os.lchown(link, 4242, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: 4242)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_file(str(path), "text", replace=True),
+        lambda path: write_atomically(path / "state", b"text"),
+        lambda path: Ring(path / "journal", 1_000_000, 100_000).acquire(),
+        lambda path: import_bag(Path("any.bag"), path),
+    ],
+    ids=["text", "state", "journal", "log"],
+)
+def test_given_a_link_of_another_user_when_something_is_written_then_the_link_is_named_and_not_followed(
+    write: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen, link = tmp_path / "chosen", tmp_path / "link"
+    plant_link(link, chosen, monkeypatch)
+    with pytest.raises(OSError, match="symbolic link of another user") as caught:
+        write(link)
+    assert caught.value.filename == str(link)
+    assert not chosen.exists()
+
+
+def test_given_an_own_link_when_something_is_written_then_it_is_followed(tmp_path: Path) -> None:
+    chosen, link = tmp_path / "chosen", tmp_path / "link"
+    link.symlink_to(chosen)
+    write_file(str(link), "text", replace=True)
+    assert chosen.read_text() == "text"
+
+
+def test_given_any_umask_when_the_state_directory_is_created_then_others_cannot_write_it(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        write_atomically(tmp_path / "a" / "b" / "state", b"text")
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE((tmp_path / each).stat().st_mode) for each in ("a", "a/b", "a/b/state")]
+    assert modes == [0o750, 0o750, 0o600]

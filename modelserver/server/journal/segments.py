@@ -26,7 +26,7 @@ from typing import Any, Final, NamedTuple
 
 from modelserver.errors import RecordingError
 from modelserver.files.regular import open_regular, read_start
-from modelserver.server.persistence.directory import FileLock
+from modelserver.server.persistence.directory import FileLock, create_directory
 from modelserver.signing.signatures import Key
 from modelserver.wire.eventlog import Buffer, LogEvent, scan
 from modelserver.wire.journal import MAGIC, SegmentEnd, SegmentHead, read_end, read_segment
@@ -110,7 +110,7 @@ class Ring:
         """Acquire the directory for this writer."""
         if self._outer_lock is not None:
             self._outer_lock.claim()
-        self.directory.mkdir(parents=True, exist_ok=True)
+        create_directory(self.directory)
         self._lock.acquire()
 
     def create_segment(self, min_number: int = 0) -> Segment:

@@ -13,9 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from modelserver.files.regular import check_links
 from modelserver.server.log import escape_text
 
 FILE_MODE: Final = 0o640
+FOLDER_MODE: Final = 0o750
 
 MAX_PID_DIGITS: Final = 20
 """Digits of the process id that are read from a lock file."""
@@ -62,7 +64,7 @@ class FileLock:
         Other errors (disk full, read-only, missing) are ignored here: the write that follows reports them.
         """
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            create_directory(self.path.parent)
             self.acquire()
         except LockHeldError:
             raise
@@ -119,6 +121,16 @@ def get_state_directory(named: str) -> Path | None:
     return Path(base) / "modelserver"
 
 
+def create_directory(path: Path) -> None:
+    """Create a directory and those above it, none of which others can write, whatever the umask. Raises OSError."""
+    check_links(path)
+    for each in (*reversed(path.parents), path):
+        if not each.exists():
+            each.mkdir(FOLDER_MODE, exist_ok=True)
+    if not path.is_dir():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
 def to_file_name(vehicle: str) -> str:
     """Return a vehicle's name with the characters that are not safe in file names replaced by _."""
     return "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
@@ -130,7 +142,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     Creates missing directories, and blocks until the data are on the disk.
     """
     temporary: Path | None = None
-    path.parent.mkdir(parents=True, exist_ok=True)
+    create_directory(path.parent)
     try:
         # temporary file, fsync, rename; then fsync the directory, or the new name may be lost
         with tempfile.NamedTemporaryFile("wb", dir=path.parent, prefix=path.name, delete=False) as file:

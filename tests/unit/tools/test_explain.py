@@ -83,7 +83,7 @@ def test_given_a_file_then_each_edge_has_its_row_and_shares_come_to_100_percent(
     assert rows[6] == ["sum", "100.0", "%", "100.0", "%"]
     assert answer.rstrip() == run("Laser:Scan", "Cart:Base")[1].rstrip()
     assert answer.rstrip().endswith(
-        "JOINT_DEFAULT: no sample of a joint on the path was received; its default is assumed"
+        "JOINT_DEFAULT: no sample of a joint on the path was received; its position is assumed"
     )
 
 

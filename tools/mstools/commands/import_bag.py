@@ -7,6 +7,7 @@ import json
 import math
 import os
 import statistics
+import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ import lcm
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
+from modelserver.files.regular import check_links
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.server.stamp_axis import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
@@ -140,8 +142,9 @@ def import_bag(
         raise RecordingError(f"{log_path}: is a folder; give a file in it")
     if not log_path.parent.is_dir():
         raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
-    part = log_path.with_name(f".{log_path.name}.{os.getpid()}.part")
-    try:
+    check_links(log_path)
+    with tempfile.TemporaryDirectory(prefix=f".{log_path.name}.", dir=log_path.parent) as draft:
+        part = Path(draft) / log_path.name
         if is_mcap(bag_path) and not is_ros_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
         else:
@@ -150,8 +153,6 @@ def import_bag(
                 seconds = _write(bag, part, chosen, of_topic, options, prefix)
                 reports = list(of_topic.values())
         os.replace(part, log_path)
-    finally:
-        part.unlink(missing_ok=True)
     return ImportReport(str(log_path), reports, seconds)
 
 
@@ -246,7 +247,7 @@ def _write(
     first = last = done = 0
     out = lcm.EventLog(str(path), "w", overwrite=True)
     try:
-        with show_progress(f"importing {path.name.strip('.')}", total) as show:
+        with show_progress(f"importing {path.name}", total) as show:
             for name, received_ns, message in bag.messages(set(chosen)):
                 report = reports[name]
                 arrived = received_ns // 1000

@@ -16,6 +16,7 @@ import typer
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Severity
+from modelserver.files.regular import check_links
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
@@ -134,6 +135,7 @@ def load_checked(config: Path) -> VehicleConfig:
 def emulate_lines(config: Path) -> EmulatedConnections:
     """Write the copy of a vehicle file for emulated devices, without the state of an earlier drive."""
     folder = config.resolve().parent / EMULATED_FOLDER
+    check_links(folder)
     folder.mkdir(exist_ok=True)
     # the next drive begins at the same place as the last one
     shutil.rmtree(folder / STATE_FOLDER, ignore_errors=True)

@@ -20,6 +20,7 @@ import yaml
 
 from modelserver.wire.urls import make_route_command
 from mstools.launch.processes import MODELSERVER, ChildProcesses, LaunchError
+from mstools.terminal.output import write_file
 
 BUS_GROUP = "239.255.76.67"
 """LCM's multicast group."""
@@ -122,7 +123,7 @@ def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedC
             devices[name] = _redirect_driver(driver, (folder / name).resolve(), bus, held)
             make_absolute(driver, "dbc")
     path = folder / "vehicle.yaml"
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    write_file(str(path), yaml.safe_dump(content, sort_keys=False), replace=True)
     return EmulatedConnections(url, path, devices)
 
 

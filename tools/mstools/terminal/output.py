@@ -15,6 +15,7 @@ from typing import Any, TextIO
 import typer
 
 from modelserver.errors import ModelServerError, Problem
+from modelserver.files.regular import check_links
 from modelserver.geometry.model import Model
 
 
@@ -73,6 +74,7 @@ def check_writable(path: str, replace: bool = True) -> None:
     """
     if path in ("", "-"):
         return
+    check_links(path)
     target = os.path.realpath(path)
     if os.path.isdir(target):
         raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
@@ -103,6 +105,7 @@ def open_atomic(path: str, replace: bool) -> Iterator[TextIO]:
     A device or a pipe is written directly. Raises ModelServerError where the file exists and `replace` is false,
     OSError where it cannot be written.
     """
+    check_links(path)
     target = os.path.realpath(path)
     if os.path.isdir(target):
         raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
