@@ -2,7 +2,7 @@
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
 #   make deb      a Debian package of it in build/
-# and: make test-quick (without processes and long drives, for the inner loop: 50 seconds on two cores),
+# and: make test-quick (without processes and long drives, for the inner loop: a minute on two cores),
 #      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean,
 #      make screenshots (of the viewer, for the docs).
 
