@@ -137,6 +137,37 @@ def test_given_a_time_outside_the_log_then_its_span_is_reported(run: Command, lo
     assert f"extends from {T0}" in err
 
 
+@pytest.mark.parametrize("given", [False, True], ids=["own geometry", "given geometry"])
+@pytest.mark.parametrize("at", [0.5, 1.005, 3.9])
+def test_given_a_log_without_poses_then_joints_and_geometry_answer_at_a_time(
+    run: Command, tmp_path: Path, at: float, given: bool
+) -> None:
+    without = {"POSE", "POSE_ENU", "POSE_ODOM", *(["MODEL_SNAPSHOT"] if given else [])}
+    path = write_log(tmp_path / "joints.lcm", [event for event in sorted(drive(4.0)) if event[1] not in without])
+    options = []
+    if given:
+        (tmp_path / "rover.yaml").write_text(save_model(rover(), "yaml").text)
+        options = ["--model", tmp_path / "rover.yaml"]
+    code, out, err = run("query", SCAN, BASE, "--log", path, "--at", f"+{at}", *options, "--json")
+    assert code == 0, err
+    assert output(out).is_close(truth(SCAN, BASE, at), 1e-3, 1e-3)
+
+
+def test_given_a_log_without_poses_and_joints_then_a_fixed_geometry_answers_at_a_time(
+    run: Command, tmp_path: Path
+) -> None:
+    path = write_log(tmp_path / "fixed.lcm", [(T0 + n * S, "GPS", b"raw") for n in range(10)])
+    (tmp_path / "rover.yaml").write_text(save_model(rover(), "yaml").text)
+    code, out, _ = run(
+        "query", "Rover:Mast", BASE, "--log", path, "--at", "+5", "--model", tmp_path / "rover.yaml", "--json"
+    )
+    assert code == 0
+    assert output(out).is_close(rover().get_transformation("Rover:Mast", BASE).pose, 1e-9, 1e-9)
+    code, _, err = run("query", "Rover:Mast", BASE, "--log", path, "--at", "+50", "--model", tmp_path / "rover.yaml")
+    assert code == 1
+    assert f"extends from {T0} to {T0 + 9 * S}" in err
+
+
 @pytest.mark.parametrize("text", ["+", "+x", "+nan", "+inf", "yesterday"])
 def test_given_no_time_at_all_then_it_is_wrong_usage(run: Command, log: Path, text: str) -> None:
     code, _, err = run("query", BASE, UTM, "--log", log, "--at", text)

@@ -39,9 +39,9 @@ TIME_UNITS: Final = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nano
 class LogContents(NamedTuple):
     """Contents of a log: the first complete snapshot, and its time range in microseconds.
 
-    `begin` and `end` are the first and last stamp of a pose, without poses of a snapshot; `base_frame` and `revision`
-    are those of the first pose; `parts` describes an incomplete snapshot. `offsets` has the stamp of a pose and its
-    offset in the file about every `OFFSET_PERIOD_US`.
+    `begin` and `end` are the first and last stamp of a pose, without poses of the joints, without these the times of
+    receipt; `base_frame` and `revision` are those of the first pose; `parts` describes an incomplete snapshot.
+    `offsets` has the stamp of a pose and its offset in the file about every `OFFSET_PERIOD_US`.
     """
 
     snapshot: ModelSnapshot | None
@@ -203,11 +203,13 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
     offsets: list[tuple[int, int]] = []
     first: PoseAnswer | None = None
     poses: list[int] = []
-    sent: list[int] = []
+    others: dict[str, list[int]] = {}
+    received_at: list[int] = []
     parts = ""
     snapshot: ModelSnapshot | None = None
     assembler, received = SnapshotAssembler(), set[tuple[str, int]]()
     for event in log:
+        _extend(received_at, event.utime)
         try:
             if event.channel == f"{prefix}POSE":
                 first = first or decode("pose_transform_t", event.data)
@@ -216,7 +218,6 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
                     offsets.append((stamp, event.end))
             elif event.channel == f"{prefix}MODEL_SNAPSHOT":
-                _extend(sent, _stamp(event))
                 if not with_geometry or snapshot is not None:
                     continue
                 part: SnapshotPart = decode("model_snapshot_t", event.data)
@@ -225,9 +226,12 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 parts = f"{count} of {part.parts} parts of revision {part.model_revision}"
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
+            else:
+                _extend(others.setdefault(event.channel, []), _stamp(event))
         except WireError:
             continue
-    begin, end = poses or sent or [0, 0]
+    joints = others.get(f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel)
+    begin, end = poses or joints or received_at or [0, 0]
     transformation = None if first is None else first.transformation
     base_frame, revision = (
         ("", "") if transformation is None else (transformation.frame_of_interest, transformation.model_revision)
