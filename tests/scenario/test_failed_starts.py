@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -10,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from support_lcm import MODELSERVER, TIMEOUT_S, run_process
+from support_lcm import MODELSERVER, TIMEOUT_S, Listener, run_process, wait_until
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
 
 WRONG = f"{VEHICLE}sensers: {{}}\n"
@@ -99,3 +100,16 @@ def test_given_sigterm_while_it_waits_then_it_ends_at_once(begin: Begin, manager
     manager.wait_for("start failed")
     process.send_signal(signal.SIGTERM)
     assert process.wait(TIMEOUT_S) == -signal.SIGTERM
+
+
+def test_given_closed_standard_streams_then_the_service_runs_and_no_socket_or_file_has_their_numbers(
+    lcm_url: str, tmp_path: Path
+) -> None:
+    path = write_vehicle(tmp_path, VEHICLE)
+    listener = Listener(lcm_url, "MODELSERVER_HEALTH")
+    with run_process(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *MODELSERVER, "run", "-c", path], lcm_url) as process:
+        assert wait_until(listener.bus, lambda: bool(listener.received) or process.poll() is not None)
+        assert process.poll() is None
+        streams = {os.readlink(f"/proc/{process.pid}/fd/{number}") for number in range(3)}
+    assert streams == {"/dev/null"}
+    assert process.returncode == 0

@@ -85,6 +85,7 @@ COMMAND_ALIASES = {alias: name for name, aliases in _ALIASES.items() for alias i
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit."""
+    _open_closed_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if COMPLETION_VARIABLE in os.environ:
         # a shell asks what may follow its words, the first of which is this program
@@ -111,6 +112,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail("the LCM library needs libglib-2.0, which this machine lacks: sudo apt install libglib2.0-0")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that the caller closed (2>&-) on /dev/null.
+
+    Else the next socket or file would have their number, and receive what libraries write to standard error.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            # the lowest free number is this one
+            opened = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(opened, True)
+            setattr(sys, name, open(opened, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
 def build_app(arguments: Sequence[str]) -> typer.Typer:
