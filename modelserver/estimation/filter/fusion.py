@@ -136,16 +136,11 @@ def report_event(state: Navigating, kind: str, verdict: Verdict, text: str) -> D
 _WORLD_SAMPLES = (AbsolutePoseSample, RangeSample)
 
 
-def uses_gnss(mode: Mode) -> bool:
-    """Return whether a mode uses GNSS."""
-    return mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
-
-
-def uses_item(mode: Mode, item: Item) -> bool:
+def uses_item(setup: Setup, mode: Mode, item: Item) -> bool:
     """Return whether a mode uses a measurement."""
     sample = item.sample
     if isinstance(sample, GpsSample):
-        return uses_gnss(mode)
+        return setup.uses_gnss(mode)
     if isinstance(sample, ImuSample):
         return mode is not Mode.NO_IMU and (mode is not Mode.DEAD_RECKONING or item.kind == "imu_tilt")
     if isinstance(item.measurement, OwnMeasurement):
@@ -273,7 +268,7 @@ def release_motion(state: N) -> N:
 def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     """Return the state after a measurement of any kind, behind its gate."""
     sample, measurement = item.sample, item.measurement
-    if isinstance(state, Leveling) or measurement is None or not uses_item(state.common.mode, item):
+    if isinstance(state, Leveling) or measurement is None or not uses_item(setup, state.common.mode, item):
         return state, NOTHING
     if isinstance(sample, GpsSample) and not state.common.receiver.may_use(sample):
         return state, NOTHING  # counted by the position

@@ -34,7 +34,6 @@ from modelserver.estimation.filter.fusion import (
     fuse_measurement,
     reject,
     report_reset,
-    uses_gnss,
 )
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
@@ -103,7 +102,7 @@ def fuse_fix(setup: Setup, state: FilterState, item: Item) -> Fused:
     fix = accept_fix(setup, state, sample)
     if isinstance(fix, str):
         return state, (reject(item, fix),)
-    is_used = uses_gnss(state.common.mode)
+    is_used = setup.uses_gnss(state.common.mode)
     if is_used:
         state = _capture_origin(setup, state, fix, item.utime)
     if isinstance(state, Leveling):

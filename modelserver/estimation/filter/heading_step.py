@@ -33,7 +33,6 @@ from modelserver.estimation.filter.fusion import (
     fuse_measurement,
     reject,
     report_reset,
-    uses_gnss,
 )
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment, PathFit, PathFix, Rotation, to_horizontal
@@ -211,7 +210,7 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
     """Return the state after the receiver's velocity, which gives the heading if it is unknown."""
     sample = item.sample
     assert isinstance(sample, GpsSample)
-    if not uses_gnss(state.common.mode) or isinstance(state, Leveling):
+    if not setup.uses_gnss(state.common.mode) or isinstance(state, Leveling):
         return state, NOTHING
     receiver = state.common.receiver
     if receiver.is_unfilled(sample):
@@ -287,7 +286,7 @@ def fuse_baseline(setup: Setup, state: FilterState, item: Item) -> Fused:
     sample, measurement = item.sample, item.measurement
     assert isinstance(sample, GpsSample)
     assert isinstance(measurement, GpsBaseline)
-    if not uses_gnss(state.common.mode) or isinstance(state, Leveling):
+    if not setup.uses_gnss(state.common.mode) or isinstance(state, Leveling):
         return state, NOTHING
     if isinstance(accept_fix(setup, state, sample), str):
         return state, NOTHING

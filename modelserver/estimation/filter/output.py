@@ -12,7 +12,6 @@ from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodeti
 from modelserver.estimation.filter import eskf, latency_estimator, propagation, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
-from modelserver.estimation.filter.fusion import uses_gnss
 from modelserver.estimation.filter.measurements.constraints import compute_tilt
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
@@ -184,7 +183,7 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
     settings = setup.settings
     sampled = max(state.imu.used_utime, 0 if setup.uses_imu(state.common.mode) else nav.utime)
     left = settings.imu_timeout - (utime - sampled) * 1e-6
-    if state.gnss.used_utime and uses_gnss(state.common.mode):
+    if state.gnss.used_utime and setup.uses_gnss(state.common.mode):
         left = min(left, settings.gps_timeout - (utime - state.gnss.used_utime) * 1e-6)
     left = max(left, 0.0)
     k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
@@ -263,7 +262,7 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
     if isinstance(state, Aligned):
         gnss = state.gnss
         is_stale = gnss.used_utime and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
-        if is_stale and uses_gnss(common.mode):
+        if is_stale and setup.uses_gnss(common.mode):
             invalid |= 32  # STALE_GPS
         if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
             invalid |= 128  # GPS_REJECTED

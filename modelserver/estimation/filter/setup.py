@@ -96,3 +96,7 @@ class Setup:
     def uses_imu(self, mode: Mode) -> bool:
         """Return whether the IMU propagates the state in a mode."""
         return mode is not Mode.NO_IMU and self.has_imu
+
+    def uses_gnss(self, mode: Mode) -> bool:
+        """Return whether fixes are used in a mode: the vehicle has an antenna."""
+        return bool(self.rig.gps_frame) and mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)

@@ -42,7 +42,6 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth.geodesy import LocalFrame
-from modelserver.estimation.filter.fusion import uses_gnss
 from modelserver.estimation.filter.imu_monitor import read_turn_rate
 from modelserver.estimation.filter.measurements.gnss import locate_fix, split_variance
 from modelserver.estimation.filter.measurements.wheels import estimate_turn_rate
@@ -201,7 +200,7 @@ class StreamCorrelation(NamedTuple):
             return self._add_gyro(setup, sample) if _has_gyro(setup, mode) else self
         if isinstance(sample, WheelsSample):
             return self._add_wheels(setup, sample, _has_gyro(setup, mode)) if mode is not Mode.NO_WHEELS else self
-        if isinstance(sample, GpsSample) and setup.rig.gps_frame and uses_gnss(mode):
+        if isinstance(sample, GpsSample) and setup.uses_gnss(mode):
             return self._add_fix(setup, sample, _has_gyro(setup, mode))
         return self
 

@@ -19,7 +19,7 @@ from modelserver.earth.geodesy import GeodesyError, LocalFrame
 from modelserver.estimation.filter import eskf
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, Earth, NavState, level_attitude
-from modelserver.estimation.filter.fusion import NOTHING, Fused, report_event, uses_gnss
+from modelserver.estimation.filter.fusion import NOTHING, Fused, report_event
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor, OutputOffset
 from modelserver.estimation.filter.leveling import get_tilt_by_bias
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR
@@ -321,7 +321,7 @@ def _check_fixes(setup: Setup, state: Unaligned, restored: Aligned, age: float, 
     waiting, fix = state.common.warm_start, state.alignment.last_fix
     assert waiting is not None
     text = f"warm start: the pose stored {format_age(age)}: the wheels and the IMU were stationary"
-    if not setup.rig.gps_frame or not uses_gnss(state.common.mode):
+    if not setup.uses_gnss(state.common.mode):
         return restored, (_report(restored, text),)
     if fix is None:
         if (utime - waiting.since) * 1e-6 < FIX_TIMEOUT:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from modelserver.estimation.filter import (
     imu_monitor,
     latency_estimator,
     leveling,
+    output,
     step,
 )
 from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
@@ -335,6 +337,20 @@ def test_given_the_pose_of_another_localizer_then_the_filter_starts_there_with_t
     assert np.diagonal(state.nav.covariance)[[0, 1, 2, 6, 7, 8]] == pytest.approx(np.diagonal(P))
     for wrong in (Estimate(T0, Pose.identity()), Estimate(T0, X, X, X, last.covariance, invalid=Invalid.STALE_GPS)):
         assert leveling.start_from(SETUP, first, wrong, before) is None
+
+
+@pytest.mark.parametrize(("gps", "expected"), [(True, Invalid.STALE_GPS), (False, Invalid(0))])
+def test_given_no_fixes_for_long_then_they_are_stale_only_on_a_vehicle_with_an_antenna(
+    gps: bool, expected: Invalid
+) -> None:
+    setup = Setup(rig(gps=gps))
+    first = step.start(Mode.FULL, GEODESY)
+    X = Pose.identity()
+    last = Estimate(T0, X, X, X, tuple(np.diag([0.01] * 6).ravel().tolist()))
+    state = leveling.start_from(setup, first, last, replace(last, utime=T0 - 100_000))
+    assert state is not None
+    late = T0 + round((setup.settings.gps_timeout + 1.0) * 1e6)
+    assert output.find_invalid(setup, state, late) & Invalid.STALE_GPS == expected
 
 
 # --- heading alignment --------------------------------------------------------------------------------------
