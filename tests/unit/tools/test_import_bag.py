@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,30 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
         cli.main([str(each) for each in arguments])
     out, err = capsys.readouterr()
     return int(end.value.code or 0), out, err
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (lambda data: data[:9] + b"\xff" * 7 + b"\x7f" + data[17:], "cannot be read on opening it"),
+        (lambda data: data[:10], "cannot be read on opening it"),
+        (lambda data: data[: len(data) // 2], "cannot be read"),
+        (lambda data: data.replace(b"3 linear_acceleration\n", b"3 linear_accelerated_\n"), "otherwise than ROS does"),
+    ],
+    ids=["length beyond memory", "shorter than its end", "half", "field of another name"],
+)
+def test_given_a_damaged_mcap_file_of_ros_then_the_file_and_the_damage_are_named(
+    tmp_path: Path, damage: Callable[[bytes], bytes], why: str
+) -> None:
+    ros = Ros(2)
+    bag = ros.write(tmp_path / "bag", [("/imu", START_NS + n, ros.imu(START_NS + n)) for n in range(5)], in_mcap=True)
+    (whole,) = bag.glob("*.mcap")
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(damage(whole.read_bytes()))
+    assert path.read_bytes() != whole.read_bytes()
+    with pytest.raises(RecordingError, match=why):
+        import_bag(path, tmp_path / "out.lcm")
+    assert not (tmp_path / "out.lcm").exists()
 
 
 # --- times, order, channels ---------------------------------------------------------------------------------

@@ -259,7 +259,13 @@ def _write(
                 elif len(offsets[name]) < LOOKED_AT:
                     offsets[name].append((utime - arrived) * 1e-6)
                 header = SensorHeader(utime, chosen[name].value, report.written, arrived)
-                sample = converters[name].convert(header, message)
+                try:
+                    sample = converters[name].convert(header, message)
+                except AttributeError as error:
+                    raise RecordingError(
+                        f"topic {name}: {error}: the file defines {report.type_name} otherwise than ROS does: "
+                        "it is damaged, or this is another type of that name"
+                    ) from None
                 out.write_event(arrived, report.channel, codec.encode(sample))
                 report.written += 1
                 first, last = first or arrived, arrived

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from modelserver.errors import RecordingError
 
 INSTALL = "pip install 'modelserver[bags]'"
+REMEDY: Final = "`rosbag reindex` repairs such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,7 @@ class Bag:
         stream = iter(self._reader.messages(connections=connections)) if connections else iter(())
         count = 0
         while True:
-            with _explain_errors(self._path, f"after {count} messages"):
+            with explain_errors(self._path, f"after {count} messages"):
                 try:
                     connection, received_ns, raw = next(stream)
                 except StopIteration:
@@ -66,7 +68,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         # reading a FIFO or a device would block
         raise RecordingError(f"{path}: {'neither a file nor a folder' if path.exists() else 'no such file'}")
     reader = None
-    with _explain_errors(path, "on opening it"):
+    with explain_errors(path, "on opening it"):
         # ROS 2 bags may lack their type definitions; those of ROS itself have been stable
         reader = AnyReader(_list_files(path), default_typestore=get_typestore(Stores.LATEST))
         reader.open()
@@ -87,15 +89,22 @@ def _list_files(path: Path) -> list[Path]:
 
 
 @contextmanager
-def _explain_errors(path: Path, place: str) -> Iterator[None]:
-    """Convert any exception of the library on a damaged bag to one readable error."""
+def explain_errors(path: Path, place: str, kind: str = "bag", remedy: str = REMEDY) -> Iterator[None]:
+    """Convert any exception of a library on a damaged file to one readable error; OSError of the disk stays."""
     try:
         yield
-    except (RecordingError, OSError, MemoryError):
+    except RecordingError:
         raise
-    except Exception as error:  # the library documents no exceptions for damaged files
+    except MemoryError:
+        what = "it states a length that exceeds the memory"
+    except Exception as error:  # the libraries document no exceptions for damaged files
+        # EINVAL: a seek to before the begin of a file that is too short
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            raise
         what = str(error).strip() or type(error).__name__
-        raise RecordingError(
-            f"{path}: the bag cannot be read {place}: {what.rstrip('.')}. It may be cut short or never have been "
-            "closed; `rosbag reindex` repairs such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
-        ) from None
+    else:
+        return
+    raise RecordingError(
+        f"{path}: the {kind} cannot be read {place}: {what.rstrip('.')}. It may be cut short or never have been "
+        f"closed; {remedy}"
+    )

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 from modelserver.errors import RecordingError
-from mstools.recordings.bag_reader import open_bag
+from mstools.recordings.bag_reader import explain_errors, open_bag
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 ENCODING: Final = "lcm"
 ROS_ENCODING: Final = "cdr"
 TOPIC_PREFIX: Final = "/lcm/"
+REMEDY: Final = "`mcap recover` repairs such files"
 
 
 class RecordedMessage(NamedTuple):
@@ -33,8 +35,10 @@ class McapLog:
     def __init__(self, path: Path, file: IO[bytes]):
         from mcap.reader import make_reader
 
-        self._reader = make_reader(file)
-        summary = self._reader.get_summary()
+        self._path = path
+        with explain_errors(path, "on opening it", "MCAP file", REMEDY):
+            self._reader = make_reader(file)
+            summary = self._reader.get_summary()
         if summary is None:
             raise RecordingError(f"{path}: the MCAP file has no summary: it was not closed; `mcap recover` repairs it")
         counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
@@ -49,7 +53,13 @@ class McapLog:
     def read(self) -> Iterator[RecordedMessage]:
         """Yield the messages in the order of the file."""
         topics = [f"{TOPIC_PREFIX}{each}" for each in self.channels]
-        for _, channel, message in self._reader.iter_messages(topics=topics, log_time_order=False):
+        stream = iter(self._reader.iter_messages(topics=topics, log_time_order=False))
+        for count in itertools.count():
+            with explain_errors(self._path, f"after {count} messages", "MCAP file", REMEDY):
+                found = next(stream, None)
+            if found is None:
+                return
+            _, channel, message = found
             yield RecordedMessage(message.log_time // 1000, channel.topic.removeprefix(TOPIC_PREFIX), message.data)
 
 
@@ -79,11 +89,8 @@ def is_ros_mcap(path: Path) -> bool:
 def open_mcap(path: Path) -> Iterator[McapLog]:
     """Open an MCAP file. Raises RecordingError for one that is damaged, or without the library; OSError."""
     try:
-        from mcap.exceptions import McapError
+        import mcap  # noqa: F401
     except ImportError:
         raise RecordingError("reading MCAP files needs the library mcap: pip install 'modelserver[bags]'") from None
     with path.open("rb") as file:
-        try:
-            yield McapLog(path, file)
-        except (McapError, EOFError, ValueError) as error:
-            raise RecordingError(f"{path}: the MCAP file is damaged: {error or type(error).__name__}") from None
+        yield McapLog(path, file)
