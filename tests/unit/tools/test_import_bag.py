@@ -60,7 +60,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 @pytest.mark.parametrize(
     ("damage", "why"),
     [
-        (lambda data: data[:9] + b"\xff" * 7 + b"\x7f" + data[17:], "cannot be read on opening it"),
+        (lambda data: data[:9] + b"\xff" * 5 + b"\0" * 3 + data[17:], "cannot be read on opening it"),
         (lambda data: data[:10], "cannot be read on opening it"),
         (lambda data: data[: len(data) // 2], "cannot be read"),
         (lambda data: data.replace(b"3 linear_acceleration\n", b"3 linear_accelerated_\n"), "otherwise than ROS does"),
