@@ -94,7 +94,8 @@ def test_given_the_clock_set_by_an_hour_then_the_pose_is_not_valid_until_it_is_r
             for _, pose in run.received.poses[stepped:]
             for reason in Invalid(pose.transformation.invalid_reasons)
         }
-        assert (Invalid.CLOCK_STEPPED if hours < 0 else Invalid.STALE_IMU) in reasons
+        # ahead: the old samples are stale, unless the first new one, which restarts the filter, came before a tick
+        assert reasons & ({Invalid.CLOCK_STEPPED} if hours < 0 else {Invalid.STALE_IMU, Invalid.NO_IMU})
         run.assert_consistent()
         assert run.longest_gap(stepped_at) < valid - stepped_at + 2.0
         print(f"not valid after {invalid - stepped_at:.2f} s, valid after {valid - stepped_at:.2f} s: {reasons}")
