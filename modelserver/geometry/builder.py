@@ -26,7 +26,6 @@ from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
-from modelserver.geometry.plausibility import find_reversed
 from modelserver.geometry.shape import Shape
 from modelserver.geometry.topology import Topology, full_name
 from modelserver.transforms.pose import Pose
@@ -410,8 +409,11 @@ class _ModelReview:
                 _suggest_fix(found) if bad else "",
             )
         # what closes a loop begins anywhere
-        for each in () if closures else find_reversed(bodies.values(), constraints):
-            far, near = each.from_.partition(":")[0], each.to.partition(":")[0]
+        for crossing in () if closures else topology.traverse_breadth_first(root[0]):
+            each, far, near = crossing.constraint, crossing.far_body, crossing.near_body
+            if crossing.forward or each.pose.is_close(Pose.identity()):
+                continue
+            # on a new part, the offset would be measured from there
             self.add_problem(
                 Severity.WARNING,
                 f"constraint {each.name} goes from {far} to {near}, which is nearer to {root[0]}: its pose is measured "

@@ -1,4 +1,4 @@
-"""What is possible in a geometry but improbable: numbers in another unit, a constraint the wrong way round. Pure.
+"""What is possible in a geometry but improbable: numbers in another unit. Pure.
 
 Each is a warning: what was seen, and what would be expected.
 """
@@ -6,12 +6,8 @@ Each is a warning: what was seen, and what would be expected.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Final
-
-from modelserver.geometry.parts import Body, Constraint
-from modelserver.transforms.pose import Pose
 
 FARTHEST: Final = 30.0
 """Meters from a body's origin, or along a constraint, that a part of a vehicle has at most."""
@@ -46,30 +42,3 @@ def looks_like_radians(degrees: float) -> bool:
 def looks_like_degrees(radians: float) -> bool:
     """Return whether a number of radians is more than a turn, or a whole number of more than half a one."""
     return abs(radians) > LARGEST_ANGLE or (abs(radians) >= 4.0 and float(radians).is_integer())
-
-
-def find_reversed(bodies: Iterable[Body], constraints: Iterable[Constraint]) -> Iterator[Constraint]:
-    """Yield the constraints of a tree with a pose that begin at the part farther from the first body.
-
-    The pose of a constraint is given in its From: on the new part, an offset is measured from there.
-    """
-    first = next(iter(bodies), None)
-    listed = tuple(constraints)
-    if first is None:
-        return
-    neighbors: dict[str, list[str]] = {}
-    ends = {each.name: tuple(end.partition(":")[0] for end in (each.from_, each.to)) for each in listed}
-    for a, b in ends.values():
-        neighbors.setdefault(a, []).append(b)
-        neighbors.setdefault(b, []).append(a)
-    distance, waiting = {first.name: 0}, deque([first.name])
-    while waiting:
-        body = waiting.popleft()
-        for other in neighbors.get(body, ()):
-            if other not in distance:
-                distance[other] = distance[body] + 1
-                waiting.append(other)
-    for each in listed:
-        a, b = ends[each.name]
-        if a in distance and distance[a] > distance[b] and not each.pose.is_close(Pose.identity()):
-            yield each
