@@ -155,6 +155,11 @@ class Problem:
         return f"{head}{self.severity}: {self.message}{tail}{fix}"
 
 
+def has_error(problems: Iterable[Problem]) -> bool:
+    """Return whether one of the problems is an error."""
+    return any(each.severity is Severity.ERROR for each in problems)
+
+
 MAX_KNOWN_NAMES = 20_000
 MAX_COMPARED_LENGTH = 100
 MAX_COMPARED_NAMES = 16

@@ -22,7 +22,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
+from modelserver.errors import Location, Suggestion, has_error, quote, suggest_name
 from modelserver.formats import reading
 from modelserver.formats.reading import ORIGIN, ElementReader, SyntaxProblemError, label, suggest_known_key
 from modelserver.geometry import names
@@ -267,7 +267,7 @@ class _BotFramesReader(ElementReader):
 
     @property
     def has_errors(self) -> bool:
-        return any(problem.severity is Severity.ERROR for problem in self.builder.problems)
+        return has_error(self.builder.problems)
 
     def enter(self, line: int, place: str) -> ElementReader:
         return ElementReader(self.builder, self.file, line, place)

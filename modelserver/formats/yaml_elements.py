@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from modelserver.errors import Severity, quote, suggest_name
+from modelserver.errors import has_error, quote, suggest_name
 from modelserver.formats.reading import MAX_POSITION
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode
 from modelserver.geometry.inertia import RigidInertia, Rows
@@ -235,8 +235,7 @@ class _YamlJointReader:
 
     @property
     def has_errors(self) -> bool:
-        new = self.at.builder.problems[self.problem_count :]
-        return any(each.severity is Severity.ERROR for each in new)
+        return has_error(self.at.builder.problems[self.problem_count :])
 
     def read(self) -> Joint | None:
         at = self.at

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
+from modelserver.errors import Location, Severity, Suggestion, has_error, quote, suggest_name
 from modelserver.formats.reading import label
 from modelserver.formats.yaml_elements import POSE_KEYS, SigmaDefaults, read_inertia, read_joint, read_pose, read_sigma
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode, parse_yaml
@@ -179,7 +179,7 @@ class _GeometryReader:
             )
             for name, key, value in self.list_bodies(top.enter(fields["bodies"], "bodies")):
                 self.read_body(name, key, value)
-        elif not any(problem.severity is Severity.ERROR for problem in builder.problems):
+        elif not has_error(builder.problems):
             top.error("there are no bodies", "add bodies:, with a name and frames: for each")
         if "constraints" in fields:
             for name, key, value in top.enter(fields["constraints"], "constraints").pairs:

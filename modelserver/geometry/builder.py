@@ -18,7 +18,16 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from modelserver.errors import GeometryError, Location, NotConnectedError, Problem, Severity, Suggestion, quote
+from modelserver.errors import (
+    GeometryError,
+    Location,
+    NotConnectedError,
+    Problem,
+    Severity,
+    Suggestion,
+    has_error,
+    quote,
+)
 from modelserver.geometry import loop_closure as loops
 from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint
@@ -209,7 +218,7 @@ class ModelBuilder:
         problems = tuple(
             problem for _, problem in sorted(enumerate(review.problems), key=lambda item: (item[1].line, item[0]))
         )
-        if any(problem.severity is Severity.ERROR for problem in problems):
+        if has_error(problems):
             return None, problems
         return Model(tuple(bodies.values()), constraints, self.name, self.description, problems), problems
 
@@ -234,7 +243,7 @@ class _ModelReview:
 
     @property
     def has_errors(self) -> bool:
-        return any(problem.severity is Severity.ERROR for problem in self.problems)
+        return has_error(self.problems)
 
     def _is_new_name(
         self, label: str, name: str, source: Location, seen: dict[str, Location], example: str, fix: str = ""

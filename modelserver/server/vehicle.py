@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -284,7 +284,7 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
     model = geometry.model
     if model is None and geometry.problems:
         raise errors.GeometryError(geometry.problems)
-    if model is None or has_error(problems):
+    if model is None or errors.has_error(problems):
         raise errors.ConfigError(problems)
     mounts = None
     gps, imu = config.sensors.gps, config.sensors.imu
@@ -311,7 +311,7 @@ def examine_vehicle(
             problems.append(_make_problem(file, "geometry", why))
     if geometry.partial_model is not None:
         problems += find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
-    if geometry.model is not None and not has_error(problems):
+    if geometry.model is not None and not errors.has_error(problems):
         problems += _find_dynamics_problems(config, geometry.model, file)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
@@ -343,11 +343,6 @@ def find_unsigned_drive(config: VehicleConfig) -> str:
     return (
         f"every host on the network of {config.lcm.url} can drive the vehicle through driver {drives[0]}: no signature"
     )
-
-
-def has_error(problems: Iterable[errors.Problem]) -> bool:
-    """Return whether one of the problems is an error."""
-    return any(each.severity is errors.Severity.ERROR for each in problems)
 
 
 def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> errors.Problem:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, Location, Problem, Severity
+from modelserver.errors import ConfigError, Location, Problem, Severity, has_error
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.formats import check_file
@@ -80,7 +80,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     """Return the model of a vehicle file, None if it has an error, and all problems. Raises OSError."""
     # imported here: a geometry file needs no configuration libraries and no geodesy
     from modelserver.config.vehicle_file import add_lines, load_partly
-    from modelserver.server.vehicle import examine_vehicle, has_error, load_vehicle
+    from modelserver.server.vehicle import examine_vehicle, load_vehicle
 
     try:
         config, problems = load_partly(file, blank=True)
@@ -109,7 +109,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     more = [each for each in add_lines(more, file) if not _is_within(each.element, wrong)]
     found = (*problems, *more, *geometry.problems)
     # a model beside a wrong vehicle file would look like success
-    clean = not any(each.severity is Severity.ERROR for each in found)
+    clean = not has_error(found)
     return geometry.model if clean else None, (*sorted(found, key=lambda each: (each.file != file, each.line)),)
 
 

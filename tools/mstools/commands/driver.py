@@ -18,8 +18,8 @@ from modelserver.errors import (
     ModelServerError,
     Problem,
     RecordingError,
-    Severity,
     find_nearest_names,
+    has_error,
     quote,
 )
 from modelserver.server.log import set_up_logging
@@ -191,7 +191,7 @@ def show_drivers(config: Path) -> None:
         typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
     problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
     print_problems(problems)
-    if any(problem.severity is Severity.ERROR for problem in problems):
+    if has_error(problems):
         raise typer.Exit(1)
 
 

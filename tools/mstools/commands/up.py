@@ -15,7 +15,7 @@ from typing import Annotated, Final
 import typer
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import ModelServerError, Severity
+from modelserver.errors import ModelServerError, Severity, has_error
 from modelserver.files.regular import check_links
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
@@ -127,7 +127,7 @@ def load_checked(config: Path) -> VehicleConfig:
         raise ModelServerError(f"{config} does not exist; give the vehicle file with -c, or {hint}")
     _, problems = check_vehicle(str(config))
     print_problems(each for each in problems if each.severity is not Severity.NOTE)
-    if any(each.severity is Severity.ERROR for each in problems):
+    if has_error(problems):
         raise typer.Exit(1)
     return load_config(config)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import ModelServerError, Problem, Severity
+from modelserver.errors import ModelServerError, Problem, has_error
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import read_start
 from modelserver.formats import parse_content, read_content
@@ -113,7 +113,7 @@ class EditSession:
     @property
     def has_errors(self) -> bool:
         """Whether a problem forbids to save."""
-        return any(each.severity is Severity.ERROR for each in self.problems)
+        return has_error(self.problems)
 
     @property
     def undo_name(self) -> str:
