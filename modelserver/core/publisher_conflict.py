@@ -133,7 +133,7 @@ class PublisherConflictDetector:
 
     def _check_outlier(self, header: SensorHeader | SampleId, now_ns: int) -> bool:
         """Process a sample that does not continue the sequence; return whether it is from a second publisher."""
-        if now_ns - self._last_ns > max(RESTART_GAP_NS, RESTART_GAP_INTERVALS * self._interval_ns):
+        if self._may_be_restarted(now_ns):
             self._restart(header, now_ns, self._sender)
             return False
         if now_ns - self._outlier_ns > PUBLISHER_TIMEOUT_NS:
@@ -148,26 +148,27 @@ class PublisherConflictDetector:
 
     def _check_other(self, header: SensorHeader | SampleId, now_ns: int, sender: object) -> bool:
         """Process a sample of another publisher; return whether it stays the second one."""
-        silent_ns = now_ns - self._last_ns
-        is_restarted = header.source == self.source and silent_ns > max(
-            RESTART_GAP_NS, RESTART_GAP_INTERVALS * self._interval_ns
-        )
+        is_restarted = header.source == self.source and self._may_be_restarted(now_ns)
         is_named = header.source in self._names and self.source not in self._names
-        if is_restarted or is_named or self._wins_contest((header.source, sender), silent_ns, now_ns):
+        if is_restarted or is_named or self._wins_contest((header.source, sender), now_ns):
             if not is_restarted:
                 self._set_conflict(self.source, now_ns)
             self._restart(header, now_ns, sender)
             return False
         return self._set_conflict(header.source, now_ns)
 
-    def _wins_contest(self, second: object, silent_ns: int, now_ns: int) -> bool:
+    def _may_be_restarted(self, now_ns: int) -> bool:
+        """Return whether the owner has been silent for so long that its source was restarted."""
+        return now_ns - self._last_ns > max(RESTART_GAP_NS, RESTART_GAP_INTERVALS * self._interval_ns)
+
+    def _wins_contest(self, second: object, now_ns: int) -> bool:
         """Return whether a second publisher is steady where the first one is not."""
         if second != self._second or now_ns - self._second_ns > SLOWEST_PERIOD_NS:
             if self._second is not None and now_ns - self._second_ns <= SLOWEST_PERIOD_NS:
                 return False  # a third one
             self._second, self._second_since_ns = second, now_ns
         self._second_ns = now_ns
-        if silent_ns > SLOWEST_PERIOD_NS:
+        if now_ns - self._last_ns > SLOWEST_PERIOD_NS:
             self._slow_ns = now_ns
         return now_ns - self._second_since_ns >= CONTEST_NS and now_ns - self._slow_ns < CONTEST_NS
 
