@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import errno
+import itertools
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from modelserver.errors import RecordingError
 
 INSTALL = "pip install 'modelserver[bags]'"
 REMEDY: Final = "`rosbag reindex` repairs such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
+
+
+M = TypeVar("M")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +43,15 @@ class Bag:
     def messages(self, topics: set[str]) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, receive time (ns) and message of some topics in the order received. Raises RecordingError."""
         connections = [each for each in self._reader.connections if each.topic in topics]
-        stream = iter(self._reader.messages(connections=connections)) if connections else iter(())
-        count = 0
-        while True:
-            with explain_errors(self._path, f"after {count} messages"):
-                try:
-                    connection, received_ns, raw = next(stream)
-                except StopIteration:
-                    return
-                message = self._reader.deserialize(raw, connection.msgtype)
-            count += 1
-            yield connection.topic, received_ns, message
+        if not connections:
+            return
+        yield from explain_each(
+            (
+                (connection.topic, received_ns, self._reader.deserialize(raw, connection.msgtype))
+                for connection, received_ns, raw in self._reader.messages(connections=connections)
+            ),
+            self._path,
+        )
 
 
 @contextmanager
@@ -86,6 +88,17 @@ def _list_files(path: Path) -> list[Path]:
         if found := sorted(each for each in path.iterdir() if each.suffix == suffix and each.is_file()):
             return found
     raise RecordingError(f"{path}: no bag: there is no metadata.yaml, no .mcap and no .db3 file in it")
+
+
+def explain_each(messages: Iterable[M], path: Path, kind: str = "bag", remedy: str = REMEDY) -> Iterator[M]:
+    """Yield what a library reads from a file, with `explain_errors`."""
+    stream = iter(messages)
+    for count in itertools.count():
+        with explain_errors(path, f"after {count} messages", kind, remedy):
+            found = next(stream, None)
+        if found is None:
+            return
+        yield found
 
 
 @contextmanager

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 from modelserver.errors import RecordingError
-from mstools.recordings.bag_reader import explain_errors, open_bag
+from mstools.recordings.bag_reader import explain_each, explain_errors, open_bag
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 ENCODING: Final = "lcm"
@@ -53,13 +52,8 @@ class McapLog:
     def read(self) -> Iterator[RecordedMessage]:
         """Yield the messages in the order of the file."""
         topics = [f"{TOPIC_PREFIX}{each}" for each in self.channels]
-        stream = iter(self._reader.iter_messages(topics=topics, log_time_order=False))
-        for count in itertools.count():
-            with explain_errors(self._path, f"after {count} messages", "MCAP file", REMEDY):
-                found = next(stream, None)
-            if found is None:
-                return
-            _, channel, message = found
+        stream = self._reader.iter_messages(topics=topics, log_time_order=False)
+        for _, channel, message in explain_each(stream, self._path, "MCAP file", REMEDY):
             yield RecordedMessage(message.log_time // 1000, channel.topic.removeprefix(TOPIC_PREFIX), message.data)
 
 
