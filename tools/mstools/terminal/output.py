@@ -74,10 +74,7 @@ def check_writable(path: str, replace: bool = True) -> None:
     """
     if path in ("", "-"):
         return
-    check_links(path)
-    target = os.path.realpath(path)
-    if os.path.isdir(target):
-        raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
+    target = _find_target(path)
     if os.path.isfile(target) and not replace:
         raise _make_exists_error(path)
     if os.path.exists(target) and not os.path.isfile(target):
@@ -105,10 +102,7 @@ def open_atomic(path: str, replace: bool) -> Iterator[TextIO]:
     A device or a pipe is written directly. Raises ModelServerError where the file exists and `replace` is false,
     OSError where it cannot be written.
     """
-    check_links(path)
-    target = os.path.realpath(path)
-    if os.path.isdir(target):
-        raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
+    target = _find_target(path)
     if os.path.exists(target) and not os.path.isfile(target):
         with open(target, "w", encoding="utf-8", newline="\n") as stream:
             yield stream
@@ -143,6 +137,15 @@ def open_atomic(path: str, replace: bool) -> Iterator[TextIO]:
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(draft)
+
+
+def _find_target(path: str) -> str:
+    """Return what is written for a path. Raises ModelServerError for a directory, ForeignLinkError."""
+    check_links(path)
+    target = os.path.realpath(path)
+    if os.path.isdir(target):
+        raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
+    return target
 
 
 def _make_exists_error(path: str) -> ModelServerError:
