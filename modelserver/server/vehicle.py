@@ -325,9 +325,8 @@ def examine_vehicle(
     if text := find_unsigned_drive(config):
         is_written = config.commands.drive == "unsigned"
         severity = errors.Severity.NOTE if is_written else errors.Severity.WARNING
-        place = errors.Location(file, element="commands")
         fix = f"{KEY_HINT}; or write ttl=0 in lcm.url, or drive: unsigned to accept it"
-        problems.append(errors.Problem(severity, text, place, fix))
+        problems.append(_make_problem(file, "commands", text, fix, severity=severity))
     try:
         get_configured_origin(config)
     except GeodesyError as error:
@@ -345,8 +344,15 @@ def find_unsigned_drive(config: VehicleConfig) -> str:
     )
 
 
-def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> errors.Problem:
-    return errors.Problem(errors.Severity.ERROR, why, errors.Location(file, element=key), fix, near)
+def _make_problem(
+    file: str,
+    key: str,
+    why: str,
+    fix: str = "",
+    near: tuple[str, ...] = (),
+    severity: errors.Severity = errors.Severity.ERROR,
+) -> errors.Problem:
+    return errors.Problem(severity, why, errors.Location(file, element=key), fix, near)
 
 
 def find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[errors.Problem]:
@@ -404,7 +410,7 @@ def _find_improbable_mounts(config: VehicleConfig, model: Model, file: str) -> I
         return model.get_transformation(frame, config.base_frame).pose.xyz
 
     def warn(key: str, why: str, fix: str) -> errors.Problem:
-        return errors.Problem(errors.Severity.WARNING, why, errors.Location(file, element=key), fix)
+        return _make_problem(file, key, why, fix, severity=errors.Severity.WARNING)
 
     sensors = config.sensors
     for key, sensor in (("gps", sensors.gps), ("imu", sensors.imu)):
