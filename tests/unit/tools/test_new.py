@@ -176,6 +176,132 @@ def test_given_a_urdf_then_its_frames_are_found_or_asked_for(tmp_path: Path, run
     assert run(tmp_path / "b", "--yes", "--from-urdf", urdf, "--gps-frame", "mast:Origin")[0] == 0
 
 
+def make_urdf(links: dict[str, str], wheels: dict[str, tuple[float, float]], radius: float = 0.0) -> str:
+    """Return a URDF: each link fixed at a place of base_link, and each wheel turning at a place, 0.2 m up."""
+    parts = ['<robot name="rover"><link name="base_link"/>']
+    for name, place in links.items():
+        parts.append(
+            f'<link name="{name}"/><joint name="{name}_joint" type="fixed"><parent link="base_link"/>'
+            f'<child link="{name}"/><origin xyz="{place}"/></joint>'
+        )
+    for name, (x, y) in wheels.items():
+        shape = f'<collision><geometry><cylinder radius="{radius}" length="0.1"/></geometry></collision>'
+        parts.append(
+            f'<link name="{name}">{shape if radius else ""}</link><joint name="{name}_joint" type="continuous">'
+            f'<parent link="base_link"/><child link="{name}"/><origin xyz="{x} {y} 0.2"/><axis xyz="0 1 0"/></joint>'
+        )
+    return "".join(parts) + "</robot>"
+
+
+FOUR = {"wheel_fl": (0.5, 0.3), "wheel_fr": (0.5, -0.3), "wheel_rl": (-0.1, 0.3), "wheel_rr": (-0.1, -0.3)}
+
+
+@pytest.mark.parametrize(
+    ("links", "gps", "imu"),
+    [
+        # the parts themselves, not the frames of their joints on the parent
+        ({"gps_link": "0 0 0.9", "imu_link": "0.2 0 0.1"}, "gps_link", "imu_link"),
+        # a part before the one that carries it
+        ({"gps_0_mount": "0 0 0.8", "gps_0_link": "0 0 1", "IMUPlate": "0 0 0", "Imu1": "0 0 0"}, "gps_0_link", "Imu1"),
+        ({"wifi_antenna": "0 0 1", "navsat": "0 0 0.5", "maximum": "0 0 2", "my_imu": "0 0 0"}, "navsat", "my_imu"),
+    ],
+)
+def test_given_a_urdf_then_each_sensor_is_on_its_own_link_and_the_guess_is_marked(
+    links: dict[str, str], gps: str, imu: str, tmp_path: Path, run: Run
+) -> None:
+    urdf = tmp_path / "rover.urdf"
+    urdf.write_text(make_urdf(links, {}))
+    code, out, _ = run(tmp_path / "a", "--yes", "--from-urdf", urdf)
+    sensors = load_config(tmp_path / "a" / "vehicle.yaml").sensors
+    assert (code, sensors.wheels) == (0, None)
+    assert sensors.gps is not None
+    assert sensors.imu is not None
+    assert (sensors.gps.frame, sensors.imu.frame) == (f"{gps}:Origin", f"{imu}:Origin")
+    for what in ("base_frame", "gps", "imu"):
+        assert f"{what}: guessed" in out.partition("To be measured")[2]
+    place = ", ".join(f"{float(each):g}" for each in links[gps].split())
+    assert f"gps: guessed from its name, ({place}) m from base_link:Origin" in out
+    assert "z of gx1 itself is down" in out
+    # what was given is no guess
+    given = ("--gps-frame", f"{gps}:Origin", "--imu-frame", f"{imu}:Origin", "--base-frame", "base_link:Origin")
+    _, out, _ = run(tmp_path / "b", "--yes", "--from-urdf", urdf, "--imu", "vectornav", *given)
+    assert "guessed" not in out
+
+
+@pytest.mark.parametrize(
+    ("wheels", "vehicle", "expected"),
+    [
+        (FOUR, "", {"front_left": (0.5, 0.3), "rear_right": (-0.1, -0.3)}),
+        (FOUR, "ackermann", {"rear_left": (-0.1, 0.3), "rear_right": (-0.1, -0.3)}),
+        (FOUR, "tracked", {"left": (0.2, 0.3), "right": (0.2, -0.3)}),
+        ({"l_wheel": (0.0, 0.2), "r_wheel": (0.0, -0.2), "caster_wheel": (0.3, 0.0)}, "", {"left": (0.0, 0.2)}),
+    ],
+)
+@pytest.mark.parametrize("radius", [0.0, 0.25])
+def test_given_a_urdf_with_wheels_then_they_have_contact_points(
+    radius: float,
+    wheels: dict[str, tuple[float, float]],
+    vehicle: str,
+    expected: dict[str, tuple[float, float]],
+    tmp_path: Path,
+    run: Run,
+) -> None:
+    urdf = tmp_path / "rover.urdf"
+    urdf.write_text(make_urdf({"gps": "0 0 1", "imu": "0 0 0"}, wheels, radius))
+    options = ("--vehicle", vehicle) if vehicle else ()
+    code, out, _ = run(tmp_path / "a", "--yes", "--from-urdf", urdf, "--wheels", "can0", *options)
+    assert (code, find_problems(tmp_path / "a")) == (0, [])
+    config, model = load_config(tmp_path / "a" / "vehicle.yaml"), load_model(tmp_path / "a" / "geometry.yaml")
+    assert config.sensors.wheels is not None
+    for name, place in expected.items():
+        found = model.get_transformation(config.sensors.wheels.frames[name], "base_link:Origin").pose
+        assert found.xyz == pytest.approx((*place, 0.2 - radius))
+        assert f"{name}: guessed: where " in out
+    count = len(config.sensors.wheels.frames)
+    assert count == (4 if wheels is FOUR and not vehicle else 2)
+    # the point that moves straight ahead in a turn
+    rolling = model.get_transformation(config.rolling_frame or config.base_frame, "base_link:Origin").pose
+    x = {"": 0.2, "ackermann": -0.1, "tracked": 0.2}[vehicle] if wheels is FOUR else 0.0
+    assert rolling.xyz[:2] == pytest.approx((x, 0.0))
+
+
+def test_given_a_urdf_without_wheels_then_those_asked_for_have_a_typical_place(tmp_path: Path, run: Run) -> None:
+    urdf = tmp_path / "rover.urdf"
+    urdf.write_text(make_urdf({"gps": "0 0 1", "imu": "0 0 0"}, {}))
+    code, out, _ = run(tmp_path / "a", "--yes", "--from-urdf", urdf, "--wheels", "can0")
+    assert (code, find_problems(tmp_path / "a")) == (0, [])
+    assert "front_left: a typical place: the geometry has no such wheel" in out
+
+
+def test_given_a_urdf_with_steered_wheels_then_the_vehicle_is_one_with_a_rear_axle(tmp_path: Path, run: Run) -> None:
+    urdf = tmp_path / "car.urdf"
+    text = make_urdf(
+        {"gps": "0 0 1", "imu": "0 0 0", "knuckle": "1 0.5 0.3"}, {k: FOUR[k] for k in FOUR if "r" in k[-2]}
+    )
+    text = text.replace('knuckle_joint" type="fixed"', 'knuckle_joint" type="revolute"').replace(
+        "</robot>",
+        '<link name="front_wheel"/><joint name="f" type="continuous"><parent link="knuckle"/>'
+        '<child link="front_wheel"/>'
+        '<axis xyz="0 1 0"/></joint></robot>',
+    )
+    urdf.write_text(
+        text.replace(
+            '<origin xyz="1 0.5 0.3"/>',
+            '<origin xyz="1 0.5 0.3"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>',
+        )
+    )
+    assert run(tmp_path / "a", "--yes", "--from-urdf", urdf, "--wheels", "can0")[0] == 0
+    wheels = load_config(tmp_path / "a" / "vehicle.yaml").sensors.wheels
+    assert wheels is not None
+    assert wheels.kinematics == "ackermann"
+
+
+def test_given_no_gps_then_the_geometry_needs_no_frame_for_it(tmp_path: Path, run: Run) -> None:
+    urdf = tmp_path / "rover.urdf"
+    urdf.write_text(make_urdf({"imu": "0 0 0"}, {}))
+    assert run(tmp_path / "a", "--yes", "--from-urdf", urdf, "--gps", "none")[0] == 0
+
+
 def test_given_a_terminal_then_it_asks_until_the_answer_is_known(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -29,6 +29,19 @@ from mstools.scaffold.files import (
     make_dbc,
     make_geometry,
     make_vehicle,
+)
+from mstools.scaffold.guesses import (
+    GPS_WORDS,
+    IMU_WORDS,
+    Mount,
+    Mounts,
+    Wheel,
+    add_wheel_frames,
+    guess_base,
+    guess_kind,
+    guess_sensor,
+    list_wheels,
+    note_axes,
 )
 from mstools.scaffold.templates import TEMPLATES
 from mstools.terminal.options import choose_name, option
@@ -89,19 +102,26 @@ def command(
     model = None if urdf is None else _load_geometry(urdf)
     known = {name: f"{each.summary}" for name, each in TEMPLATES.items()}
     name = _check_name(ask.text("Name of the vehicle", name, folder.resolve().name or "vehicle"))
-    kind = ask.choice("Which kind of vehicle is it?", vehicle, known, "skid", "--vehicle")
+    base = None if model is None else Mount(base_frame) if base_frame else guess_base(model)
+    turning = (
+        () if model is None or base is None else list_wheels(model, _check_frame(model, base.frame, "--base-frame"))
+    )
+    kind = ask.choice(
+        "Which kind of vehicle is it?", vehicle, known, guess_kind(turning) if turning else "skid", "--vehicle"
+    )
     wanted = NewVehicle(
         name,
         TEMPLATES[kind],
         ask.device("GNSS receiver", gps, list_kinds(KINDS, GpsSample), DEFAULT_GPS, "--gps"),
         ask.device("Inertial unit", imu, list_kinds(KINDS, ImuSample), DEFAULT_IMU, "--imu"),
-        None if model is not None else ask.wheels(wheels),
+        ask.wheels(wheels, propose_can() if model is None or turning else NONE),
         model is None and ask.flag("Is there a camera?", camera),
-        None,
-        None if model is None else find_frames(model, base_frame, gps_frame, imu_frame),
     )
     if wanted.has_camera:
         wanted = dataclasses.replace(wanted, head=ask.head(pan_tilt))
+    if model is not None and base is not None:
+        model, mounts = find_mounts(model, base, wanted, turning, gps_frame, imu_frame)
+        wanted = dataclasses.replace(wanted, given=mounts)
     files = {GEOMETRY_FILE: make_geometry(wanted) if model is None else save_model(model, "yaml").text}
     if wanted.wheels is not None:
         files[DBC_FILE] = make_dbc(wanted)
@@ -163,9 +183,9 @@ class Questions:
         line = self.text(question, given, NONE)
         return None if line == NONE else Device(KINDS["text_joints"], line)
 
-    def wheels(self, given: str) -> Device | None:
+    def wheels(self, given: str, default: str) -> Device | None:
         """Return the wheels on a CAN bus; None for none."""
-        channel = self.text("CAN channel of the wheel encoders (none: there are none)", given, propose_can())
+        channel = self.text("CAN channel of the wheel encoders (none: there are none)", given, default)
         return None if channel == NONE else Device(KINDS["wheels"], channel)
 
 
@@ -204,24 +224,43 @@ def _load_geometry(file: Path) -> Model:
     return model
 
 
-def find_frames(model: Model, base: str, gps: str, imu: str) -> dict[str, str]:
-    """Return the frames of base, gps and imu: those given, else by their names. Raises typer.BadParameter."""
-    names = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body.frames]
+def find_mounts(
+    model: Model, base: Mount, wanted: NewVehicle, turning: Sequence[Wheel], gps: str, imu: str
+) -> tuple[Model, Mounts]:
+    """Return the frames of what is on a vehicle, those given or guessed, and the model with those of its wheels.
 
-    def choose(given: str, words: tuple[str, ...], option_name: str) -> str:
+    Raises typer.BadParameter, GeometryError.
+    """
+
+    def choose(given: str, words: tuple[str, ...], option_name: str) -> Mount:
         if given:
-            return choose_name(given, names, "frame", option_name)
-        found = next((each for word in words for each in names if word in each.lower()), "")
-        if not found:
-            shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-            raise typer.BadParameter(f"give the frame; the geometry has: {shown}", param_hint=option_name)
-        return found
+            return Mount(_check_frame(model, given, option_name))
+        if guess := guess_sensor(model, words, base.frame):
+            return guess
+        names = list_frames(model)
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise typer.BadParameter(f"give the frame; the geometry has: {shown}", param_hint=option_name)
 
-    return {
-        "base": choose(base, ("base_footprint", "base_link", "base", names[0].lower()), "--base-frame"),
-        "gps": choose(gps, ("antenna", "gnss", "gps", "navsat"), "--gps-frame"),
-        "imu": choose(imu, ("imu", "inertial"), "--imu-frame"),
-    }
+    mounts = Mounts(
+        base,
+        choose(gps, GPS_WORDS, "--gps-frame") if wanted.gps is not None else None,
+        choose(imu, IMU_WORDS, "--imu-frame") if wanted.imu is not None else None,
+    )
+    if wanted.imu is not None and mounts.imu is not None and wanted.imu.kind.has_z_down:
+        mounts = mounts._replace(imu=note_axes(model, mounts.imu, wanted.imu.kind.name, base.frame))
+    if wanted.wheels is None:
+        return model, mounts
+    model, wheels, rolling = add_wheel_frames(model, base.frame, wanted.template, turning)
+    return model, mounts._replace(wheels=wheels, rolling=rolling)
+
+
+def list_frames(model: Model) -> list[str]:
+    """Return the full names of all frames."""
+    return [frame.full_name for body in model.bodies for frame in body.frames]
+
+
+def _check_frame(model: Model, name: str, option_name: str) -> str:
+    return choose_name(name, list_frames(model), "frame", option_name)
 
 
 def write_files(folder: Path, files: Mapping[str, str], force: bool) -> None:

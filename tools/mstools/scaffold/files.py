@@ -10,6 +10,7 @@ from typing import Final
 from modelserver.messages import GpsSample, ImuSample
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.registry import DeviceKind
+from mstools.scaffold.guesses import Mount, Mounts
 from mstools.scaffold.templates import Place, VehicleTemplate
 
 MARK: Final = "MEASURE"
@@ -44,7 +45,7 @@ def find_line_key(kind: DeviceKind, line: str) -> str:
 class NewVehicle:
     """What is on a new vehicle.
 
-    `head` is the pan-tilt head below the camera; `frames` are those of base, gps and imu in a geometry that exists.
+    `head` is the pan-tilt head below the camera; `given` are the frames in a geometry that exists.
     """
 
     name: str
@@ -54,7 +55,16 @@ class NewVehicle:
     wheels: Device | None = None
     has_camera: bool = False
     head: Device | None = None
-    frames: Mapping[str, str] | None = None
+    given: Mounts | None = None
+
+    @property
+    def mounts(self) -> Mounts:
+        """The frames of the vehicle: those in a geometry that exists, else those of `make_geometry`."""
+        if self.given is not None:
+            return self.given
+        wheels = {name: Mount(f"{self.body}:{_frame_of_wheel(name)}") for name in self.template.wheels}
+        base, gps, imu = (Mount(f"{self.body}:{frame}") for frame in ("Base", "Antenna", "ImuUnit"))
+        return Mounts(base, gps, imu, wheels)
 
     @property
     def body(self) -> str:
@@ -146,19 +156,19 @@ def _frame_of_wheel(name: str) -> str:
 
 def make_vehicle(vehicle: NewVehicle) -> str:
     """Return the text of the vehicle file."""
-    template, body = vehicle.template, vehicle.body
-    frames = vehicle.frames or {"base": f"{body}:Base", "gps": f"{body}:Antenna", "imu": f"{body}:ImuUnit"}
+    template, mounts = vehicle.template, vehicle.mounts
     lines = [
         f"# {vehicle.name}: {template.summary}.",
         "# Check with: modelserver check vehicle.yaml. All keys: docs/vehicle-file.md.",
         *(f"# {line}" for line in template.note.splitlines()),
         f"vehicle: {vehicle.name}",
         f"geometry: {GEOMETRY_FILE}",
-        f'base_frame: "{frames["base"]}"   # POSE describes this frame',
+        f'base_frame: "{mounts.base.frame}"{_mark(mounts.base) or "   # POSE describes this frame"}',
+        *(f'rolling_frame: "{each.frame}"{_mark(each)}' for each in (mounts.rolling,) if each is not None),
         "state_directory: state   # the origin, and the state for the next start",
         "journal: {directory: journal, megabytes: 256}   # all inputs and outputs, to replay; the oldest are deleted",
     ]
-    if sensors := list(_list_sensors(vehicle, frames)):
+    if sensors := list(_list_sensors(vehicle, mounts)):
         lines += ["", "sensors:", *sensors]
     if template.settings:
         lines += [
@@ -177,18 +187,20 @@ def make_vehicle(vehicle: NewVehicle) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _list_sensors(vehicle: NewVehicle, frames: Mapping[str, str]) -> Iterator[str]:
-    if vehicle.gps is not None:
-        yield f'  gps: {{channel: GPS, frame: "{frames["gps"]}"}}'
-    if vehicle.imu is not None:
-        yield f'  imu: {{channel: IMU, frame: "{frames["imu"]}"}}'
+def _list_sensors(vehicle: NewVehicle, mounts: Mounts) -> Iterator[str]:
+    for name, device, mount in (("gps", vehicle.gps, mounts.gps), ("imu", vehicle.imu, mounts.imu)):
+        if device is not None and mount is not None:
+            yield f'  {name}: {{channel: {name.upper()}, frame: "{mount.frame}"}}{_mark(mount)}'
     if vehicle.wheels is not None:
         yield "  wheels:"
         yield "    channel: WHEELS"
         yield f"    kinematics: {vehicle.template.kinematics}"
         yield "    frames:"
-        for name in vehicle.template.wheels:
-            yield f'      {name}: "{vehicle.body}:{_frame_of_wheel(name)}"'
+        yield from (f'      {name}: "{mount.frame}"{_mark(mount)}' for name, mount in mounts.wheels.items())
+
+
+def _mark(mount: Mount) -> str:
+    return f"   # {MARK}: {mount.note}" if mount.note else ""
 
 
 def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
