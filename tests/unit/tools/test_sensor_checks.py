@@ -3,21 +3,45 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
 
+from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.messages import VALID, Decision, FixType, GpsSample, Mode, Phase, SensorHeader, Verdict
+from modelserver.messages import (
+    VALID,
+    Decision,
+    FixType,
+    GpsSample,
+    Mode,
+    Phase,
+    SensorHeader,
+    Verdict,
+    WheelSample,
+    WheelsSample,
+)
 from mstools.report.findings import collect_findings
 from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
-from mstools.report.sensor_motion import SecondMeans, SensorMotion, compute_sensor_motion
+from mstools.report.sensor_motion import (
+    SecondMeans,
+    SensorMotion,
+    compare_turn_rates,
+    compute_sensor_motion,
+    compute_wheel_motion,
+)
 
 START = 1_700_000_000
 SECONDS = 120
 TRACK = 0.6
-RADIUS = 6_371_000.0
+
+
+RATE = 20
+"""Wheel samples a second."""
+
+EVEN, BURSTS, SHUFFLED = "even", "bursts", "shuffled"
 
 
 def make_motion(
@@ -27,25 +51,85 @@ def make_motion(
     degrees: float = 1.0,
     with_gyro: bool = True,
     swapped: bool = False,
+    arrival: str = EVEN,
+    place: tuple[float, float] = (50.0, -111.0),
 ) -> SensorMotion:
-    """Return the motion of a drive, alternately 20 s straight and 20 s in a wide turn; factors corrupt the sensors."""
+    """Return the motion of a drive, alternately 20 s straight and 20 s in a wide turn; factors corrupt the sensors.
+
+    `arrival`: bursts are stamped 9 us apart, four together; shuffled ones come in any order.
+    """
     rates = SecondMeans()
-    fixes, turns = [], []
+    fixes, wheels = [], []
     x = y = yaw = 0.0
+    travel = {"left": 0.0, "right": 0.0}
+    plane = LocalFrame.at(*place, 0.0)
     for n in range(SECONDS):
         rate = (0.0, 0.1, 0.0, -0.1)[n // 20 % 4]
         yaw += rate
         x, y = x + 2.0 * math.cos(yaw), y + 2.0 * math.sin(yaw)
-        header = SensorHeader((START + n) * 1_000_000, "any")
         if with_gyro:
             rates.add(START + n, gyro * rate)
-        north, east = (math.degrees(each / RADIUS) * degrees for each in (y, x))
-        fixes.append(GpsSample(header, FixType.FIX_3D, north, east))
+        latitude, longitude, _ = geodetic_from_ecef(plane.to_ecef((x, y, 0.0)))
+        latitude, longitude = (degrees * (latitude - place[0]) + place[0], degrees * (longitude - place[1]) + place[1])
+        fixes.append(GpsSample(SensorHeader((START + n) * 1_000_000, "gps"), FixType.FIX_3D, latitude, longitude))
         speeds = {"left": left * (2.0 - rate * TRACK / 2.0), "right": right * (2.0 + rate * TRACK / 2.0)}
         if swapped:
             speeds = {"left": speeds["right"], "right": speeds["left"]}
-        turns += [(header.utime, name, speed, 0.0) for name, speed in speeds.items()]
-    return compute_sensor_motion(rates.finish(), fixes, turns, {"left": TRACK / 2.0, "right": -TRACK / 2.0})
+        for k in range(RATE):
+            travel = {name: travel[name] + speed / RATE for name, speed in speeds.items()}
+            utime = (START + n) * 1_000_000 + (k + 1) * 1_000_000 // RATE
+            if arrival == BURSTS:
+                utime += 9 * (k % 4) - (k % 4) * 1_000_000 // RATE
+            counts = tuple(WheelSample(name, round(meters, 3)) for name, meters in travel.items())
+            wheels.append(WheelsSample(SensorHeader(utime, "wheels", n * RATE + k), counts))
+    if arrival == SHUFFLED:
+        random.Random(1).shuffle(wheels)
+        random.Random(2).shuffle(fixes)
+    sides = {"left": TRACK / 2.0, "right": -TRACK / 2.0}
+    return compute_sensor_motion(rates.finish(), fixes, compute_wheel_motion(wheels), sides)
+
+
+@pytest.mark.parametrize("arrival", [EVEN, BURSTS, SHUFFLED])
+@pytest.mark.parametrize("place", [(0.0, 0.0), (50.0, -111.0), (89.999, 10.0), (-77.0, 180.0), (-33.0, -179.9999)])
+def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
+    place: tuple[float, float], arrival: str
+) -> None:
+    found = make_motion(arrival=arrival, place=place)
+    # straight lines between fixes are a little shorter than the way
+    assert found.compare_distances() == pytest.approx((230.0, 230.0), rel=0.03)
+    wheels, fixes = found.compare_distances()
+    assert wheels / fixes == pytest.approx(1.0, abs=0.02)
+    assert found.distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.01)
+    compared = compare_turn_rates(found.gyro, found.wheel_turn_rate)
+    assert compared == pytest.approx((1.0, 1.0), abs=0.1)
+    assert found.compare_with_course(found.gyro) == pytest.approx((1.0, 1.0), abs=0.1)
+    assert collect_findings(make_data(sensor_motion=found)) == []
+    swapped = make_motion(arrival=arrival, place=place, swapped=True)
+    assert only(make_data(sensor_motion=swapped)).title == "Left and right wheels are swapped"
+
+
+def test_given_speeds_without_travel_then_they_are_means_of_their_seconds() -> None:
+    speed = [0.5, 1.5]
+    samples = [
+        WheelsSample(SensorHeader(START * 1_000_000 + 9 * n, "wheels", n), (WheelSample("left", speed=speed[n]),))
+        for n in range(2)
+    ]
+    found = compute_sensor_motion({}, [], compute_wheel_motion(samples), {"left": 0.3})
+    assert found.wheels == {"left": {START: 1.0}}
+
+
+def test_given_travel_that_begins_again_then_it_is_no_distance() -> None:
+    samples = [
+        WheelsSample(SensorHeader((START + n) * 1_000_000, "wheels", n % 2), (WheelSample("left", travel),))
+        for n, travel in enumerate([5000.0, 5001.0, 0.0, 1.0])
+    ]
+    assert [each.speed for each in compute_wheel_motion(samples)] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("burst", [1, 4, 10])
+def test_given_samples_in_bursts_then_their_period_is_that_of_the_source(burst: int) -> None:
+    times = tuple(0.1 * (n - n % burst) + 9e-6 * (n % burst) for n in range(200))
+    assert SourceTimes("wheels", times).period == pytest.approx(0.1, rel=0.1)
 
 
 def make_data(**more: object) -> ReplayData:

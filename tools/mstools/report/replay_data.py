@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -34,10 +34,19 @@ from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.report.sensor_motion import SecondMeans, SensorMotion, compute_sensor_motion
+from mstools.report.sensor_motion import (
+    SecondMeans,
+    SensorMotion,
+    WheelMotion,
+    compute_sensor_motion,
+    compute_wheel_motion,
+)
 
 SNAPSHOT_PERIOD_US = 200_000
 """Shortest interval between two stored states, microseconds."""
+
+PERIOD_SAMPLES = 20
+"""Samples over which a period is taken: more than the bursts of recorders and buses have."""
 
 FROZEN_S = 1.0
 """Seconds without change until an IMU counts as frozen."""
@@ -51,6 +60,7 @@ class StateSample:
     ----------
     position : of the antenna (without a receiver of the rolling frame), east, north, up of the origin in World:UTM
     yaw : of the rolling frame from grid east
+    velocity : of the rolling frame, true east and north, m/s
     sigma, yaw_sigma : longest axis of the horizontal position, m, and heading
     horizontal_protection_level, heading_protection_level : of the pose
     speed, lateral_speed, yaw_rate : forward and to the left, m/s; rad/s
@@ -69,6 +79,7 @@ class StateSample:
     speed: float = math.nan
     lateral_speed: float = math.nan
     yaw_rate: float = math.nan
+    velocity: tuple[float, float] | None = None
     is_stationary: bool = False
     mode: Mode | None = None
     phase: Phase | None = None
@@ -80,8 +91,8 @@ class StateSample:
 class FixRecord:
     """A fix and the decision on it. `position` as in `StateSample`; None without a position or origin.
 
-    `residual` is fix minus antenna, east and north, m, including the time-correlated error; `velocity` the antenna's,
-    m/s; None where the fix was not compared. `verdict` is empty where nothing was decided.
+    `residual` is fix minus antenna, true east and north, m, including the time-correlated error; `velocity` the
+    vehicle's, m/s; None where the fix was not compared. `verdict` is empty where nothing was decided.
     """
 
     t: float
@@ -94,7 +105,7 @@ class FixRecord:
 
 @dataclass(frozen=True, slots=True)
 class WheelComparison:
-    """Measured speed of a wheel at `t` and the one expected from the state, m/s along its rolling direction."""
+    """Measured speed of a wheel around `t` and the one expected from the state, m/s along its rolling direction."""
 
     t: float
     name: str
@@ -111,8 +122,13 @@ class SourceTimes:
 
     @property
     def period(self) -> float:
-        """Median interval between two samples, seconds; nan with fewer than two."""
-        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
+        """Median interval between two samples, seconds; nan with fewer than two.
+
+        The median is of the time for several samples: those that arrive in bursts have the period of their source.
+        """
+        several = max(1, min(PERIOD_SAMPLES, len(self.times) // 4))
+        times = np.array(self.times)
+        return float(np.median(times[several:] - times[:-several])) / several if len(times) > 1 else math.nan
 
     def find_gaps(self) -> list[tuple[float, float]]:
         """Return begin and end of the intervals longer than three periods and 0.2 s."""
@@ -200,8 +216,7 @@ class ReplayCollector:
         self._decisions: list[Decision] = []
         self._states: list[tuple[int, StateSample]] = []
         self._fixes: list[GpsSample] = []
-        self._wheel_speeds: list[tuple[int, str, float, float]] = []
-        self._previous_wheels: dict[str, WheelsSample] = {}
+        self._wheels: list[WheelsSample] = []
         self._times: dict[str, list[int]] = {}
         self._forces = np.zeros(3)
         self._force_count = 0
@@ -231,7 +246,8 @@ class ReplayCollector:
         if isinstance(sample, GpsSample):
             self._fixes.append(sample)
         elif isinstance(sample, WheelsSample):
-            self._add_wheels(sample)
+            self._wheels.append(sample)
+            self._wheel_names.update(dict.fromkeys(wheel.name for wheel in sample.wheels))
         elif isinstance(sample, ImuSample):
             self._add_imu(sample)
         # before the first state, the estimate at the sample has the reasons why there is none
@@ -256,6 +272,7 @@ class ReplayCollector:
         snapshots = tuple(replace(each, t=seconds(utime)) for utime, each in self._states)
         config = self._vehicle.config
         self._close_frozen()
+        rolling = compute_wheel_motion(self._wheels)
         return ReplayData(
             vehicle=config.vehicle,
             log=log,
@@ -265,7 +282,7 @@ class ReplayCollector:
             snapshots=snapshots,
             fixes=self._evaluate_fixes(first_utime, snapshots),
             decisions=tuple(self._decisions),
-            wheels=self._compare_wheels(first_utime, snapshots),
+            wheels=self._compare_wheels(rolling, first_utime, snapshots),
             sensors=tuple(SourceTimes(n, tuple(sorted(map(seconds, t)))) for n, t in sorted(self._times.items())),
             rejected=dict(rejected),
             mean_force=self._mean_force(),
@@ -279,7 +296,7 @@ class ReplayCollector:
             sensor_motion=compute_sensor_motion(
                 self._yaw_rates.finish(),
                 self._fixes,
-                self._wheel_speeds,
+                rolling,
                 {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()},
             ),
         )
@@ -311,6 +328,7 @@ class ReplayCollector:
                 "speed": state.linear_velocity[0],
                 "lateral_speed": state.linear_velocity[1],
                 "yaw_rate": state.angular_velocity[2],
+                "velocity": so3.rotate(state.pose.wxyz, state.linear_velocity)[:2],
                 "is_stationary": state.stationary,
                 "mode": state.mode,
                 "phase": state.phase,
@@ -325,19 +343,6 @@ class ReplayCollector:
             heading_protection_level=estimate.heading_protection_level,
             **known,
         )
-
-    def _add_wheels(self, sample: WheelsSample) -> None:
-        before = self._previous_wheels.get(sample.header.source)
-        self._previous_wheels[sample.header.source] = sample
-        earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
-        dt = (sample.header.utime - before.header.utime) * 1e-6 if before is not None else 0.0
-        for wheel in sample.wheels:
-            self._wheel_names[wheel.name] = None
-            distance = wheel.travel - earlier.get(wheel.name, math.nan)
-            speed = distance / dt if 0.0 < dt < 1.0 and math.isfinite(distance) else wheel.speed
-            if math.isfinite(speed) and math.isfinite(wheel.steering):
-                middle = sample.header.utime - round(0.5e6 * min(dt, 1.0))
-                self._wheel_speeds.append((middle, wheel.name, speed, wheel.steering))
 
     def _add_imu(self, sample: ImuSample) -> None:
         if sample.specific_force is not None and all(map(math.isfinite, sample.specific_force)):
@@ -390,22 +395,24 @@ class ReplayCollector:
                     utm = geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
                     place = geodesy.to_relative_utm(utm)
             before = _latest(snapshots, times, t) if decision is not None and decision.dof == 2 else None
-            if decision is not None and before is not None and math.isfinite(before.speed):
+            if decision is not None and before is not None and before.velocity is not None:
                 east = split_variance(fix.east_variance, fix, sample.fix_type, settings)[1]
                 north = split_variance(fix.north_variance, fix, sample.fix_type, settings)[1]
                 a, b = (before.values.get(name, 0.0) for name in CORRELATED_ERROR[:2])
                 residual = (decision.residual[0] + east * a, decision.residual[1] + north * b)
-                velocity = _velocity(before)
+                velocity = before.velocity
             found.append(FixRecord(t, place, verdict, reason, residual, velocity))
         return tuple(found)
 
-    def _compare_wheels(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[WheelComparison, ...]:
+    def _compare_wheels(
+        self, rolling: Sequence[WheelMotion], first_utime: int, snapshots: tuple[StateSample, ...]
+    ) -> tuple[WheelComparison, ...]:
         known = [each for each in snapshots if math.isfinite(each.speed)]
-        if not known or not self._wheel_speeds:
+        if not known or not rolling:
             return ()
-        utimes, names, measured, steering = zip(*self._wheel_speeds, strict=True)
+        begins, ends, names, measured, steering = zip(*rolling, strict=True)
         times = [each.t for each in known]
-        at = (np.array(utimes) - first_utime) * 1e-6
+        at = (0.5 * (np.array(begins) + np.array(ends)) - first_utime) * 1e-6
         v, w = (np.interp(at, times, [getattr(each, name) for each in known]) for name in ("speed", "yaw_rate"))
         contacts = {name: self._rig.pose(frame).xyz for name, frame in self._rig.wheel_frames.items()}
         x, y, _ = np.array([contacts.get(name, (math.nan,) * 3) for name in names]).T
@@ -415,11 +422,6 @@ class ReplayCollector:
             for each in zip(at.tolist(), names, measured, expected.tolist(), strict=True)
             if each[1] in contacts and times[0] <= each[0] <= times[-1]
         )
-
-
-def _velocity(snapshot: StateSample) -> tuple[float, float]:
-    c, s = math.cos(snapshot.yaw), math.sin(snapshot.yaw)
-    return (c * snapshot.speed - s * snapshot.lateral_speed, s * snapshot.speed + c * snapshot.lateral_speed)
 
 
 def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> StateSample | None:

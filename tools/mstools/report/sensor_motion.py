@@ -1,6 +1,7 @@
 """Motion by each sensor alone, before any localization: turn rates of gyro, wheels and fixes, and distances.
 
-All series are means over one second, so that a long log needs little memory. Two series are compared by their
+All series are means over one second, so that a long log needs little memory. A wheel's speed is its travel over time,
+however its samples arrived; places are in the tangent plane, the same on all of Earth. Two series are compared by their
 correlation sum(ab) / sqrt(sum(a^2) sum(b^2)) and by the ratio of their root mean squares: a ratio of 57 reveals degrees
 instead of radians, a negative correlation a swapped sign. Fixes give a course from steps of at least COURSE_STEP_M.
 Limits: without turns or straight driving there is nothing to compare, and the comparison is None.
@@ -10,16 +11,22 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from modelserver.messages import FixType, GpsSample
+from modelserver.earth.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic
+from modelserver.messages import FixType, GpsSample, WheelsSample
 
-EARTH_RADIUS = 6_371_000.0
+MIN_TRAVEL_US = 50_000
+"""Least time over which travel gives a speed, microseconds: one count of 1 mm is then 2 cm/s."""
+
+MAX_TRAVEL_US = 5_000_000
+"""Longest time over which travel gives a speed, microseconds."""
 
 COURSE_STEP_M = 8.0
 """Distance between two fixes that give a course, meters: several times their noise."""
@@ -94,9 +101,9 @@ class SensorMotion:
         """Compare a turn rate with the fixes' course, integrated over the intervals of its changes."""
         found: dict[int, tuple[float, float]] = {}
         for t, u, turn in self.course_changes():
-            known = [rates[second] for second in range(math.floor(t), math.ceil(u)) if second in rates]
-            if known:
-                found[math.floor(t)] = (sum(known) / len(known) * (u - t), turn)
+            mean = _mean_between(rates, t, u)
+            if math.isfinite(mean):
+                found[math.floor(t)] = (mean * (u - t), turn)
         return _compare(found.values(), 0.1)
 
     def count_opposed(self, turn: Mapping[int, float]) -> tuple[int, int]:
@@ -124,10 +131,9 @@ class SensorMotion:
             if anchor is None or each[0] - before > 5.0:
                 anchor, distance, before = each, 0.0, each[0]
                 continue
-            seconds = range(math.floor(before), math.floor(each[0]) + 1)
-            known = [speed[second] for second in seconds if second in speed]
-            if known:
-                distance += sum(known) / len(known) * (each[0] - before)
+            mean = _mean_between(speed, before, each[0])
+            if math.isfinite(mean):
+                distance += mean * (each[0] - before)
             before = each[0]
             if distance >= DISTANCE_STEP_M:
                 rolled += distance
@@ -182,44 +188,102 @@ def _compare(turns: Collection[tuple[float, float]], least: float) -> TurnRateCo
 
 
 class SecondMeans:
-    """Means of the values of each second since 1970."""
+    """Weighted means of the values of each second since 1970."""
 
     def __init__(self) -> None:
-        self._sums: defaultdict[int, tuple[float, int]] = defaultdict(lambda: (0.0, 0))
+        self._sums: defaultdict[int, tuple[float, float]] = defaultdict(lambda: (0.0, 0.0))
 
-    def add(self, second: int, value: float) -> None:
+    def add(self, second: int, value: float, weight: float = 1.0) -> None:
         """Add a value."""
-        total, count = self._sums[second]
-        self._sums[second] = (total + value, count + 1)
+        total, weights = self._sums[second]
+        self._sums[second] = (total + value * weight, weights + weight)
 
     def finish(self) -> dict[int, float]:
         """Return the means."""
-        return {second: total / count for second, (total, count) in sorted(self._sums.items())}
+        return {second: total / weights for second, (total, weights) in sorted(self._sums.items())}
+
+
+class WheelMotion(NamedTuple):
+    """Mean speed of a wheel from `begin` to `end`, utimes, m/s; equal for a speed that the wheel itself measured."""
+
+    begin: int
+    end: int
+    name: str
+    speed: float
+    steering: float
+
+
+def compute_wheel_motion(samples: Iterable[WheelsSample]) -> list[WheelMotion]:
+    """Return the speeds of wheels by their travel, without travel the measured ones. Any order of samples will do.
+
+    A driver that was started again, whose `seq` is smaller than before, counts its travel from another beginning.
+    """
+    found: list[WheelMotion] = []
+    anchors: dict[tuple[str, str], tuple[int, float]] = {}
+    last_seq: dict[str, int] = {}
+    for sample in sorted(samples, key=lambda each: each.header.utime):
+        utime, source = sample.header.utime, sample.header.source
+        if sample.header.seq < last_seq.get(source, 0):
+            anchors = {key: anchor for key, anchor in anchors.items() if key[0] != source}
+        last_seq[source] = sample.header.seq
+        for wheel in sample.wheels:
+            if not math.isfinite(wheel.steering):
+                continue
+            if not math.isfinite(wheel.travel):
+                if math.isfinite(wheel.speed):
+                    found.append(WheelMotion(utime, utime, wheel.name, wheel.speed, wheel.steering))
+                continue
+            key = (source, wheel.name)
+            begin, travel = anchors.get(key, (0, 0.0))
+            if utime - begin >= MIN_TRAVEL_US:
+                anchors[key] = (utime, wheel.travel)
+                speed = (wheel.travel - travel) / (utime - begin) * 1e6
+                if utime - begin <= MAX_TRAVEL_US:
+                    found.append(WheelMotion(begin, utime, wheel.name, speed, wheel.steering))
+    return found
 
 
 def compute_sensor_motion(
     gyro: Mapping[int, float],
     fixes: Iterable[GpsSample],
-    turns: Iterable[tuple[int, str, float, float]],
+    rolling: Iterable[WheelMotion],
     sides: Mapping[str, float],
 ) -> SensorMotion:
-    """Return the motion by each sensor.
-
-    `turns` are utime, wheel, speed and steering, of which steered ones are left out; `sides` the lateral offsets.
-    """
+    """Return the motion by each sensor. `sides` are the lateral offsets of the wheels; steered speeds are left out."""
     wheels: defaultdict[str, SecondMeans] = defaultdict(SecondMeans)
-    for utime, name, speed, steering in turns:
+    for begin, end, name, speed, steering in rolling:
         if name in sides and abs(steering) < 0.02:
-            wheels[name].add(utime // 1_000_000, speed)
+            for second in range(begin // 1_000_000, end // 1_000_000 + 1):
+                overlap = min(end, (second + 1) * 1_000_000) - max(begin, second * 1_000_000)
+                if begin == end or overlap > 0:
+                    wheels[name].add(second, speed, max(overlap, 1))
     speeds = {name: means.finish() for name, means in wheels.items()}
-    places = [
-        (each.header.utime * 1e-6, math.radians(each.latitude_deg), math.radians(each.longitude_deg))
-        for each in fixes
-        if each.fix_type is not FixType.NONE and math.isfinite(each.latitude_deg + each.longitude_deg)
+    places = [(each.header.utime * 1e-6, each) for each in fixes if each.fix_type is not FixType.NONE]
+    return SensorMotion(gyro, speeds, dict(sides), tuple(_project_fixes(places)))
+
+
+def _project_fixes(fixes: Iterable[tuple[float, GpsSample]]) -> Iterator[tuple[float, float, float]]:
+    """Yield times, east and north of fixes, by time; those without a place are left out."""
+    plane, height = None, 0.0
+    for t, fix in sorted(fixes, key=lambda each: each[0]):
+        with suppress(GeodesyError):
+            if plane is None:
+                height = fix.height_ellipsoidal if math.isfinite(fix.height_ellipsoidal) else 0.0
+                plane = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, height)
+            # of one height: its noise is none of the way
+            ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
+            yield (t, *plane.from_ecef(ecef)[:2])
+
+
+def _mean_between(series: Mapping[int, float], begin: float, end: float) -> float:
+    """Return the mean of a series of seconds over a time, s since 1970, as far as it is known; nan where it is not."""
+    known = [
+        (series[second], min(end, second + 1.0) - max(begin, second))
+        for second in range(math.floor(begin), math.ceil(end))
+        if second in series
     ]
-    _, north, east = places[0] if places else (0.0, 0.0, 0.0)
-    flat = tuple((t, EARTH_RADIUS * math.cos(north) * (b - east), EARTH_RADIUS * (a - north)) for t, a, b in places)
-    return SensorMotion(gyro, speeds, dict(sides), flat)
+    total = sum(weight for _, weight in known)
+    return sum(value * weight for value, weight in known) / total if total > 0.0 else math.nan
 
 
 def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float) -> list[tuple[float, float, float]]:
