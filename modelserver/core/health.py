@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 
 from modelserver import messages
 from modelserver.core.host_clock import Instant
+from modelserver.core.source_clocks import format_offset, is_clock_off
 from modelserver.core.state import (
     CHANGE_PERIOD_NS,
     CoreState,
@@ -97,7 +98,10 @@ def _find_unusable(state: CoreState, now: Instant) -> Iterator[tuple[str, str, s
                 fix = f"; {finding.fix}" if finding.fix else ""
                 yield f"sensors.{finding.sensor} ({finding.reason})", finding.reason, f"{finding.text}{fix}"
     for name, traffic in state.traffic.items():
-        if traffic.dropped >= MIN_DROPPED and not _is_silent(name, traffic, now):
+        if traffic.num_off and is_clock_off(state.traffic, name, now) and not _is_silent(name, traffic, now):
+            offset = format_offset(traffic.offset, now.utime * 1e-6)
+            yield name, "clock", f"its clock is off: its stamps are {offset} their receipt; its samples are not used"
+        elif traffic.dropped >= MIN_DROPPED and not _is_silent(name, traffic, now):
             counts = f"{traffic.count} received, {traffic.used} of {traffic.measured} measurements used"
             yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
 

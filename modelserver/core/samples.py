@@ -9,6 +9,7 @@ from typing import Final
 from modelserver import messages
 from modelserver.core.host_clock import Instant
 from modelserver.core.requests import answer_waiting
+from modelserver.core.source_clocks import LATE_LIMIT_S, SAMPLE_FUTURE_LIMIT_S, is_clock_off, note_offset
 from modelserver.core.state import (
     DEGRADED,
     RUNNING,
@@ -32,9 +33,8 @@ from modelserver.query import PlatformView
 COMMAND_FUTURE_LIMIT_S: Final = 1.0
 """A command stamped this far ahead of the host's clock is rejected: one of the two clocks is wrong."""
 
-SAMPLE_FUTURE_LIMIT_S: Final = 0.25
-"""The same for a sample: synchronized clocks differ by less, and a fix that is fused a quarter of a second late is off
-by what the vehicle travels in that time."""
+EARLIEST_US, LATEST_US = -round(LATE_LIMIT_S * 1e6), round(SAMPLE_FUTURE_LIMIT_S * 1e6)
+"""Bounds of a stamp less its receipt, microseconds."""
 
 WARM_START: Final = "warm_start"
 """Kind of the decisions on the persisted state of an earlier run."""
@@ -47,9 +47,14 @@ def process_sample(state: CoreState, sample: messages.Sample, now: Instant) -> S
     state = check_host_clock(state, now, count_message(state.traffic, source, header.host_utime, now))
     if state.missing_sensors:
         state = mark_received(state, sample)
-    if header.utime > now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
+    offset, known = header.utime - now.utime, state.traffic.get(source)
+    if (known is not None and known.num_off) or not EARLIEST_US <= offset <= LATEST_US:
+        state = state._replace(traffic=note_offset(state.traffic, source, header.utime, now))
         # rejected for its own source alone: any publisher can stamp as it likes
-        return count_rejection(state, source, "future"), ()
+        if offset > LATEST_US:
+            return count_rejection(state, source, "future"), ()
+        if is_clock_off(state.traffic, source, now):
+            return count_rejection(state, source, "too_old"), ()
     if isinstance(sample, messages.JointsSample):
         return process_joints(state, sample, now)
     if state.localizer is None:
@@ -128,7 +133,7 @@ def update_localizer(
     if has_estimate and not history.is_too_soon(utime):
         history = history.append(localizer.defer_estimate(utime))
     model, base_frame, _, _, rolling, invalid, joints, dynamics = state.view
-    if invalid and has_estimate and not is_rejected and utime <= now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
+    if invalid and has_estimate and not is_rejected and utime <= now.utime + LATEST_US:
         # the estimate is of the host's new time of day
         invalid = messages.VALID
     view = new_tuple(PlatformView, (model, base_frame, localizer, history, rolling, invalid, joints, dynamics))

@@ -114,6 +114,7 @@ class SourceTraffic(NamedTuple):
     reported, rate, reported_delay: count, rate (Hz) and greatest delay (s) of the last full health report.
     measured, used: measurements with a decision of localization, and those that it used.
     dropped, reason: measurements dropped in a row since the last used one, and the last reason.
+    offset, num_off: stamp less receipt of the last sample, s, and how many in a row had it; 0 if it was on time.
     """
 
     count: int = 0  # type: ignore[assignment]  # hides tuple.count
@@ -127,6 +128,8 @@ class SourceTraffic(NamedTuple):
     used: int = 0
     dropped: int = 0
     reason: str = ""
+    offset: float = 0.0
+    num_off: int = 0
 
 
 class HealthConditions(NamedTuple):
@@ -310,6 +313,7 @@ def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:
         known.used + (decision.verdict in (messages.Verdict.USED, messages.Verdict.RESET)),
         known.dropped + 1 if is_rejected else 0,
         decision.reason if is_rejected else "",
+        *known[11:],
     )
     return CoreState(state.view, state.host_clock, {**state.traffic, source: updated}, *state[3:])
 

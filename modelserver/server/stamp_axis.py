@@ -8,29 +8,26 @@ alone, it is that one's clock.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, islice
-from typing import Final
+from typing import Final, get_args
 
-from modelserver.server.ingress import SensorChannel, peek_sample_id
-from modelserver.wire.codec import fingerprint_of
+from modelserver import messages
+from modelserver.core.source_clocks import SPREAD_S, format_offset
+from modelserver.server.ingress import peek_sample_id
+from modelserver.wire.codec import fingerprint_of, get_type_name
 from modelserver.wire.eventlog import LogEvent
 
 LARGEST_DELAY_S: Final = 5.0
 """Largest difference of stamp and receipt that buses and latencies explain, seconds."""
 
-SPREAD_S: Final = 2.0
-"""Within which the sources of one clock agree, seconds."""
-
 LOOKED_AT: Final = 4000
 """Events that are looked at: some ten seconds of a vehicle's sensors."""
 
-SINCE_START_S: Final = 1e9
-"""Seconds since 1970 that no clock has that was ever set: 2001."""
 
-LEAP_S: Final = 18.0
-"""GPS time less UTC since 2017."""
+SAMPLES: Final = frozenset(fingerprint_of(get_type_name(each)) for each in get_args(messages.Sample))
+"""The first bytes of messages with samples."""
 
 
 @dataclass(slots=True)
@@ -55,7 +52,7 @@ class StampAxis:
     def describe(self) -> list[str]:
         """Describe what is off, a sentence for each; empty if nothing is."""
         if self.common:
-            return [f"all stamps are {self.format(self.common)} their receipt: evaluated on the axis of the stamps"]
+            return [f"all stamps are {self.format(self.common)} their receipt: the axis of the stamps is used"]
         return [
             f"the stamps on {channel} are {self.format(offset)} their receipt: the clock of that source is off"
             for channel, offset in self.by_channel.items()
@@ -64,36 +61,22 @@ class StampAxis:
 
     def format(self, offset: float) -> str:
         """Format an offset with what it is known as, e.g. `3,600.0 s (1 h: a time zone?) behind`."""
-        size, stamp_s = abs(offset), self.received_s + offset
-        hours = round(size / 3600.0)
-        known = ""
-        if abs(size - LEAP_S) < 0.5:
-            known = " (GPS time instead of UTC?)"
-        elif 1 <= hours <= 14 and abs(size - 3600.0 * hours) < SPREAD_S:
-            known = f" ({hours} h: a time zone?)"
-        elif abs(1000.0 * stamp_s / max(self.received_s, 1.0) - 1.0) < 0.01:
-            known = " (milliseconds instead of microseconds?)"
-        elif abs(stamp_s / max(1000.0 * self.received_s, 1.0) - 1.0) < 0.01:
-            known = " (nanoseconds instead of microseconds?)"
-        elif stamp_s < SINCE_START_S < self.received_s:
-            known = " (from 0 on, as of a simulation, or of a unit since its start?)"
-        return f"{size:,.1f} s{known} {'ahead of' if offset > 0.0 else 'behind'}"
+        return format_offset(offset, self.received_s)
 
 
-def measure(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel]) -> StampAxis:
-    """Return the median offset of the stamps of each channel of sensors."""
+def measure(events: Iterable[LogEvent], channels: Container[str] | None = None) -> StampAxis:
+    """Return the median offset of the stamps of each channel with samples; of some channels, or of all."""
     offsets: dict[str, list[float]] = {}
     received_s = 0.0
     for event in events:
         received_s = event.utime * 1e-6
-        channel = channels.get(event.channel)
-        found = None if channel is None else peek_sample_id(event.data, fingerprint_of(channel.type_name))
-        if found is not None:
+        is_wanted = (channels is None or event.channel in channels) and event.data[:8] in SAMPLES
+        if is_wanted and (found := peek_sample_id(event.data, event.data[:8])) is not None:
             offsets.setdefault(event.channel, []).append((found.utime - event.utime) * 1e-6)
     return StampAxis({name: statistics.median(values) for name, values in offsets.items()}, received_s)
 
 
-def align(events: Iterable[LogEvent], channels: Mapping[str, SensorChannel], axis: StampAxis) -> Iterator[LogEvent]:
+def align(events: Iterable[LogEvent], channels: Container[str], axis: StampAxis) -> Iterator[LogEvent]:
     """Yield events with their receipt on the axis of the stamps; what is found is written to `axis`."""
     waiting = iter(events)
     first = list(islice(waiting, LOOKED_AT))

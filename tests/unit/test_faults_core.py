@@ -8,10 +8,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support_drive import MAX_MISLEADING_S, CoreRun, SimulatedDrive, run_core
+from support_drive import MAX_MISLEADING_S, CoreRun, SimulatedDrive, raptor, run_core
 from support_faults import FAULTS, FROM_S, INERTIAL
 
-from modelserver.messages import GpsSample
+from modelserver import core
+from modelserver.core import Instant
+from modelserver.messages import VALID, GpsSample, ImuSample, PublishHealth, Tick, WheelsSample
 from modelserver.simulation import Event, GpsModel
 
 pytestmark = pytest.mark.slow
@@ -114,3 +116,56 @@ def test_given_the_computers_clock_set_by_an_hour_then_the_pose_is_not_valid_unt
     assert found.longest_misleading <= MAX_MISLEADING_S
     assert found.between(SECONDS - 1.0)[-1].is_valid
     assert all(each.position_error < 2.0 for each in found.between(FROM_S) if each.is_valid)
+
+
+OFFSETS = {
+    "since its start": (60_000_000 - START, "from 0 on, as of a simulation, or of a unit since its start?"),
+    "an hour behind": (-3_600_000_000, "s (1 h: a time zone?) behind their receipt"),
+    "GPS time": (18_000_000, "s (GPS time instead of UTC?) ahead of their receipt"),
+}
+
+
+@pytest.mark.parametrize("kind", [GpsSample, ImuSample, WheelsSample])
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_given_a_source_whose_clock_is_off_then_that_one_is_named_and_no_other(offset: str, kind: type[Event]) -> None:
+    microseconds, known = OFFSETS[offset]
+
+    def shift(event: Event) -> Event:
+        utime = event.header.utime + microseconds
+        return replace(event, header=replace(event.header, utime=utime)) if isinstance(event, kind) else event
+
+    drive, events = make_drive()
+    found = run_core(drive, list(map(shift, events))[: len(events) // 2])
+    now = Instant(1_000_000_000 + found.poses[-1][1].utime * 1000 - START * 1000, found.poses[-1][1].utime)
+    health = next(
+        output.health
+        for output in core.step(found.state._replace(health_due_ns=0), Tick(0.0, 0, 0), now)[1]
+        if isinstance(output, PublishHealth)
+    )
+    warnings = dict(health.warnings)
+    source = {GpsSample: "sensor:gps", ImuSample: "sensor:imu", WheelsSample: "sensor:wheels"}[kind]
+    assert known in warnings[source]
+    assert "its clock is off" in warnings[source]
+    # the samples of the others are used, and none of them is blamed
+    assert not {each for each in warnings if each.startswith("sensor:")} - {source}
+    others = {name: each for name, each in found.state.traffic.items() if name != source}
+    for name, each in others.items():
+        rejected = sum(found.state.rejected.get((name, reason), 0) for reason in ("too_old", "future"))
+        assert rejected < 0.1 * each.count
+    assert found.longest_misleading == 0.0
+
+
+@pytest.mark.parametrize("hours", [-1.0, -1000.0])
+def test_given_a_log_that_is_played_back_then_no_clock_is_off(hours: float) -> None:
+    def shift(event: Event) -> Event:
+        return replace(event, header=replace(event.header, utime=event.header.utime + round(hours * 3600e6)))
+
+    _, events = make_drive()
+    state = raptor().start_core(Instant(1_000_000_000, START))
+    for event in map(shift, events[: len(events) // 2]):
+        state, _ = core.step(
+            state, event, Instant(event.header.host_utime * 1000 - START * 1000 + 10**9, event.header.host_utime)
+        )
+    assert not {reason for _, reason in state.rejected} & {"too_old", "future"}
+    assert state.localizer is not None
+    assert state.localizer.estimate(state.localizer.utime).invalid == VALID

@@ -241,7 +241,7 @@ def test_given_stamps_on_another_axis_then_the_log_is_evaluated_on_it_and_the_am
     assert [row.easting - 1000.0 for row in rows] == [2, 4]
     (sentence,) = run.axis.describe()
     assert known in sentence
-    assert "evaluated on the axis of the stamps" in sentence
+    assert "the axis of the stamps is used" in sentence
 
 
 def test_given_one_source_with_another_clock_then_that_one_is_named_and_nothing_is_moved() -> None:

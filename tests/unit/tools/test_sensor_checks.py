@@ -23,6 +23,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
+from modelserver.server.stamp_axis import StampAxis
 from mstools.report.findings import collect_findings
 from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
 from mstools.report.sensor_motion import (
@@ -265,3 +266,26 @@ def test_given_a_drive_then_its_distance_is_known_without_any_state() -> None:
     assert SensorMotion().distance_travelled() != SensorMotion().distance_travelled()  # not known
     distances = make_motion().compare_distances()
     assert distances.fixes == pytest.approx(distances.wheels, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("offsets", "level", "title"),
+    [
+        (
+            {"GPS": -3600.0, "IMU": -3600.0},
+            FindingLevel.NOTE,
+            "All stamps are 3,600.0 s (1 h: a time zone?) behind their receipt",
+        ),
+        (
+            {"GPS": -18.0, "IMU": 0.0},
+            FindingLevel.ERROR,
+            "The stamps on GPS are 18.0 s (GPS time instead of UTC?) behind",
+        ),
+    ],
+)
+def test_given_stamps_on_another_axis_then_the_amount_is_reported(
+    offsets: dict[str, float], level: FindingLevel, title: str
+) -> None:
+    found = only(make_data(axis=StampAxis(offsets, float(START))))
+    assert found.level is level
+    assert found.title.startswith(title)

@@ -254,7 +254,7 @@ def replay_offline(
             from mstools.report import replay_report
             from mstools.report.findings import collect_findings
 
-            replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, seen)
+            replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, seen, run.axis)
             with _open_output(report) as out:
                 out.write(replay_report.render_page(replayed))
             if not as_json:

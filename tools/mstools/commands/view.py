@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8080
 RELOAD_TIMEOUT_S = 10.0
-SHOWN_DAMAGE = 5
+SHOWN_NOTES = 5
 
 
 def command(
@@ -100,7 +100,7 @@ def command(
             viewer = Viewer(page, source, editing)
             typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
             sys.stdout.flush()
-            for each in source.damage[:SHOWN_DAMAGE]:
+            for each in source.notes[:SHOWN_NOTES]:
                 typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
             if not no_browser and bind == LOOPBACK and has_screen():
                 webbrowser.open(page.link)

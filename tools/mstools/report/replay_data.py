@@ -30,6 +30,7 @@ from modelserver.messages import (
     SensorHeader,
     WheelsSample,
 )
+from modelserver.server.stamp_axis import StampAxis
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -150,6 +151,7 @@ class ReplayData:
     sensor_keys : sensor of each source
     wheel_names : names of the wheels in the log
     sensor_motion : motion by each sensor alone
+    axis : the stamps beside the log's times
     """
 
     vehicle: str
@@ -172,6 +174,7 @@ class ReplayData:
     sensor_keys: Mapping[str, str] = field(default_factory=dict)
     wheel_names: tuple[str, ...] = ()
     sensor_motion: SensorMotion = field(default_factory=SensorMotion)
+    axis: StampAxis = field(default_factory=StampAxis)
 
     def count_samples(self, source: str) -> int:
         """Return the number of samples from a source."""
@@ -263,6 +266,7 @@ class ReplayCollector:
         last_utime: int,
         rejected: Mapping[tuple[str, str], int],
         channels: Collection[str] = (),
+        axis: StampAxis | None = None,
     ) -> ReplayData:
         """Return the data. `channels`: those of the log."""
 
@@ -291,6 +295,7 @@ class ReplayCollector:
             mode=config.localization.initial_mode,
             missing_channels=self._find_missing_channels(channels),
             channels=tuple(sorted(channels)),
+            axis=axis or StampAxis(),
             sensor_keys=dict(self._keys),
             wheel_names=tuple(self._wheel_names),
             sensor_motion=compute_sensor_motion(

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 from modelserver.messages import Mode, Verdict
-from mstools.report.replay_data import ReplayData, ReportFinding, error
+from mstools.report.replay_data import ReplayData, ReportFinding, error, note
 from mstools.report.sensor_motion import compare_turn_rates
 from mstools.terminal.output import format_count
 
@@ -48,6 +48,18 @@ def check_missing(data: ReplayData) -> Iterable[ReportFinding]:
             f"The log has {', '.join(data.channels)}." if data.channels else "The log is empty.",
             remedy,
         )
+
+
+def check_clocks(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find stamps that are on another axis than the log's times: of one source, or of all."""
+    level, advice = (
+        (note, "As it should be for a simulation; else the clock of the recorder was off.")
+        if data.axis.common
+        else (error, "Correct the clock of its driver: utime is microseconds since 1970, UTC.")
+    )
+    for sentence in data.axis.describe():
+        title, _, observation = sentence.rpartition(": ")
+        yield level(f"{title[:1].upper()}{title[1:]}", f"{observation[:1].upper()}{observation[1:]}.", advice)
 
 
 RANGE_ADVICE = {
@@ -214,6 +226,7 @@ def check_gravity(data: ReplayData) -> Iterable[ReportFinding]:
 
 SENSOR_CHECKS: tuple[Callable[[ReplayData], Iterable[ReportFinding]], ...] = (
     check_missing,
+    check_clocks,
     check_unused,
     check_gravity,
     check_gyro_unit,

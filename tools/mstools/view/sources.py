@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +19,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
+from modelserver.server.stamp_axis import LOOKED_AT, measure
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
@@ -37,7 +39,7 @@ PROGRESS_EVENTS: Final = 20_000
 class Source:
     """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
 
-    `folder` is that of the geometry file, in which its meshes are; `damage` describes what a log lost. `set_joints`
+    `folder` is that of the geometry file, in which its meshes are; `notes` are what is odd about a log. `set_joints`
     moves the joints of a geometry file, `set_model` shows it as edited.
     """
 
@@ -48,7 +50,7 @@ class Source:
     is_live: bool = False
     set_joints: Callable[[Mapping[str, float]], None] | None = None
     set_model: Callable[[Model], None] | None = None
-    damage: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     lock: threading.Lock = field(default_factory=threading.Lock)
     _resources: ExitStack = field(default_factory=ExitStack)
 
@@ -147,12 +149,14 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
         drive = Drive(prefix, loaded, base, keep_geometry=True)
     with LogFile(path) as log:
         contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
-        damage = tuple(map(str, log.damage))
+        notes = [*map(str, log.damage)]
+        # reads the log from its beginning, and forgets the damage
+        notes += measure(islice(log, LOOKED_AT)).describe()
     answers = LogPlatform(path, prefix, given, contents)
     if not drive.base_frame:
         drive.base_frame = answers.base_frame
     folder = model.resolve().parent if model is not None else None
-    return Source(path.name, drive, answers, folder, damage=damage)
+    return Source(path.name, drive, answers, folder, notes=tuple(notes))
 
 
 def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], None]) -> Iterator[LogEvent]:
