@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.fix_alternation import FixAlternation
+from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.estimation.raw.heading import Heading
 from modelserver.estimation.raw.localizer import RawLocalizer
@@ -21,6 +23,7 @@ from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     Decision,
     Estimate,
+    GpsSample,
     Invalid,
     LocalizerSummary,
     Mode,
@@ -30,6 +33,7 @@ from modelserver.messages import (
     Rejected,
     RestoredState,
     Sample,
+    SensorFinding,
     SwitchMode,
     Verdict,
 )
@@ -54,7 +58,8 @@ class ModeLocalizer(NamedTuple):
     """The localizer for all modes, immutable. Create the first with `start`.
 
     `active` is the filter or raw mode. `X_odom` is the pose of its Odom in the published Odom, `epochs` the number of
-    epochs of the localizers before it, and `drift` the 36 numbers of Odom's covariance reached with them.
+    epochs of the localizers before it, and `drift` the 36 numbers of Odom's covariance reached with them. `alternation`
+    finds two receivers on one channel, from which no pose is valid.
     """
 
     config: LocalizerConfig
@@ -62,6 +67,7 @@ class ModeLocalizer(NamedTuple):
     X_odom: Pose
     epochs: int = 0
     drift: tuple[float, ...] = ()
+    alternation: FixAlternation = FixAlternation()
 
     @classmethod
     def start(
@@ -84,21 +90,32 @@ class ModeLocalizer(NamedTuple):
 
     def process(self, sample: Sample | SwitchMode) -> tuple[ModeLocalizer, tuple[LocalizerEvent, ...]]:
         """Return the state after a sample, and the events."""
-        config, before, X_odom, epochs, drift = self
+        config, before, X_odom, epochs, drift, alternation = self
         if isinstance(sample, SwitchMode) and (isinstance(before, RawLocalizer) or sample.mode is Mode.RAW):
             return self._switch_mode(sample)
         active, notes = before.process(sample)
-        if active is before:
+        if isinstance(sample, GpsSample):
+            settings = config.raw if isinstance(before, RawLocalizer) else config.setup.settings
+            fix = evaluate_fix(sample, settings, True)
+            alternation = alternation if isinstance(fix, str) else alternation.add(sample, fix)
+        elif active is before:
             return self, notes
-        return new_tuple(ModeLocalizer, (config, active, X_odom, epochs, drift)), notes
+        return new_tuple(ModeLocalizer, (config, active, X_odom, epochs, drift, alternation)), notes
 
     def estimate(self, utime: int) -> Estimate:
         """Return the pose at `utime`, in the Odom published since the start."""
-        return self._continue_odom(self.active.estimate(utime))
+        found = self._continue_odom(self.active.estimate(utime))
+        return replace(found, invalid=found.invalid | Invalid.GNSS_INCONSISTENT) if self.has_two_receivers else found
+
+    @property
+    def has_two_receivers(self) -> bool:
+        """Whether fixes alternate between two places, and are used."""
+        is_used = isinstance(self.active, RawLocalizer) or self.active.mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
+        return bool(self.alternation.distance) and is_used
 
     def defer_estimate(self, utime: int) -> Estimate | Deferred:
         """Return `estimate(utime)`, deferred until it is read where that saves work."""
-        if isinstance(self.active, FilterLocalizer) and not self.epochs:
+        if isinstance(self.active, FilterLocalizer) and not self.epochs and not self.alternation.distance:
             return self.active.defer_estimate(utime)
         return self.estimate(utime)
 
@@ -119,6 +136,14 @@ class ModeLocalizer(NamedTuple):
         found = self.active.summary(utime)
         if isinstance(self.active, RawLocalizer):
             found = found._replace(findings=self.config.setup.findings[Mode.RAW])
+        if self.has_two_receivers:
+            apart = (
+                f"two receivers on one channel: fixes alternate between places {self.alternation.distance:.1f} m apart"
+            )
+            fix = "give each receiver a channel of its own, and name one under sensors.gps"
+            found = found._replace(
+                findings=(*found.findings, SensorFinding("gps", "receivers", "sensors.gps", apart, fix))
+            )
         return found
 
     def _continue_odom(self, estimate: Estimate) -> Estimate:

@@ -8,12 +8,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support_drive import MAX_MISLEADING_S, CoreRun, SimulatedDrive, raptor, run_core
+from support_drive import MAX_MISLEADING_S, CoreRun, Progress, SimulatedDrive, raptor, run_core
 from support_faults import FAULTS, FROM_S, INERTIAL
 
 from modelserver import core
 from modelserver.core import Instant
 from modelserver.messages import VALID, GpsSample, ImuSample, PublishHealth, Tick, WheelsSample
+from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import Event, GpsModel
 
 pytestmark = pytest.mark.slow
@@ -169,3 +170,29 @@ def test_given_a_log_that_is_played_back_then_no_clock_is_off(hours: float) -> N
     assert not {reason for _, reason in state.rejected} & {"too_old", "future"}
     assert state.localizer is not None
     assert state.localizer.estimate(state.localizer.utime).invalid == VALID
+
+
+@pytest.mark.parametrize("mode", ["full", "no_imu", "raw"])
+def test_given_two_receivers_on_one_channel_then_no_pose_is_valid_and_they_are_named(mode: str) -> None:
+    count = 0
+
+    def alternate(event: Event) -> Event:
+        nonlocal count
+        count += isinstance(event, GpsSample)
+        if not isinstance(event, GpsSample) or count % 2:
+            return event
+        return replace(event, latitude_deg=event.latitude_deg + 30.0 / 111_000.0)
+
+    drive, events = make_drive()
+    config = raptor().config
+    vehicle = load_vehicle(replace(config, localization=replace(config.localization, mode=mode)))
+    progress = Progress(drive, (np.inf, 0.0), vehicle.start_core(Instant(1_000_000_000, START)), START)
+    for event in map(alternate, events):
+        progress.update(event)
+    found = CoreRun(drive, progress.state, progress.poses)
+    assert not any(each.is_valid for each in found.between(9.0))
+    assert "GNSS_INCONSISTENT" in found.reasons(9.0)
+    assert found.longest_misleading <= MAX_MISLEADING_S
+    assert progress.state.localizer is not None
+    texts = [each.text for each in progress.state.localizer.summary(progress.due).findings]
+    assert any("two receivers on one channel: fixes alternate between places 30.0 m apart" in text for text in texts)
