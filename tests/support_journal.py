@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from support_samples import FORWARD, GEOMETRY, VEHICLE, drive, write_vehicle
+from support_samples import FORWARD, GEOMETRY, VEHICLE, drive, wait_for_reload, write_vehicle
 from support_signing import ALLOWED, KEY, envelope, write_test_key
 
 from modelserver.config.vehicle_file import LimitsConfig, load_config
@@ -18,6 +18,7 @@ from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.segments import Ring, list_segments
 from modelserver.server.journal.writer import JournalContext, JournalWriter
 from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.reloading import GeometryReader, read_geometry
 from modelserver.server.vehicle import load_vehicle
 from modelserver.signing.signatures import Key
 from modelserver.wire.codec import encode
@@ -64,6 +65,7 @@ class JournalRig:
         known = {**environment.collect_facts(), "run": run, **(facts or {})}
         context = JournalContext(known, [(str(path), path.read_bytes())], self.vehicle.config)
         self.writer = JournalWriter(self.queue, self.ring, context, self.clock, pause=lambda: None, key=key)
+        reader = GeometryReader(self.vehicle, str(path), read_geometry)
         self.loop = Loop(
             self.bus,
             self.clock,
@@ -75,8 +77,8 @@ class JournalRig:
                 publisher_conflict=publisher_conflict,
             ),
             Hooks(
-                on_load=lambda load, state: self.vehicle.reload_model(load, state, str(path)),
-                snapshot=self.vehicle.encode_snapshot,
+                on_load=wait_for_reload(reader.begin),
+                snapshot=reader.encode_snapshot,
                 channels=lambda state: self.vehicle.sensor_channels(state.model),
                 verifier=self.vehicle.make_command_verifier(self.clock.monotonic_ns(), str(path)),
                 journal=self.queue,

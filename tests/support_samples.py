@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -24,6 +25,7 @@ from modelserver.messages import (
     GpsSample,
     ImuSample,
     Invalid,
+    LoadModel,
     LocalizerSummary,
     Mode,
     NavigationState,
@@ -38,6 +40,7 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
+from modelserver.server.reloading import PollReload
 from modelserver.transforms import Pose
 
 START = 1_700_000_000_000_000
@@ -269,3 +272,18 @@ def instant_at(utime: int) -> Instant:
 def start_core(localizer: ScriptedLocalizer | None = ScriptedLocalizer(), **settings: object) -> CoreState:
     """Return the initial core state of the cart at START."""
     return start(CoreSettings("Cart:Base", vehicle="cart", **settings), cart(), localizer, instant_at(START))  # type: ignore[arg-type]
+
+
+def wait_for_reload(
+    begin: Callable[[LoadModel, CoreState], PollReload],
+) -> Callable[[LoadModel, CoreState], PollReload]:
+    """Return the function with its thread joined, so that the first poll has the result."""
+
+    def begin_and_wait(command: LoadModel, state: CoreState) -> PollReload:
+        poll = begin(command, state)
+        for thread in threading.enumerate():
+            if thread.name == "reload":
+                thread.join(20.0)
+        return poll
+
+    return begin_and_wait

@@ -62,6 +62,9 @@ MAX_DISCARDED: Final = 1024
 IDLE_S: Final = 0.01
 """After this time without a request, queued replies (to programs of the same name) are discarded first."""
 
+RELOAD_TIMEOUT_S: Final = 60.0
+"""Timeout of a reload, seconds: 20 times that of 10,000 frames."""
+
 MAX_WAIT_S: Final = 60.0
 _MAX_WAIT_MS: Final = 60_000
 """LCM's timeout is an int of milliseconds: a longer wait is split."""
@@ -214,9 +217,11 @@ class Platform(PlatformClient):
 
         With `dry_run` nothing is changed. Raises NoServerError; ForbiddenError if the vehicle file or the signature
         does not permit it; KeyFileError; RejectedError if the file is wrong or does not fit the vehicle: the geometry
-        in force stays.
+        in force stays. A large file takes seconds, for up to RELOAD_TIMEOUT_S; the server answers from the old one.
         """
-        return self._query(ReloadModel(self._header(), dry_run), ReloadReply)
+        # without a server this ends at once
+        self.get_body_list()
+        return self._query(ReloadModel(self._header(), dry_run), ReloadReply, timeout=RELOAD_TIMEOUT_S)
 
     def set_state_vector(self, pose: Transformation) -> Acknowledgement:
         """Set the pose of the vehicle, the base frame in World:UTM, through a 7-vector.
@@ -236,23 +241,32 @@ class Platform(PlatformClient):
     def _header(self) -> RequestHeader:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
-    def _query(self, request: Any, reply_type: type[R], is_complete: Callable[[bytes], bool] | None = None) -> R:
-        """Return the reply to a request, for a batch its last part. Raises NoServerError, QueryError, WireError."""
+    def _query(
+        self,
+        request: Any,
+        reply_type: type[R],
+        is_complete: Callable[[bytes], bool] | None = None,
+        timeout: float = 0.0,
+    ) -> R:
+        """Return the reply to a request, for a batch its last part. Raises NoServerError, QueryError, WireError.
+
+        timeout: of a command, seconds; 0 = that of all tries.
+        """
         time: TimeQuery = getattr(request, "time", TimeQuery())
         try:
             data = encode(request)
         except _ENCODE_ERRORS as error:
             raise _to_malformed_request(error, time.at) from error
         channel = self._channels[type(request)]
-        timeout, tries = self.timeout + time.wait_ms * 1e-3, 1 + self.retries
+        seconds, tries = self.timeout + time.wait_ms * 1e-3, 1 + self.retries
         request_id = data[_REQUEST_ID]
         if isinstance(request, COMMANDS):
-            timeout, tries = timeout * tries, 1
+            seconds, tries = timeout or seconds * tries, 1
             self._signer = self._signer or load_signer(self._key_file, self._prefix, self._name)
             # without a key it is sent unsigned: the server's reply explains how to sign
             if self._signer is not None:
                 channel, data = self._signer.channel, self._signer.seal(CHANNEL_OF[type(request)], data)
-        return _decode_reply(self._exchange(channel, data, timeout, is_complete, tries, request_id), reply_type)
+        return _decode_reply(self._exchange(channel, data, seconds, is_complete, tries, request_id), reply_type)
 
     def _exchange(
         self,

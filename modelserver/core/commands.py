@@ -1,8 +1,8 @@
 """Commands: reload the geometry, set the pose, switch the mode. Executed only if signed. Pure.
 
-A reload has two steps, since the core does no input or output: `_request_reload` outputs `LoadModel`, the server loop
-reads the file, and the result comes back as the event `ModelLoaded` (`apply_model`). A pose that is set becomes an
-absolute-pose sample of the source `OPERATOR`, and passes the gates of localization as any other measurement.
+A reload has two steps, since the core does no input or output: it outputs `LoadModel`, the file is read beside the
+loop, and the result comes back as the event `ModelLoaded` (`apply_model`). A pose that is set becomes an absolute-pose
+sample of the source `OPERATOR`, and passes the gates of localization as any other measurement.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from modelserver.core.state import CoreState, StepResult, count_rejection
 from modelserver.errors import Status
 from modelserver.estimation.interface import Localizer, LocalizerEvent
 from modelserver.geometry import names
-from modelserver.geometry.difference import describe_changes
 from modelserver.geometry.model import Model
 from modelserver.transforms.covariance import find_problem
 
 
 @dataclass(frozen=True, slots=True)
 class ModelLoaded:
-    """Event: the geometry was read. It has a model and the localizer for it, or the reason `why` not.
+    """Event: the geometry was read. It has a model, the localizer for it and its changes, or the reason `why` not.
 
     `request` is the client's request, None for a reload by signal.
     """
@@ -37,6 +36,7 @@ class ModelLoaded:
     model: Model | None = None
     localizer: Localizer | None = None
     why: str = ""
+    changes: tuple[str, ...] = ()
 
 
 COMMANDS: Final = (messages.ReloadModel, messages.SetStateVector, messages.SetHTransform)
@@ -108,7 +108,6 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
         if request is None:
             return state, ()
         return state, reply_error(state, messages.ReloadModel, request.header, Status.REJECTED, loaded.why, now)
-    changes = describe_changes(state.model, model)
     outputs: list[messages.Output] = []
     if request is None or not request.dry_run:
         view = state.view._replace(model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
@@ -119,7 +118,9 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
         state = state._replace(requests_answered=state.requests_answered + 1)
         header = messages.ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
         outputs.append(
-            messages.SendReply(request.header.reply_channel, messages.ReloadReply(header, model.revision, changes))
+            messages.SendReply(
+                request.header.reply_channel, messages.ReloadReply(header, model.revision, loaded.changes)
+            )
         )
     return state, tuple(outputs)
 

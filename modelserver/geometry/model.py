@@ -82,7 +82,8 @@ class Model:
         self._paths: OrderedDict[tuple[str, str], KinematicPath] = OrderedDict()
         self.joints = {each.name: each for each in constraints if each.joint.is_movable}
         self.drives = resolve_mimics(self.joints.values())
-        self._tree = FrameTree(self._bodies, self._topology, lambda name: self.drives[name].leader)
+        drives = self.drives  # not the model: no value has a reference cycle
+        self._tree = FrameTree(self._bodies, self._topology, lambda name: drives[name].leader)
         closures = self._topology.find_loop_closures()
         assembly_of = {body: number for number, bodies in enumerate(self.assemblies) for body in bodies}
         self._assemblies_with_loops = frozenset(assembly_of[closing.bodies[0]] for closing in closures)

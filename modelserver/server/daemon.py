@@ -25,6 +25,7 @@ from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence.stores import SUBJECT as RESTART
 from modelserver.server.persistence.stores import PersistentStores, open_stores
+from modelserver.server.reloading import GeometryReader
 from modelserver.server.supervision.systemd import Notifier, ServiceSupervisor
 from modelserver.server.vehicle import Vehicle
 from modelserver.version import __version__
@@ -106,6 +107,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         publishers=vehicle.list_publishers(),
         shared_channels=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
+    reader = GeometryReader(vehicle, file)
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))
     journal = make_writer(config, file, clock, store.lock, next(iter(vehicle.read_keys(file)), None))
     loop = Loop(
@@ -116,8 +118,8 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         Hooks(
             on_origin=lambda output: origins.save(output.origin) if origins is not None else None,
             on_mode_switch=log_mode_switch,
-            on_load=supervisor.wrap_load(lambda command, state: vehicle.reload_model(command, state, file)),
-            snapshot=vehicle.encode_snapshot,
+            on_load=supervisor.wrap_load(reader.begin),
+            snapshot=reader.encode_snapshot,
             channels=lambda state: vehicle.sensor_channels(state.model),
             on_persist=states.save if states is not None else lambda state: "",
             gauges=read_gauges,
@@ -165,6 +167,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         with supervisor.notify_at_exit():
             loop.run()
     finally:
+        reader.close()
         if states is not None:
             states.close(core.get_state_to_persist(loop.state, clock.now()))
         if journal is not None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import errno
 import logging
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -40,6 +41,7 @@ from modelserver.server.ingress import (
 )
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
+from modelserver.server.reloading import PollReload
 from modelserver.server.requests.handler import RequestHandler
 from modelserver.server.requests.scheduler import RunDelay
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
@@ -67,8 +69,12 @@ FLOOD_PAUSE_S = 0.002
 """How long requests wait for the next pass at most, seconds, in a flood or without time for them."""
 
 
-def _report_no_file(command: messages.LoadModel, state: CoreState) -> ModelLoaded:
-    return ModelLoaded(command.request, why="this server has no geometry file to read")
+MAX_RELOADS = 8
+"""Reloads that wait for the one in progress; further ones are rejected."""
+
+
+def _report_no_file(command: messages.LoadModel, state: CoreState) -> PollReload:
+    return lambda state: ModelLoaded(command.request, why="this server has no geometry file to read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +85,8 @@ class Hooks:
     ----------
     on_origin: persists an origin that was captured.
     on_mode_switch: gets a mode command and the states before and after it.
-    on_load: reads the geometry again.
-    snapshot: encodes the snapshot of the model for the bus.
+    on_load: begins to read the geometry again.
+    snapshot: encodes the snapshot of a model for the bus.
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
     gauges: reads resources of the process for the health report, given the number of waiting requests.
@@ -92,8 +98,8 @@ class Hooks:
 
     on_origin: Callable[[messages.PersistOrigin], None] = lambda origin: None
     on_mode_switch: Callable[[messages.SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
-    on_load: Callable[[messages.LoadModel, CoreState], ModelLoaded] = _report_no_file
-    snapshot: Callable[[CoreState], bytes] = lambda state: b""
+    on_load: Callable[[messages.LoadModel, CoreState], PollReload] = _report_no_file
+    snapshot: Callable[[Model], bytes] = lambda model: b""
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
     gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
@@ -109,7 +115,7 @@ _NO_HOOKS = Hooks()
 class SnapshotEncoder:
     """Encodes the model snapshot once per model."""
 
-    def __init__(self, encode_snapshot: Callable[[CoreState], bytes]):
+    def __init__(self, encode_snapshot: Callable[[Model], bytes]):
         self._encode_snapshot = encode_snapshot
         self._model: Model | None = None
         self._parts: list[messages.SnapshotPart] = []
@@ -117,7 +123,7 @@ class SnapshotEncoder:
     def encode_parts(self, state: CoreState, utime: int) -> list[messages.SnapshotPart]:
         """Return the messages to publish at `utime`."""
         if self._model is not state.model:
-            self._parts = split_snapshot(self._encode_snapshot(state), state.model.revision, utime)
+            self._parts = split_snapshot(self._encode_snapshot(state.model), state.model.revision, utime)
             # last: after an error it is encoded again
             self._model = state.model
         return [replace(part, utime=utime) for part in self._parts]
@@ -160,6 +166,8 @@ class Loop:
         self._logged: set[tuple[str, str]] = set()
         self._timer = TickTimer(clock, settings.period_ns)
         self._reload_requested = self._stop_requested = False
+        self._reloads: deque[messages.LoadModel] = deque()  # the first is in progress
+        self._poll_reload: PollReload | None = None
         self._waiting_poses: list[tuple[str, bytes]] | None = None  # for the deadline of the tick in progress, if any
         self._has_backlog = False  # whether samples remained after the samples of the last pass
         prefix = settings.channel_prefix
@@ -207,6 +215,8 @@ class Loop:
         if self._reload_requested:
             self._reload_requested = False
             self.send((messages.LoadModel(),))
+        elif self._reloads:
+            self._continue_reload()
         now_ns = self._drain_sensors(self._clock.monotonic_ns())
         if now_ns >= timer.begin_ns:
             self._tick()
@@ -426,14 +436,34 @@ class Loop:
                 )
 
     def _load(self, output: messages.LoadModel) -> None:
-        before = self.state.model.revision
-        loaded = self._hooks.on_load(output, self.state)
+        """Reload the geometry after those in progress; old answers serve until then."""
+        if len(self._reloads) > MAX_RELOADS:
+            why = f"{MAX_RELOADS} reloads are waiting already; ask again when they have ended"
+            self.step(ModelLoaded(output.request, why=why), self._clock.now())
+            return
+        self._reloads.append(output)
+        self._continue_reload()
+
+    def _continue_reload(self) -> None:
+        """Begin the first reload, or take its geometry if it has been read."""
+        command, before = self._reloads[0], self.state.model.revision
+        try:
+            if self._poll_reload is None:
+                self._poll_reload = self._hooks.on_load(command, self.state)
+            loaded = self._poll_reload(self.state)
+        except Exception as error:
+            self.handle_error("LoadModel", error)
+            loaded = ModelLoaded(command.request, why=f"internal error while reading it: {error}")
+        if loaded is None:
+            return
+        self._reloads.popleft()
+        self._poll_reload = None
         self.step(loaded, self._clock.now())
         if loaded.model is None:
             log.error(
                 "the geometry could not be reloaded, revision %s stays in use: %s", before, escape_lines(loaded.why)
             )
-        elif output.request is None or not output.request.dry_run:
+        elif command.request is None or not command.request.dry_run:
             self._subscribe(self._hooks.channels(self.state))
             log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from modelserver import core, errors, messages
 from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
-from modelserver.core.commands import ModelLoaded
 from modelserver.core.state import START
 from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.estimation.findings import find_unusable
@@ -142,44 +141,20 @@ class Vehicle:
         mode_channel = config.localization.mode_channel
         return CommandVerifier(keys, config.lcm.channel_prefix, config.commands.window_s, mode_channel, started_ns)
 
-    def encode_snapshot(self, state: CoreState) -> bytes:
-        """Encode a snapshot of the current model."""
-        view = state.view
+    def encode_snapshot(self, model: Model) -> bytes:
+        """Encode a snapshot of a geometry of this vehicle."""
+        config = self.config
         return encode_snapshot(
             ModelSnapshot(
-                self.config.vehicle,
-                view.model,
-                view.base_frame,
-                view.rolling_frame,
-                self.config.limits.history_s,
-                f"{self.config.lcm.channel_prefix}{self.config.sensors.joints.channel}",
-                round(self.config.sensors.joints.latency * 1e6),
+                config.vehicle,
+                model,
+                config.base_frame,
+                config.rolling_frame or config.base_frame,
+                config.limits.history_s,
+                f"{config.lcm.channel_prefix}{config.sensors.joints.channel}",
+                round(config.sensors.joints.latency * 1e6),
             )
         )
-
-    def reload_model(self, command: messages.LoadModel, state: CoreState, file: str = "") -> ModelLoaded:
-        """Read the geometry file again, and check all of it against the vehicle file."""
-        try:
-            vehicle = load_vehicle(self.config, file)
-        except (errors.GeometryError, errors.ConfigError) as error:
-            return ModelLoaded(command.request, why=str(error))
-        except Exception as error:
-            log.exception("reloading the geometry failed")
-            return ModelLoaded(command.request, why=f"internal error while reading it: {error}")
-        lost = find_disconnected(vehicle.model) - find_disconnected(state.model)
-        if lost:
-            why = (
-                f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
-                "write a temporary file and rename it; to use the geometry as it is, restart the server"
-            )
-            return ModelLoaded(command.request, why=why)
-        localizer, setup = state.localizer, vehicle.make_localizer_setup()
-        if setup is not None:
-            from modelserver.estimation.modes import ModeLocalizer
-
-            if isinstance(localizer, ModeLocalizer):
-                localizer = localizer.reconfigure(setup)
-        return ModelLoaded(command.request, vehicle.model, localizer)
 
     def ticks_per_pose(self) -> int:
         """Return the ticks per POSE in timer mode; more than one if POSE is slower than `HOUSEKEEPING_HZ`."""

@@ -105,6 +105,25 @@ def test_given_hangup_then_a_good_file_counts_at_once_and_a_bad_one_changes_noth
     assert daemon.health().handler_errors == 0
 
 
+def test_given_a_large_file_then_poses_and_old_answers_come_until_it_is_whole(
+    start_daemon: StartDaemon, tmp_path: Path
+) -> None:
+    daemon = start_daemon()
+    platform = daemon.platform()
+    old = daemon.health().model_revision
+    extra = "".join(f"      Point{n}: {{xyz: [{n % 10}, 0, 0.1]}}\n" for n in range(2000))
+    (tmp_path / "geometry.yaml").write_text(HIGHER_CAMERA.replace("    frames:\n", f"    frames:\n{extra}", 1))
+    with platform.subscribe_pose() as poses:
+        daemon.process.send_signal(signal.SIGHUP)
+        revisions = [next(poses).transformation.model_revision for _ in range(10)]
+        # reading takes a fifth of a second at least: a process has to start
+        assert set(revisions) == {old}
+        assert platform.get_transformation("Camera:Origin", "Cart:Base").model_revision == old
+        new = daemon.health(lambda health: health.model_revision != old).model_revision
+        found = platform.get_transformation("Cart:Point7", "Cart:Base")
+    assert (found.model_revision, found.position[0]) == (new, 7.0)
+
+
 def test_given_no_permission_then_neither_reload_nor_a_pose_is_taken_and_the_setting_is_named(daemon: Daemon) -> None:
     platform = daemon.platform()
     revision = daemon.health().model_revision

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from modelserver.core.commands import ModelLoaded
     from modelserver.messages import LoadModel
     from modelserver.server.clock import Clock
+    from modelserver.server.reloading import PollReload
 
 MAX_STATUS_LENGTH: Final = 400
 """Characters of a status line."""
@@ -127,25 +128,14 @@ class Notifier:
             self._ping_due_ns = now + self._watchdog_ns // PINGS_PER_TIMEOUT
             self.send("WATCHDOG=1")
 
-    @contextlib.contextmanager
-    def reloading(self, seconds: float = STEP_TIMEOUT_S) -> Iterator[None]:
-        """Report a reload until the block ends, with `seconds` as watchdog timeout.
+    def notify_reloading(self) -> None:
+        """Report that a reload begins. systemd 253 needs the monotonic time, to ignore the answer to an earlier one."""
+        self.send("RELOADING=1", f"MONOTONIC_USEC={self._monotonic_ns() // 1000}", "STATUS=reloading the geometry")
 
-        systemd 253 needs the monotonic time, to ignore the answer to an earlier reload.
-        """
-        lines = ["RELOADING=1", f"MONOTONIC_USEC={self._monotonic_ns() // 1000}", "STATUS=reloading the geometry"]
-        if self._watchdog_ns:
-            # a new timeout counts from now, and needs a ping
-            lines += [f"WATCHDOG_USEC={round(seconds * 1e6)}", "WATCHDOG=1"]
-        self.send(*lines)
-        try:
-            yield
-        finally:
-            lines = ["READY=1", f"STATUS={self._status}"]
-            if self._watchdog_ns:
-                lines += [f"WATCHDOG_USEC={self._watchdog_ns // 1000}", "WATCHDOG=1"]
-            self.send(*lines)
-            self._ping_due_ns = self._status_due_ns = 0
+    def notify_reloaded(self) -> None:
+        """Report that a reload has ended."""
+        self.send("READY=1", f"STATUS={self._status}")
+        self._status_due_ns = 0
 
     def notify_stopping(self) -> None:
         """Report that the service stops."""
@@ -238,18 +228,35 @@ class ServiceSupervisor:
             notifier.ping_watchdog()
 
     def wrap_load(
-        self, load: Callable[[LoadModel, CoreState], ModelLoaded]
-    ) -> Callable[[LoadModel, CoreState], ModelLoaded]:
+        self, load: Callable[[LoadModel, CoreState], PollReload]
+    ) -> Callable[[LoadModel, CoreState], PollReload]:
         """Wrap a function that reloads the geometry, so that the service manager is notified."""
 
-        def load_and_notify(command: LoadModel, state: CoreState) -> ModelLoaded:
-            with self._notifier.reloading():
-                result = load(command, state)
-            if command.request is None or not command.request.dry_run:
-                self._reload_error = "" if result.model is not None else result.why
-            return result
+        def load_and_notify(command: LoadModel, state: CoreState) -> PollReload:
+            self._notifier.notify_reloading()
+            with self._notify_error():
+                poll = load(command, state)
+
+            def poll_and_notify(state: CoreState) -> ModelLoaded | None:
+                with self._notify_error():
+                    result = poll(state)
+                if result is not None:
+                    self._notifier.notify_reloaded()
+                    if command.request is None or not command.request.dry_run:
+                        self._reload_error = "" if result.model is not None else result.why
+                return result
+
+            return poll_and_notify
 
         return load_and_notify
+
+    @contextlib.contextmanager
+    def _notify_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._notifier.notify_reloaded()
+            raise
 
     @contextlib.contextmanager
     def notify_at_exit(self) -> Iterator[None]:

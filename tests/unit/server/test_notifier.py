@@ -69,8 +69,8 @@ def test_given_no_socket_to_send_to_then_nothing_is_sent(given: str) -> None:
     notifier.notify_starting("reading")
     notifier.notify_ready("serving")
     notifier.update_status(lambda: pytest.fail("nobody asks for it"))
-    with notifier.reloading():
-        pass
+    notifier.notify_reloading()
+    notifier.notify_reloaded()
     notifier.notify_stopping()
     assert not notifier.is_active
 
@@ -135,28 +135,11 @@ def test_given_a_status_with_lines_of_its_own_then_it_is_one_line_and_not_too_lo
     assert len(datagram.splitlines()[1]) == MAX_STATUS_LENGTH + len("STATUS=")
 
 
-def test_given_a_reload_then_it_is_notified_and_has_its_own_watchdog_timeout() -> None:
+def test_given_a_reload_then_its_begin_and_end_are_notified() -> None:
     recorder = RecordingManager()
     recorder.notifier.notify_ready("serving")
     recorder.pop()
-    with recorder.notifier.reloading(60.0):
-        (begin,) = recorder.pop()
-        recorder.now_ns += 20 * SECOND
-    (end,) = recorder.pop()
-    assert begin.splitlines() == [
-        "RELOADING=1", "MONOTONIC_USEC=5000000", "STATUS=reloading the geometry", "WATCHDOG_USEC=60000000",
-        "WATCHDOG=1",
-    ]  # fmt: skip
-    assert end.splitlines() == ["READY=1", "STATUS=serving", "WATCHDOG_USEC=3000000", "WATCHDOG=1"]
-
-
-def test_given_a_reload_that_throws_then_it_is_over_all_the_same() -> None:
-    recorder = RecordingManager()
-
-    def reload() -> None:
-        with recorder.notifier.reloading():
-            raise LookupError
-
-    with pytest.raises(LookupError):
-        reload()
-    assert recorder.pop()[-1].startswith("READY=1")
+    recorder.notifier.notify_reloading()
+    assert recorder.pop() == ["RELOADING=1\nMONOTONIC_USEC=5000000\nSTATUS=reloading the geometry"]
+    recorder.notifier.notify_reloaded()
+    assert recorder.pop() == ["READY=1\nSTATUS=serving"]

@@ -2,34 +2,51 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support_samples import GEOMETRY, ME, START, VEHICLE, ScriptedLocalizer, cart, drive, imu, start_core, write_vehicle
+from support_samples import (
+    GEOMETRY,
+    ME,
+    START,
+    VEHICLE,
+    ScriptedLocalizer,
+    cart,
+    drive,
+    imu,
+    start_core,
+    wait_for_reload,
+    write_vehicle,
+)
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.core import CoreState
-from modelserver.core.commands import ModelLoaded
 from modelserver.errors import Status
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.formats.snapshot import decode_snapshot
+from modelserver.geometry import Model
 from modelserver.messages import (
     GetExplanation,
+    GetTransformation,
     JointSample,
     JointsSample,
     LoadModel,
     ReloadModel,
     ReloadReply,
+    RequestHeader,
     SensorHeader,
     SignedCommand,
     SnapshotPart,
 )
+from modelserver.server import reloading
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
-from modelserver.server.loop import Hooks, Loop, LoopSettings, SnapshotEncoder
+from modelserver.server.loop import MAX_RELOADS, Hooks, Loop, LoopSettings, SnapshotEncoder
+from modelserver.server.reloading import GeometryReader, PollReload, read_geometry
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.snapshot import PART_BYTES, SnapshotAssembler
@@ -134,6 +151,10 @@ def test_given_two_reloads_in_sequence_in_raw_mode_then_odom_stays_where_it_was(
     assert twice.drift == after.drift != ()
 
 
+def read_again(vehicle: Vehicle, file: str = "") -> Callable[[LoadModel, CoreState], PollReload]:
+    return wait_for_reload(GeometryReader(vehicle, file, read_geometry).begin)
+
+
 # --- the daemon's reading -------------------------------------------------------------------------------------------
 
 
@@ -141,7 +162,8 @@ def test_given_a_file_that_suits_then_model_and_localizer_come_together(tmp_path
     vehicle = load(tmp_path)
     state = vehicle.start_core(FakeClock(START).now())
     (tmp_path / "geometry.yaml").write_text(HIGHER_CAMERA)
-    found = vehicle.reload_model(LoadModel(), state)
+    found = read_again(vehicle)(LoadModel(), state)(state)
+    assert found is not None
     assert found.why == ""
     assert found.model is not None
     assert found.model.revision != state.model.revision
@@ -169,9 +191,60 @@ def test_given_a_file_that_is_wrong_or_does_not_suit_then_nothing_comes_but_why(
     state = vehicle.start_core(FakeClock(START).now())
     path = tmp_path / "geometry.yaml"
     path.unlink() if geometry is None else path.write_text(geometry)
-    found = vehicle.reload_model(LoadModel(), state, str(tmp_path / "vehicle.yaml"))
+    found = read_again(vehicle, str(tmp_path / "vehicle.yaml"))(LoadModel(), state)(state)
+    assert found is not None
     assert (found.model, found.localizer) == (None, None)
     assert why in found.why
+
+
+@pytest.fixture
+def read_in_process(tmp_path: Path) -> GeometryReader:
+    return GeometryReader(load(tmp_path), str(tmp_path / "vehicle.yaml"))
+
+
+def test_given_a_process_of_its_own_then_it_reads_what_this_one_would(
+    tmp_path: Path, read_in_process: GeometryReader
+) -> None:
+    vehicle = load(tmp_path)
+    state = vehicle.start_core(FakeClock(START).now())
+    begin = wait_for_reload(read_in_process.begin)
+    (tmp_path / "geometry.yaml").write_text(HIGHER_CAMERA)
+    found, expected = (each(LoadModel(), state)(state) for each in (begin, read_again(vehicle)))
+    assert found is not None
+    assert expected is not None
+    assert expected.model is not None
+    assert found.model is not None
+    assert (found.model.bodies, found.model.constraints) == (expected.model.bodies, expected.model.constraints)
+    assert found.model.revision == expected.model.revision
+    assert isinstance(found.localizer, ModeLocalizer)
+    assert found.localizer.config.setup.rig.model is found.model
+    assert found.changes == ("constraint Mounted moves by 100 mm and 0 deg",)
+    assert read_in_process.encode_snapshot(found.model) == vehicle.encode_snapshot(found.model)
+    (tmp_path / "geometry.yaml").write_text(GEOMETRY.replace("to: Camera", "to: Camrea"))
+    found = begin(LoadModel(), state)(state)
+    assert found is not None
+    assert "Camrea" in found.why
+
+
+@pytest.mark.parametrize(
+    ("script", "why"),
+    [
+        ("import os; os.kill(os.getpid(), 9)", "ended early (SIGKILL)"),
+        ("raise MemoryError", "ended early (code 1)"),
+        ("print('noise')", "internal error while reading it"),
+        ("import time; time.sleep(60)", "reading it took more than 0 s"),
+    ],
+)
+def test_given_a_process_that_fails_then_the_old_model_stays_and_the_reason_is_known(
+    script: str, why: str, tmp_path: Path, read_in_process: GeometryReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reloading, "_MAIN", script)
+    if "sleep" in script:
+        monkeypatch.setattr(reloading, "LIMIT_S", 0.3)
+    state = load(tmp_path).start_core(FakeClock(START).now())
+    found = wait_for_reload(read_in_process.begin)(LoadModel(), state)(state)
+    assert found is not None
+    assert (found.model, why in found.why) == (None, True)
 
 
 # --- the loop -------------------------------------------------------------------------------------------------------
@@ -184,14 +257,15 @@ class Rig:
         self.folder, self.clock = folder, FakeClock(START)
         self.bus = FakeBus(self.clock)
         self.vehicle = load(folder, text, geometry)
+        self.reader = GeometryReader(self.vehicle, read=read_geometry)
         self.loop = Loop(
             self.bus,
             self.clock,
             self.vehicle.start_core(self.clock.now()),
             LoopSettings(20_000_000, self.vehicle.sensor_channels()),
             Hooks(
-                on_load=self.vehicle.reload_model,
-                snapshot=self.vehicle.encode_snapshot,
+                on_load=wait_for_reload(self.reader.begin),
+                snapshot=self.reader.encode_snapshot,
                 channels=lambda state: self.vehicle.sensor_channels(state.model),
             ),
         )
@@ -312,7 +386,7 @@ def test_given_the_first_joint_with_a_reload_then_joints_are_received_from_then_
 def test_given_a_reading_that_breaks_then_the_loop_goes_on_and_counts_it(tmp_path: Path, fail: Exception) -> None:
     rig = Rig(tmp_path)
 
-    def fail_to_load(command: LoadModel, state: CoreState) -> ModelLoaded:
+    def fail_to_load(command: LoadModel, state: CoreState) -> PollReload:
         raise fail
 
     rig.loop._hooks = replace(rig.loop._hooks, on_load=fail_to_load)
@@ -322,6 +396,41 @@ def test_given_a_reading_that_breaks_then_the_loop_goes_on_and_counts_it(tmp_pat
     rig.turns()
     assert rig.loop.state.handler_errors == 1
     assert rig.loop.state.traffic["sensor:imu"].count == 1
+
+
+def test_given_reloads_while_one_is_in_progress_then_they_follow_in_turn_and_the_old_model_serves(
+    tmp_path: Path,
+) -> None:
+    rig = Rig(tmp_path, VEHICLE + "commands: {reload: true, key_file: k}\n")
+    old = rig.loop.state.model.revision
+    may_end, started = threading.Event(), []
+
+    def begin(command: LoadModel, state: CoreState) -> PollReload:
+        started.append(command)
+        poll = wait_for_reload(rig.reader.begin)(command, state)
+        return lambda state: poll(state) if may_end.is_set() else None
+
+    rig.loop._hooks = replace(rig.loop._hooks, on_load=begin)
+    rig.write(HIGHER_CAMERA)
+    for n in range(MAX_RELOADS + 2):
+        request = ReloadModel(RequestHeader(n, "REPLY_TEST"), dry_run=n > 0)
+        rig.loop.execute(SignedCommand(request), rig.clock.now())
+    rig.turns(5)
+    assert len(started) == 1
+    rig.bus.publish("PLATFORM_GET_TRANSFORMATION", encode(GetTransformation(ME, "Camera:Origin", "Cart:Base")))
+    rig.turns()
+    *_, data = rig.bus.get_published("REPLY_TEST")
+    assert decode("get_transformation_reply_t", data).header.model_revision == old
+    rejected, *_ = rig.bus.get_published("REPLY_TEST")
+    header = decode("reload_model_reply_t", rejected).header
+    assert (header.request_id, header.status) == (MAX_RELOADS + 1, Status.REJECTED)
+    assert "reloads are waiting" in header.message
+    may_end.set()
+    rig.turns(2 * MAX_RELOADS)
+    replies = [decode("reload_model_reply_t", data) for data in rig.bus.get_published("REPLY_TEST")[2:]]
+    assert [each.header.request_id for each in replies] == list(range(MAX_RELOADS + 1))
+    assert [bool(each.changes) for each in replies] == [True] + [False] * MAX_RELOADS
+    assert rig.loop.state.model.revision != old
 
 
 def test_given_a_loop_without_a_file_then_a_reload_is_rejected_with_the_reason() -> None:
@@ -339,10 +448,10 @@ def test_given_a_loop_without_a_file_then_a_reload_is_rejected_with_the_reason()
 # --- the broadcast --------------------------------------------------------------------------------------------------
 
 
-def counting(size: int) -> tuple[Callable[[CoreState], bytes], list[int]]:
+def counting(size: int) -> tuple[Callable[[Model], bytes], list[int]]:
     calls: list[int] = []
 
-    def write(state: CoreState) -> bytes:
+    def write(model: Model) -> bytes:
         calls.append(len(calls))
         return bytes(size)
 

@@ -27,6 +27,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.reloading import PollReload
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.signing.signatures import Key
 from modelserver.transforms import Pose, Transformation
@@ -66,9 +67,9 @@ class Rig:
             ),
         )
 
-    def load(self, command: Any, state: Any) -> ModelLoaded:
+    def load(self, command: Any, state: Any) -> PollReload:
         self.loads += 1
-        return ModelLoaded(command.request, state.model, state.localizer)
+        return lambda state: ModelLoaded(command.request, state.model, state.localizer)
 
     def get_replies(self, data: bytes, channel: str = "MODELSERVER_SIGNED") -> list[bytes]:
         """Put a message on the bus; return the replies to it."""

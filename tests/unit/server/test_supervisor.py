@@ -15,6 +15,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.reloading import PollReload
 from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
 from modelserver.wire.codec import encode
 
@@ -55,9 +56,9 @@ class Watched:
     def _take(self, datagram: bytes) -> None:
         self.notifications.append(datagram.decode())
 
-    def _load(self, command: LoadModel, state: CoreState) -> ModelLoaded:
+    def _load(self, command: LoadModel, state: CoreState) -> PollReload:
         assert self.notifications[-1].startswith("RELOADING=1")
-        return self.answer
+        return lambda state: self.answer
 
     def runs(self, seconds: float, *sources: str) -> list[str]:
         """Run with a sample of each source at 10 Hz, and return the notifications."""
@@ -163,8 +164,8 @@ def test_given_a_reload_that_fails_then_the_status_has_the_reason_until_one_succ
 
 def test_given_a_dry_run_that_fails_then_the_status_stays() -> None:
     watched = Watched()
-    load = watched.supervisor.wrap_load(lambda command, state: ModelLoaded(command.request, why="no"))
-    load(LoadModel(ReloadModel(RequestHeader(1, "REPLY_TEST"), True)), watched.loop.state)
+    load = watched.supervisor.wrap_load(lambda command, state: lambda state: ModelLoaded(command.request, why="no"))
+    load(LoadModel(ReloadModel(RequestHeader(1, "REPLY_TEST"), True)), watched.loop.state)(watched.loop.state)
     watched.runs(2.0)
     assert "refused" not in watched.status()
 

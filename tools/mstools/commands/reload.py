@@ -22,7 +22,7 @@ def command(
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
-    timeout: TimeoutOption = 10.0,
+    timeout: TimeoutOption = 2.0,
     key: KeyOption = None,
 ) -> None:
     """Reload the geometry file of the running daemon, and print the changes.

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 8080
-RELOAD_TIMEOUT_S = 10.0
 SHOWN_NOTES = 5
 
 
@@ -136,7 +135,7 @@ def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, 
     check_writable(str(edited.path))
     if edited.config is not None:
         url, prefix = url or edited.config.lcm.url, prefix or edited.config.lcm.channel_prefix
-    return Editing(EditSession(edited, parse_variables(settings)), url, prefix, RELOAD_TIMEOUT_S, str(key))
+    return Editing(EditSession(edited, parse_variables(settings)), url, prefix, key=str(key))
 
 
 def open_source(

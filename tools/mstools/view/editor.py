@@ -43,7 +43,7 @@ class Editing:
     session: EditSession
     url: str = ""
     prefix: str = ""
-    timeout: float = 10.0
+    timeout: float = 2.0
     key: str = ""
 
     def reload(self, dry_run: bool) -> ReloadReply:
