@@ -254,6 +254,25 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
     find_fields(page, "Gizmo").set_checked(False)
 
 
+def test_given_other_items_and_kinds_in_turn_then_the_gizmo_is_where_the_item_is(edited_page: EditedPage) -> None:
+    _, page, _ = edited_page
+    box = find_fields(page, "Gizmo")
+    if not box.is_visible():
+        page.get_by_text("Gizmo", exact=True).first.click()
+    box.set_checked(True)
+    choose(page, "Kind", "constraint")
+    # its first item, and then another one of the same body
+    choose(page, "Kind", "frame")
+    choose(page, "Item", "Raptor:CG")
+    pictures = []
+    for is_shown in (True, False, True):
+        box.set_checked(is_shown)
+        pictures.append(take_picture(page)[:, :SCENE_WIDTH])
+    shown, hidden, again = pictures
+    assert (np.abs(shown - hidden).sum(axis=2) > 90).sum() > 50, "the gizmo has vanished"
+    assert (np.abs(shown - again).sum(axis=2) > 90).sum() < 50, "the gizmo was somewhere else"
+
+
 def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: EditedPage) -> None:
     path, page, _ = edited_page
     select_item(page, "frame", "FLEA:Lens")

@@ -163,6 +163,7 @@ class VehicleScene:
             precision="float32",
         )
         self._gizmo: Any = None
+        self._gizmo_count = 0
         self._ellipsoid = self._scene.add_icosphere("/world/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False)
 
     def _add_lines(self, name: str, color: Rgb, width: float) -> Any:
@@ -347,11 +348,12 @@ class VehicleScene:
         node = self._bodies.get(body)
         if node is None:
             return
-        self._gizmo = self._scene.add_frame(
-            f"{node.name}/edited", show_axes=False, position=parent.xyz, wxyz=parent.wxyz
-        )
+        # a name of its own each time: a page hides for good what is removed and added again under the same one
+        self._gizmo_count += 1
+        name = f"{node.name}/edited{self._gizmo_count}"
+        self._gizmo = self._scene.add_frame(name, show_axes=False, position=parent.xyz, wxyz=parent.wxyz)
         controls = self._scene.add_transform_controls(
-            f"{node.name}/edited/gizmo",
+            f"{name}/gizmo",
             scale=GIZMO_SCALE * self._size,
             depth_test=False,
             position=pose.xyz,
