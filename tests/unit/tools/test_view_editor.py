@@ -37,9 +37,8 @@ class EditedPage:
         self.session = EditSession(EditedFile.open(path))
         self.actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.shown: list[Model] = []
-        assert self.session.model is not None
         scene = VehicleScene(server, None, lambda frame, is_reference: None)
-        scene.set_model(self.session.model, "Raptor:CG", NameLabels.NONE)
+        scene.set_model(self.session.drawn, "Raptor:CG", NameLabels.NONE)
         self.scene = scene
         self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
         self.fields = self.editor._fields
@@ -71,6 +70,49 @@ def page(tmp_path: Path) -> Iterator[EditedPage]:
     opened = open_page(port=0)
     yield EditedPage(tmp_path / "vehicle.yaml", opened.server)
     opened.close()
+
+
+ERRORS = {
+    "unknown body": ("to: Digiclops:Mount", "to: Digiclopz:Mount", "DigiclopsFixed"),
+    "sigma": ("xyz: [1.15, 0.6, -0.017]", "xyz: [1.15, 0.6]", "Raptor:CG"),
+}
+
+
+@pytest.fixture(params=ERRORS)
+def wrong_page(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[EditedPage, str]]:
+    right, wrong, culprit = ERRORS[request.param]
+    for each in ("vehicle.yaml", "raptor.dbc"):
+        shutil.copy(RAPTOR / each, tmp_path)
+    text = (RAPTOR / "geometry.yaml").read_text()
+    assert right in text
+    (tmp_path / "geometry.yaml").write_text(text.replace(right, wrong, 1))
+    opened = open_page(port=0)
+    yield EditedPage(tmp_path / "vehicle.yaml", opened.server), culprit
+    opened.close()
+
+
+def test_given_a_file_with_an_error_then_it_opens_with_its_problems_and_can_be_fixed(
+    wrong_page: tuple[EditedPage, str],
+) -> None:
+    page, culprit = wrong_page
+    session, editor = page.session, page.editor
+    assert session.model is None
+    assert "not joined" in editor._status.content
+    assert "**error**" in editor._problem_texts.content
+    (button,) = [each for each in editor._buttons if each.label == f"1: {culprit}"]
+    assert button is not None
+    item = session.find_culprit(next(each for each in session.problems if each.severity == "error"))
+    assert item is not None
+    editor.select(item)
+    text = session.document.get_yaml(item)
+    for right, wrong, _ in ERRORS.values():
+        text = text.replace(wrong, right)
+    editor._text.value = text
+    editor._write_text()
+    assert not session.has_errors
+    assert page.shown == [session.model]
+    session.save()
+    assert (session.file.path).read_text() == (RAPTOR / "geometry.yaml").read_text()
 
 
 @pytest.mark.slow

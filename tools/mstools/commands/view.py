@@ -82,13 +82,9 @@ def command(
     from mstools.view.page import ViewError, open_page
     from mstools.view.viewer import Viewer
 
-    source = open_source(file, model, settings, url, prefix, timeout)
+    editing = open_editing(file, settings, url, prefix, key or "") if edit and file is not None else None
+    source = open_source(file, model, settings, url, prefix, timeout, editing)
     try:
-        editing = None
-        if edit and file is not None:
-            if source.set_model is None:
-                raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
-            editing = open_editing(file, settings, url, prefix, key or "")
         try:
             page = open_page(bind, DEFAULT_PORT if port is None else port, with_token=edit)
         except ViewError:
@@ -99,6 +95,8 @@ def command(
             viewer = Viewer(page, source, editing)
             typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
             sys.stdout.flush()
+            if editing is not None and editing.session.has_errors:
+                typer.echo(escape(f"modelserver: {source.title}: has errors, listed in the tab Edit"), err=True)
             for each in source.notes[:SHOWN_NOTES]:
                 typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
             if not no_browser and bind == LOOPBACK and has_screen():
@@ -124,13 +122,15 @@ def check_installed() -> None:
 
 
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
-    """Begin to edit a geometry file, or that of a vehicle file. Raises EditError, OSError.
+    """Begin to edit a geometry file, or that of a vehicle file. Raises typer.BadParameter, EditError, OSError.
 
     Bus and prefix of the service are those given, else of the vehicle file.
     """
     from mstools.edit.session import EditedFile, EditSession
     from mstools.view.editor import Editing
 
+    if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
+        raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
     edited = EditedFile.open(file)
     check_writable(str(edited.path))
     if edited.config is not None:
@@ -139,9 +139,15 @@ def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, 
 
 
 def open_source(
-    file: Path | None, model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float
+    file: Path | None,
+    model: Path | None,
+    settings: list[str] | None,
+    url: str,
+    prefix: str,
+    timeout: float,
+    editing: Editing | None = None,
 ) -> Source:
-    """Open what is to be shown. Raises GeometryError, ConfigError, RecordingError, OSError."""
+    """Open what is to be shown, or edited. Raises GeometryError, ConfigError, RecordingError, OSError."""
     from mstools.view.sources import open_geometry, open_live, open_log
 
     if file is None:
@@ -153,4 +159,5 @@ def open_source(
             return open_log(file, prefix, model, lambda part: show(round(part * size)))
     if model is not None:
         raise typer.BadParameter(f"goes with a log, but {file} is none: {kind.value}", param_hint="--model")
-    return open_geometry(file, parse_variables(settings))
+    session = None if editing is None else editing.session
+    return open_geometry(file, parse_variables(settings), session)

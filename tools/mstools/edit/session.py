@@ -34,6 +34,14 @@ class Step(NamedTuple):
     change: str
 
 
+class CheckedText(NamedTuple):
+    """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
+
+    model: Model | None
+    drawn: Model | None
+    problems: tuple[Problem, ...]
+
+
 @dataclass(frozen=True)
 class EditedFile:
     """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it."""
@@ -60,16 +68,16 @@ class EditedFile:
         except UnicodeDecodeError:
             raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
 
-    def check(self, text: str, variables: Mapping[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
-        """Return the model in a text, None if it has an error, and all problems, also of frames in the vehicle file."""
+    def check(self, text: str, variables: Mapping[str, str]) -> CheckedText:
+        """Return what a text has, with all problems, also of frames in the vehicle file."""
         builder = parse_content(text.encode(), str(self.path), variables)
         model, problems = builder.check()
         partial = model or builder.build_bodies()
-        if self.config is None or partial is None:
-            return model, problems
-        from modelserver.server.vehicle import find_frame_problems
+        if self.config is not None and partial is not None:
+            from modelserver.server.vehicle import find_frame_problems
 
-        return model, (*problems, *find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
+            problems += tuple(find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
+        return CheckedText(model, partial, problems)
 
 
 class EditSession:
@@ -87,18 +95,27 @@ class EditSession:
         if not document.list_items():
             path = self.file.path
             raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
+        drawn = self.file.check(document.text, self._variables).drawn
+        if drawn is None:
+            raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
         self._saved = saved
         self._steps = [Step(document, "")]
         self._undone: list[Step] = []
+        self.drawn: Model = drawn
+        """The last model without an error; before there is one, the bodies of the file alone."""
         self.model: Model | None = None
         """The last model without an error."""
         self._loaded: GeometryDocument | None = None
         self._check()
 
     def _check(self) -> None:
-        model, self.problems = self.file.check(self.document.text, self._variables)
-        if model is not None:
-            self.model, self._loaded = model, self.document
+        found = self.file.check(self.document.text, self._variables)
+        self.problems = found.problems
+        if found.model is not None:
+            self.model = self.drawn = found.model
+            self._loaded = self.document
+        elif self.model is None and found.drawn is not None:
+            self.drawn = found.drawn
 
     @property
     def document(self) -> GeometryDocument:

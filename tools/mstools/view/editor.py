@@ -77,7 +77,7 @@ class Editor:
         self._editing = editing
         self._actions = actions
         self._show = show
-        self._shown = session.model
+        self._shown = session.drawn
         self._item: GeometryItem | None = None
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
@@ -188,7 +188,7 @@ class Editor:
         assert self._item is not None
         self.select(self._item)
         if session.model is not None and session.model is not self._shown:
-            self._shown = session.model
+            self._shown = session.drawn
             self._show(session.model)
 
     def _show_status(self) -> None:
@@ -197,8 +197,8 @@ class Editor:
         errors = sum(each.severity is Severity.ERROR for each in session.problems)
         state = "not saved" if session.is_changed else "saved"
         if errors:
-            state += (
-                f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows the last model"
+            state += f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows " + (
+                "the last model" if session.model is not None else "the bodies, not joined"
             )
         if self._is_outdated:
             state += ". **The file changed meanwhile on disk:** read it again before you go on"

@@ -95,7 +95,7 @@ class ItemFields:
         """Show the fields of an item."""
         self._item = item
         self._fields, self._given = {}, {}
-        self._part = find_part(self._session.model, item)
+        self._part = find_part(self._session.drawn, item)
         old = self._form
         with self._server.atomic():
             with self._place:
@@ -127,8 +127,7 @@ class ItemFields:
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:
             return self._part.description
-        model = self._session.model
-        bodies = {each.name: each for each in model.bodies} if model is not None else {}
+        bodies = {each.name: each for each in self._session.drawn.bodies}
         return bodies[item.name].description if item.name in bodies else ""
 
     def _add(self, key: str, field: Any) -> None:
@@ -241,7 +240,7 @@ class ItemFields:
         """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
         assert self._item is not None
         present = [key for key in keys if key in self._fields]
-        # the fields show the last model without an error, not what the text has
+        # the fields show the model that is drawn, not what the text has
         is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
         return any(is_wrong or self._differs(key) for key in present)
 
@@ -325,8 +324,8 @@ class ItemFields:
 
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
-        model, part = self._session.model, self._part
-        if model is None or part is None or self._item is None:
+        model, part = self._session.drawn, self._part
+        if part is None or self._item is None:
             return None
         if isinstance(part, BodyFrame):
             return names.split(self._item.name)[0], Pose.identity(), part.pose

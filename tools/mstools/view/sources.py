@@ -25,7 +25,7 @@ from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import iter_batches
 from mstools.commands.pose_source import load_given_model
-from mstools.edit.session import EditedFile
+from mstools.edit.session import EditedFile, EditSession
 from mstools.recordings.log_platform import LogPlatform, scan_log
 from mstools.view.drive import Drive
 
@@ -102,13 +102,16 @@ def list_coordinates(model: Model) -> list[tuple[str, Joint, int]]:
     ]
 
 
-def open_geometry(path: Path, variables: Mapping[str, str]) -> Source:
-    """Open a geometry file, or that of a vehicle file. Raises GeometryError, ConfigError, OSError."""
+def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession | None = None) -> Source:
+    """Open a geometry file, or that of a vehicle file; one that is edited may have errors.
+
+    Raises GeometryError, ConfigError, OSError.
+    """
     file = EditedFile.open(path)
     geometry, base_frame = file.path, file.config.base_frame if file.config is not None else ""
-    model = load_given_model(geometry, variables)
+    model = load_given_model(geometry, variables) if session is None else session.drawn
     drive = Drive(keep_geometry=True)
-    answers = FilePlatform(model, base_frame, f"in {path}")
+    answers = FilePlatform(model, next(frame.full_name for body in model.bodies for frame in body), f"in {path}")
     source = Source(f"{model.name or path.name}", drive, answers, geometry.resolve().parent)
 
     def set_joints(positions: Mapping[str, float]) -> None:
