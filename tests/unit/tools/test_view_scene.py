@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
@@ -83,6 +84,9 @@ def test_given_bodies_that_nothing_joins_then_they_are_beside_the_vehicle(page: 
 def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named(page: Page, tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "mast.obj").write_text(TETRAHEDRON)
+    # the binary chunk begins with the numbers of the corners
+    head, _, tail = bytes(trimesh.creation.box().export(file_type="glb")).partition(b"BIN\0")
+    (tmp_path / "meshes" / "short.glb").write_bytes(head + b"BIN\0" + (99).to_bytes(4, "little") + tail[4:])
     assert len(read_mesh("meshes/mast.obj", tmp_path).faces) == 4
     assert len(read_mesh("package://robot/meshes/mast.obj", tmp_path).faces) == 4
     (tmp_path / "meshes" / "empty.stl").write_bytes(b"no mesh")
@@ -91,6 +95,7 @@ def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named
         ("missing.stl", tmp_path, "not found"),
         ("meshes/empty.stl", tmp_path, "no triangles"),
         ("meshes/bad.ply", tmp_path, "cannot be read"),
+        ("meshes/short.glb", tmp_path, "corners that it does not have"),
         ("meshes/mast.obj", None, "not from the bus"),
     ):
         with pytest.raises(ValueError, match=reason):

@@ -505,6 +505,8 @@ def read_mesh(file: str, folder: Path | None) -> trimesh.Trimesh:
         raise ValueError(f"cannot be read: {error or type(error).__name__}") from None
     if not len(mesh.faces):
         raise ValueError("has no triangles")
+    if not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices) and np.isfinite(mesh.vertices).all()):
+        raise ValueError("has triangles with corners that it does not have")
     return mesh
 
 
