@@ -31,7 +31,7 @@ from mstools.report.sensor_motion import (
     SensorMotion,
     compare_turn_rates,
     compute_sensor_motion,
-    compute_wheel_motion,
+    compute_wheel_travel,
 )
 
 START = 1_700_000_000
@@ -87,7 +87,7 @@ def make_motion(
         random.Random(1).shuffle(wheels)
         random.Random(2).shuffle(fixes)
     sides = {"left": TRACK / 2.0, "right": -TRACK / 2.0}
-    return compute_sensor_motion(rates.finish(), fixes, compute_wheel_motion(wheels), sides)
+    return compute_sensor_motion(rates.finish(), fixes, compute_wheel_travel(wheels), sides)
 
 
 @pytest.mark.parametrize("arrival", [EVEN, BURSTS, SHUFFLED])
@@ -115,7 +115,7 @@ def test_given_speeds_without_travel_then_they_are_means_of_their_seconds() -> N
         WheelsSample(SensorHeader(START * 1_000_000 + 9 * n, "wheels", n), (WheelSample("left", speed=speed[n]),))
         for n in range(2)
     ]
-    found = compute_sensor_motion({}, [], compute_wheel_motion(samples), {"left": 0.3})
+    found = compute_sensor_motion({}, [], compute_wheel_travel(samples), {"left": 0.3})
     assert found.wheels == {"left": {START: 1.0}}
 
 
@@ -124,7 +124,7 @@ def test_given_travel_that_begins_again_then_it_is_no_distance() -> None:
         WheelsSample(SensorHeader((START + n) * 1_000_000, "wheels", n % 2), (WheelSample("left", travel),))
         for n, travel in enumerate([5000.0, 5001.0, 0.0, 1.0])
     ]
-    assert [each.speed for each in compute_wheel_motion(samples)] == [1.0, 1.0]
+    assert [each.speed for each in compute_wheel_travel(samples)] == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("burst", [1, 4, 10])

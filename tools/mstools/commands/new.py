@@ -33,8 +33,8 @@ from mstools.scaffold.files import (
 from mstools.scaffold.guesses import (
     GPS_WORDS,
     IMU_WORDS,
+    FrameChoices,
     Mount,
-    Mounts,
     Wheel,
     add_wheel_frames,
     guess_base,
@@ -226,7 +226,7 @@ def _load_geometry(file: Path) -> Model:
 
 def find_mounts(
     model: Model, base: Mount, wanted: NewVehicle, turning: Sequence[Wheel], gps: str, imu: str
-) -> tuple[Model, Mounts]:
+) -> tuple[Model, FrameChoices]:
     """Return the frames of what is on a vehicle, those given or guessed, and the model with those of its wheels.
 
     Raises typer.BadParameter, GeometryError.
@@ -241,7 +241,7 @@ def find_mounts(
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise typer.BadParameter(f"give the frame; the geometry has: {shown}", param_hint=option_name)
 
-    mounts = Mounts(
+    mounts = FrameChoices(
         base,
         choose(gps, GPS_WORDS, "--gps-frame") if wanted.gps is not None else None,
         choose(imu, IMU_WORDS, "--imu-frame") if wanted.imu is not None else None,

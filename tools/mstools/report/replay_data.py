@@ -38,9 +38,9 @@ from modelserver.transforms.so3 import Array, Vector3
 from mstools.report.sensor_motion import (
     SecondMeans,
     SensorMotion,
-    WheelMotion,
+    WheelTravel,
     compute_sensor_motion,
-    compute_wheel_motion,
+    compute_wheel_travel,
 )
 
 SNAPSHOT_PERIOD_US = 200_000
@@ -276,7 +276,7 @@ class ReplayCollector:
         snapshots = tuple(replace(each, t=seconds(utime)) for utime, each in self._states)
         config = self._vehicle.config
         self._close_frozen()
-        rolling = compute_wheel_motion(self._wheels)
+        rolling = compute_wheel_travel(self._wheels)
         return ReplayData(
             vehicle=config.vehicle,
             log=log,
@@ -410,7 +410,7 @@ class ReplayCollector:
         return tuple(found)
 
     def _compare_wheels(
-        self, rolling: Sequence[WheelMotion], first_utime: int, snapshots: tuple[StateSample, ...]
+        self, rolling: Sequence[WheelTravel], first_utime: int, snapshots: tuple[StateSample, ...]
     ) -> tuple[WheelComparison, ...]:
         known = [each for each in snapshots if math.isfinite(each.speed)]
         if not known or not rolling:

@@ -203,7 +203,7 @@ class SecondMeans:
         return {second: total / weights for second, (total, weights) in sorted(self._sums.items())}
 
 
-class WheelMotion(NamedTuple):
+class WheelTravel(NamedTuple):
     """Mean speed of a wheel from `begin` to `end`, utimes, m/s; equal for a speed that the wheel itself measured."""
 
     begin: int
@@ -213,12 +213,12 @@ class WheelMotion(NamedTuple):
     steering: float
 
 
-def compute_wheel_motion(samples: Iterable[WheelsSample]) -> list[WheelMotion]:
+def compute_wheel_travel(samples: Iterable[WheelsSample]) -> list[WheelTravel]:
     """Return the speeds of wheels by their travel, without travel the measured ones. Any order of samples will do.
 
     A driver that was started again, whose `seq` is smaller than before, counts its travel from another beginning.
     """
-    found: list[WheelMotion] = []
+    found: list[WheelTravel] = []
     anchors: dict[tuple[str, str], tuple[int, float]] = {}
     last_seq: dict[str, int] = {}
     for sample in sorted(samples, key=lambda each: each.header.utime):
@@ -231,7 +231,7 @@ def compute_wheel_motion(samples: Iterable[WheelsSample]) -> list[WheelMotion]:
                 continue
             if not math.isfinite(wheel.travel):
                 if math.isfinite(wheel.speed):
-                    found.append(WheelMotion(utime, utime, wheel.name, wheel.speed, wheel.steering))
+                    found.append(WheelTravel(utime, utime, wheel.name, wheel.speed, wheel.steering))
                 continue
             key = (source, wheel.name)
             begin, travel = anchors.get(key, (0, 0.0))
@@ -239,14 +239,14 @@ def compute_wheel_motion(samples: Iterable[WheelsSample]) -> list[WheelMotion]:
                 anchors[key] = (utime, wheel.travel)
                 speed = (wheel.travel - travel) / (utime - begin) * 1e6
                 if utime - begin <= MAX_TRAVEL_US:
-                    found.append(WheelMotion(begin, utime, wheel.name, speed, wheel.steering))
+                    found.append(WheelTravel(begin, utime, wheel.name, speed, wheel.steering))
     return found
 
 
 def compute_sensor_motion(
     gyro: Mapping[int, float],
     fixes: Iterable[GpsSample],
-    rolling: Iterable[WheelMotion],
+    rolling: Iterable[WheelTravel],
     sides: Mapping[str, float],
 ) -> SensorMotion:
     """Return the motion by each sensor. `sides` are the lateral offsets of the wheels; steered speeds are left out."""

@@ -10,7 +10,7 @@ from typing import Final
 from modelserver.messages import GpsSample, ImuSample
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.registry import DeviceKind
-from mstools.scaffold.guesses import Mount, Mounts
+from mstools.scaffold.guesses import FrameChoices, Mount
 from mstools.scaffold.templates import Place, VehicleTemplate
 
 MARK: Final = "MEASURE"
@@ -55,16 +55,16 @@ class NewVehicle:
     wheels: Device | None = None
     has_camera: bool = False
     head: Device | None = None
-    given: Mounts | None = None
+    given: FrameChoices | None = None
 
     @property
-    def mounts(self) -> Mounts:
+    def mounts(self) -> FrameChoices:
         """The frames of the vehicle: those in a geometry that exists, else those of `make_geometry`."""
         if self.given is not None:
             return self.given
         wheels = {name: Mount(f"{self.body}:{_frame_of_wheel(name)}") for name in self.template.wheels}
         base, gps, imu = (Mount(f"{self.body}:{frame}") for frame in ("Base", "Antenna", "ImuUnit"))
-        return Mounts(base, gps, imu, wheels)
+        return FrameChoices(base, gps, imu, wheels)
 
     @property
     def body(self) -> str:
@@ -187,7 +187,7 @@ def make_vehicle(vehicle: NewVehicle) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _list_sensors(vehicle: NewVehicle, mounts: Mounts) -> Iterator[str]:
+def _list_sensors(vehicle: NewVehicle, mounts: FrameChoices) -> Iterator[str]:
     for name, device, mount in (("gps", vehicle.gps, mounts.gps), ("imu", vehicle.imu, mounts.imu)):
         if device is not None and mount is not None:
             yield f'  {name}: {{channel: {name.upper()}, frame: "{mount.frame}"}}{_mark(mount)}'

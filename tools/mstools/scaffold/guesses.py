@@ -41,7 +41,7 @@ class Mount(NamedTuple):
     note: str = ""
 
 
-class Mounts(NamedTuple):
+class FrameChoices(NamedTuple):
     """The frames of a new vehicle. `rolling` is the frame that moves straight ahead, where it is not `base`."""
 
     base: Mount
