@@ -124,7 +124,22 @@ class ResultLine:
         asked = "".join(f"{'' if math.isnan(x) else f'{x:.2f}':>10}" for x in (self.target.required, self.target.aim))
         bad = "" if self.is_met else "  <-- OUT OF BOUNDS"
         name = f"{self.recording.name} {self.protocol}"
-        return f"{name:16}{self.measured:9.3f}{asked}{n:7}{missing:9}   {self.target.peers}{bad}"
+        return (
+            f"{name:16}{self.measured:9.3f}{asked}{n:7}{missing:9}{self._format_integrity()}   {self.target.peers}{bad}"
+        )
+
+    def _format_integrity(self) -> str:
+        """Return share of time valid, longest time without, misleading, beyond the levels, and level over error."""
+        runs = [each.integrity for each in self.outcomes]
+        seconds = sum(each.seconds for each in runs)
+        if not seconds:
+            return f"{'never valid':>49}"
+        share = sum(each.valid for each in runs) / seconds
+        sums = [
+            sum(getattr(each, name) for each in runs) for name in ("misleading", "beyond_level", "beyond_protection")
+        ]
+        longest, ratio = max(each.gap for each in runs), max(each.ratio for each in runs)
+        return f"{share:9.1%}{longest:8.1f}" + "".join(f"{each:8.1f}" for each in sums) + f"{ratio:8.1f}"
 
     def format_details(self) -> list[str]:
         """Return the details for --verbose."""
@@ -156,7 +171,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         cache = Path(options.cache or directory)
         cache.mkdir(parents=True, exist_ok=True)
         if present:
-            print(f"{'':16}{'ours m':>9}{'required':>10}{'aim':>10}{'n':>7}{'missing':>9}   others, m")
+            names = f"{'valid':>9}{'gap s':>8}{'HMI s':>8}{'> lev.':>8}{'> prot.':>8}{'lev/95':>8}"
+            print(f"{'':16}{'ours m':>9}{'required':>10}{'aim':>10}{'n':>7}{'missing':>9}{names}   others, m")
             for line in _run_all(present, options, data, cache):
                 holds = holds and line.is_met
                 print("\n".join([line.format(), *(line.format_details() if options.verbose else ())]), flush=True)

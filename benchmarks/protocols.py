@@ -7,7 +7,8 @@
   the mean over all gaps. A gap that would end after the recording is left out: at 15 % the last one of most recordings.
 
 An error is horizontal, in the frame of the antenna, at the fix's stamp; the estimate uses the events that arrived
-before (`modelserver.server.offline`). The common scorer is stored beside the recordings and gets an estimate at each
+before (`modelserver.server.offline`). Three numbers belong together: accuracy, share of time valid, and error beyond
+the limit while valid (`Integrity`). The common scorer is stored beside the recordings and gets an estimate at each
 withheld fix. Invalid estimates count; missing ones are reported. `load_with_overrides` changes a vehicle file for an
 experiment.
 """
@@ -16,10 +17,11 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -69,6 +71,24 @@ class FixGap:
 
 
 @dataclass(frozen=True)
+class Integrity:
+    """Validity and levels from the first valid estimate on, by the time between withheld fixes, seconds.
+
+    `seconds` in all, `valid` of them, `gap` the longest time without; `misleading` valid with an error beyond the limit
+    (HMI); `beyond_level` and `beyond_protection` with one beyond the level or the protection level, valid or not.
+    `ratio` is the median level over the 95th percentile of the error.
+    """
+
+    seconds: float = 0.0
+    valid: float = 0.0
+    gap: float = 0.0
+    misleading: float = 0.0
+    beyond_level: float = 0.0
+    beyond_protection: float = 0.0
+    ratio: float = math.nan
+
+
+@dataclass(frozen=True)
 class ReplayScore:
     """Result of a run. Meters.
 
@@ -84,6 +104,7 @@ class ReplayScore:
     max: float = float("nan")
     gaps: tuple[FixGap, ...] = ()
     rejected: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    integrity: Integrity = Integrity()
 
 
 @dataclass(frozen=True)
@@ -171,20 +192,61 @@ def run(job: ReplayJob) -> ReplayScore:
             events: Iterable[LogEvent] = protocol.filter_events(recording, gps.channel)
             if job.transform is not None:
                 events = job.transform(events)
-            estimated, valid, rejected = _estimate_fixes(OfflineRun(vehicle, events, gps.frame), protocol)
-        return _score(protocol, estimated, valid, rejected, scorer, Path(directory))
+            estimated, valid, levels, rejected = _estimate_fixes(OfflineRun(vehicle, events, gps.frame), protocol)
+        score = _score(protocol, estimated, valid, rejected, scorer, Path(directory))
+        return replace(score, integrity=measure_integrity(protocol, estimated, valid, levels))
 
 
-def _estimate_fixes(replayed: OfflineRun, protocol: Protocol) -> tuple[Array, Mask, Mapping[tuple[str, str], int]]:
-    """Return east, north, up, yaw at the withheld fixes, their validity, and the rejected samples."""
+def _estimate_fixes(
+    replayed: OfflineRun, protocol: Protocol
+) -> tuple[Array, Mask, Array, Mapping[tuple[str, str], int]]:
+    """Return east, north, up, yaw at the withheld fixes, their validity, their levels, and the rejected samples.
+
+    The levels (n, 3) are level, protection level and limit of the horizontal position, m.
+    """
     # stamps of a recording may not be sorted
     at = np.maximum.accumulate(protocol.fixes.utime[protocol.withheld])
-    found, valid = [], []
+    found, valid, levels = [], [], []
     for row in replayed.rows(at.tolist()):
         w, x, y, z = row.rotation
         found.append((row.easting, row.northing, row.up, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
         valid.append(row.valid)
-    return np.array(found, float).reshape(-1, 4), np.array(valid, bool), dict(replayed.rejected)
+        if replayed.localizer is None:
+            levels.append((math.nan,) * 3)
+            continue
+        estimate, limit = replayed.localizer.estimate(row.utime), replayed.localizer.summary(row.utime).horizontal_limit
+        levels.append((estimate.horizontal_level, estimate.horizontal_protection_level, limit))
+    table, bounds = np.array(found, float).reshape(-1, 4), np.array(levels, float).reshape(-1, 3)
+    return table, np.array(valid, bool), bounds, dict(replayed.rejected)
+
+
+def measure_integrity(protocol: Protocol, estimated: Array, valid: Mask, levels: Array) -> Integrity:
+    """Return validity and levels at the withheld fixes, of which a pause counts for three seconds at most."""
+    if not valid.any():
+        return Integrity()
+    first = int(np.argmax(valid))
+    t = protocol.times[protocol.withheld][first:]
+    seconds = np.minimum(np.diff(t, append=t[-1]), 3.0)
+    error = np.hypot(*(estimated[first:, :2] - protocol.fixes.positions[protocol.withheld][first:]).T)
+    level, protection, limit = levels[first:].T
+    is_valid = valid[first:]
+    gap = longest = 0.0
+    for duration, each in zip(seconds.tolist(), is_valid.tolist(), strict=True):
+        gap = 0.0 if each else gap + duration
+        longest = max(longest, gap)
+
+    def count(mask: Mask) -> float:
+        return float(seconds[mask].sum())
+
+    return Integrity(
+        float(seconds.sum()),
+        count(is_valid),
+        longest,
+        count(is_valid & ~(error <= limit)),
+        count(error > level),
+        count(error > protection),
+        float(np.nanmedian(level) / np.nanpercentile(error, 95.0)),
+    )
 
 
 def _score(

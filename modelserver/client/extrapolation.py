@@ -109,6 +109,9 @@ class PublishedEstimate(NamedTuple):
             self.world.seconds_to_limit,
             None if self.previous is None else estimate_motion(self.previous, OdomSample(self.utime, odom.pose)),
             self.is_random_walk,
+            self.world.horizontal_level,
+            self.world.heading_level,
+            self.world.limit_risk,
         )
 
 
@@ -238,5 +241,8 @@ def _extrapolate(last: Estimate, utime: int, dt: float, is_stale: bool) -> Estim
         quality=last.quality | Quality.PREDICTED,
         horizontal_protection_level=NAN,
         heading_protection_level=NAN,
+        horizontal_level=NAN,
+        heading_level=NAN,
+        limit_risk=NAN,
         seconds_to_limit=max(left, 0.0) if left == left else NAN,
     )

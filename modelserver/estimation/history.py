@@ -319,6 +319,9 @@ def interpolate(a: Estimate, b: Estimate, utime: int) -> Estimate:
         b.seconds_to_limit,
         _interpolate_motion(a.motion, b.motion, fraction),
         b.is_odom_random_walk,
+        max(a.horizontal_level, b.horizontal_level),
+        max(a.heading_level, b.heading_level),
+        max(a.limit_risk, b.limit_risk),
     )
 
 
@@ -371,4 +374,7 @@ def restamp(estimate: Estimate, utime: int, flag: Quality, invalid: Invalid = VA
         estimate.seconds_to_limit,
         estimate.motion,
         estimate.is_odom_random_walk,
+        estimate.horizontal_level,
+        estimate.heading_level,
+        estimate.limit_risk,
     )

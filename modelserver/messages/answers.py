@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 class PoseAnswer(NamedTuple):
     """A transformation with the other fields of pose_transform_t.
 
-    `origin` is None where no world frame is involved or the origin is not known.
+    `origin` is None where no world frame is involved or the origin is not known. The levels, in m and rad, are those
+    that an error exceeds with a probability of 1e-4 at an instant; `limit_risk` is that of an error beyond a configured
+    limit.
     """
 
     transformation: Transformation
@@ -28,6 +30,9 @@ class PoseAnswer(NamedTuple):
     horizontal_protection_level: float = NAN
     heading_protection_level: float = NAN
     seconds_to_limit: float = NAN
+    horizontal_level: float = NAN
+    heading_level: float = NAN
+    limit_risk: float = NAN
 
     @property
     def geodetic(self) -> GeodeticPose | None:

@@ -46,7 +46,7 @@ class Estimate:
     None before the origin is known. `covariance` (36 numbers, row-major) is that of the world pose along east, north,
     up, for `utm` and `enu` alike: the meridian convergence between their axes is negligible in it. `odom_covariance`
     grows from the start of Odom: as a random walk (variances add) if `is_odom_random_walk`, else in proportion to time
-    (sigmas add). `motion` is None where it is not known.
+    (sigmas add). `motion` is None where it is not known. Levels and risk: see `PoseAnswer`.
     """
 
     utime: int
@@ -64,3 +64,6 @@ class Estimate:
     seconds_to_limit: float = NAN
     motion: VehicleMotion | None = field(default=None, repr=False)
     is_odom_random_walk: bool = False
+    horizontal_level: float = NAN
+    heading_level: float = NAN
+    limit_risk: float = NAN

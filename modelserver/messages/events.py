@@ -152,7 +152,8 @@ class LocalizerSummary(NamedTuple):
     """Summary of a localizer: `phase` is None in raw mode, `fix_utime` 0 before the first used fix.
 
     `findings` lists the configured sensors that cannot be used now. `distance_to_heading`: how far the vehicle must
-    still drive until its heading can be found from fixes, about, m; nan: it is known, or there are no fixes.
+    still drive until its heading can be found from fixes, about, m; nan: it is known, or there are no fixes. The
+    limits, m and rad, are those of a valid pose; nan: not known yet.
     """
 
     mode: Mode
@@ -161,6 +162,8 @@ class LocalizerSummary(NamedTuple):
     fix_utime: int = 0
     findings: tuple[SensorFinding, ...] = ()
     distance_to_heading: float = NAN
+    horizontal_limit: float = NAN
+    heading_limit: float = NAN
 
 
 class Gauges(NamedTuple):

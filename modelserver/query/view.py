@@ -371,7 +371,7 @@ class PlatformView(NamedTuple):
         elif path is not None and joints.quality:
             quality |= joints.quality
         of_vehicle = self.base_frame in (interest, reference) and not odom_only
-        horizontal, heading = self._protection_levels(estimate) if of_vehicle else (NAN, NAN)
+        levels = self._get_levels(estimate) if of_vehicle else _NO_LEVELS
         return PoseAnswer(
             Transformation(
                 interest,
@@ -386,17 +386,25 @@ class PlatformView(NamedTuple):
             ),
             origin,
             quality,
-            horizontal,
-            heading,
+            levels[0],
+            levels[1],
             NAN if odom_only else estimate.seconds_to_limit,
+            levels[2],
+            levels[3],
+            estimate.limit_risk if of_vehicle else NAN,
         )
 
-    def _protection_levels(self, estimate: Estimate) -> tuple[float, float]:
-        """Return the protection levels at the base frame, which the heading error moves about the rolling frame."""
+    def _get_levels(self, estimate: Estimate) -> tuple[float, float, float, float]:
+        """Return protection levels and levels at the base frame: the heading error moves it about the rolling one."""
         x, y, _ = self.model.get_transformation(self.base_frame, self.rolling_frame).pose.xyz
         # a chord is no longer than its arc, nor than twice the lever arm
-        error = math.hypot(x, y) * min(estimate.heading_protection_level, 2.0)
-        return estimate.horizontal_protection_level + error, estimate.heading_protection_level
+        arm, heading, level = math.hypot(x, y), estimate.heading_protection_level, estimate.heading_level
+        return (
+            estimate.horizontal_protection_level + arm * min(heading, 2.0),
+            heading,
+            estimate.horizontal_level + arm * min(level, 2.0),
+            level,
+        )
 
     def no_pose_error(self) -> NoPoseError:
         """Return the error that explains why there is no pose in the world."""
@@ -407,6 +415,7 @@ class PlatformView(NamedTuple):
 
 
 _ZERO = np.zeros((6, 6))
+_NO_LEVELS: Final = (NAN, NAN, NAN, NAN)
 _CLOCK_STEPPED: Final = Invalid.CLOCK_STEPPED.value
 ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
 """Reasons against a pose in Odom, which needs no fix and no origin."""

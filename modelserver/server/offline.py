@@ -31,14 +31,16 @@ from modelserver.wire.eventlog import LogEvent
 
 CSV_HEADER: Final = (
     "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
-    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg,"
+    "horizontal_level,heading_level,limit_risk"
 )
 
 _NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
 _NO_BOUNDS: Final = (NAN, NAN)
 _NO_SIGMAS: Final = (NAN, NAN, NAN, NAN)
 _NO_PLACE: Final = (NAN, NAN, NAN)
-_UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f,%.5f"
+_NO_LEVELS: Final = (NAN, NAN, NAN)
+_UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f,%.5f,%.4f,%.6f,%.3g"
 """Format of the last columns: to 0.1 mm, a microradian, a nanodegree."""
 
 
@@ -49,7 +51,8 @@ class TrackRow:
     `rotation` maps from the frame to grid east, grid north, up (w, x, y, z). `invalid` are the reason bits. `bounds`
     are the protection levels, horizontal (m) and heading (rad), of the base frame only; `sigmas` the standard
     deviations along east, north, up (m) and of the yaw (rad); `place` is latitude, longitude and true
-    heading, degrees. nan = not known.
+    heading, degrees. `levels` are those of an instant, m and rad, of the base frame only, and the probability of an
+    error beyond a limit. nan = not known.
     """
 
     utime: int
@@ -62,6 +65,7 @@ class TrackRow:
     bounds: tuple[float, float] = _NO_BOUNDS
     sigmas: tuple[float, float, float, float] = _NO_SIGMAS
     place: tuple[float, float, float] = _NO_PLACE
+    levels: tuple[float, float, float] = _NO_LEVELS
 
     def to_csv(self) -> str:
         """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian.
@@ -70,7 +74,7 @@ class TrackRow:
         """
         quaternion = ",".join(f"{value:.9f}" for value in self.rotation)
         place = f"{self.easting:.5f},{self.northing:.5f},{self.up:.5f}"
-        uncertainty = (_UNCERTAINTY % (*self.bounds, *self.sigmas, *self.place)).replace("nan", "")
+        uncertainty = (_UNCERTAINTY % (*self.bounds, *self.sigmas, *self.place, *self.levels)).replace("nan", "")
         return f"{self.utime},{place},{quaternion},{int(self.valid)},{self.invalid},{uncertainty}"
 
 
@@ -193,6 +197,7 @@ class OfflineRun:
             (answer.horizontal_protection_level, answer.heading_protection_level),
             sigmas,
             _NO_PLACE if geodetic is None else (geodetic.latitude_deg, geodetic.longitude_deg, geodetic.heading_deg),
+            (answer.horizontal_level, answer.heading_level, answer.limit_risk),
         )
 
 

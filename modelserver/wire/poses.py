@@ -33,7 +33,7 @@ _MATRIX = struct.Struct(">16d")
 _STATE_VECTOR = struct.Struct(">7d")
 _NUMBERS = struct.Struct(">36d")
 # initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
-_REST = struct.Struct(">3dbbqibiiddd")
+_REST = struct.Struct(">3dbbqibii6d")
 # all of these in one: of the covariance only the first number, nan where there is none
 _TRANSFORM = struct.Struct(">16dd280x3dbbqibiiddd")
 _VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
@@ -121,7 +121,7 @@ def skip_pose_vector(data: bytes, at: int) -> int:
 
 
 def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
-    transformation, origin, quality, horizontal_protection_level, heading_protection_level, seconds_to_limit = answer
+    transformation, origin, quality, *bounds = answer
     covariance = transformation.covariance_numbers
     invalid = transformation.invalid_reasons
     place = NO_PLACE if origin is None else (origin.easting, origin.northing, origin.height, origin.zone, origin.north)
@@ -138,9 +138,7 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
             not invalid,
             invalid,
             quality,
-            horizontal_protection_level,
-            heading_protection_level,
-            seconds_to_limit,
+            *bounds,
         ),
         pack_text(transformation.model_revision),
     )

@@ -280,7 +280,10 @@ class FilterLocalizer(NamedTuple):
         head = self.head
         used_utime = head.gnss.used_utime if isinstance(head, Aligned) else 0
         distance = head.alignment.estimate_distance(self.setup.settings) if isinstance(head, Unaligned) else math.nan
-        return LocalizerSummary(self.mode, head.phase, head.is_stationary, used_utime, self._find_unusable(), distance)
+        limits = output.get_limits(self.setup, head) if isinstance(head, Aligned) else (math.nan, math.nan)
+        return LocalizerSummary(
+            self.mode, head.phase, head.is_stationary, used_utime, self._find_unusable(), distance, *limits
+        )
 
     def _find_unusable(self) -> tuple[SensorFinding, ...]:
         """Return the configured sensors that cannot be used now: by their configuration, or by what they measure."""

@@ -79,13 +79,19 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
     P[5, 5] += latency_estimator.compute_heading_variance(nav, setup.layout)
     monitor = state.consistency
+    horizontal_limit, heading_limit = get_limits(setup, state)
+    sigma = math.sqrt(protection_levels.compute_longest_variance(P) + settings.lever_arm_sigma**2)
+    heading_sigma = math.sqrt(float(P[5, 5]) + protection_levels.HEADING_FLOOR**2)
+    allowance = gnss.outlier_allowance + abs(monitor.lever_arm)
+    levels = protection_levels.compute_level(sigma, allowance, heading_sigma)
+    risk = protection_levels.compute_limit_risk(sigma, allowance, heading_sigma, horizontal_limit, heading_limit)
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
     horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
     heading = monitor.bound_heading(heading, utime)
-    if heading > _get_heading_limit(setup, state):
+    if heading > heading_limit:
         invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, PROTECTION_LEVEL_EXCEEDED
-    if horizontal > _get_horizontal_limit(setup, state):
+    if horizontal > horizontal_limit:
         invalid |= 256  # PROTECTION_LEVEL_EXCEEDED
         if gnss.num_rejected:
             invalid |= 128  # GPS_REJECTED
@@ -111,6 +117,9 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         heading,
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
         compute_motion(setup, predicted, nav, velocity),
+        horizontal_level=levels[0],
+        heading_level=levels[1],
+        limit_risk=risk,
     )
 
 
@@ -161,18 +170,15 @@ def _base_buffer(n: int) -> eskf.MatrixBuffer:
     return eskf.MatrixBuffer(J, places)
 
 
-def _get_heading_limit(setup: Setup, state: Aligned) -> float:
-    """Return the heading protection level of the least valid pose, rad: configured, or by whether wheels measure."""
-    limit = setup.settings.heading_limit
-    if limit is not None:
-        return limit
-    return HEADING_LIMIT if state.common.measures_wheel_speed(state.nav.utime) else HEADING_LIMIT_WITHOUT_WHEELS
-
-
-def _get_horizontal_limit(setup: Setup, state: Aligned) -> float:
-    """Return the horizontal protection level of the least valid pose, m: configured, or by the receiver's class."""
-    limit = setup.settings.horizontal_limit
-    return state.common.receiver.horizontal_limit if limit is None else limit
+def get_limits(setup: Setup, state: Aligned) -> tuple[float, float]:
+    """Return the limits of the errors, m and rad: configured, or by the receiver's class and whether wheels measure."""
+    horizontal, heading = setup.settings.horizontal_limit, setup.settings.heading_limit
+    if horizontal is None:
+        horizontal = state.common.receiver.horizontal_limit
+    if heading is None:
+        is_measured = state.common.measures_wheel_speed(state.nav.utime)
+        heading = HEADING_LIMIT if is_measured else HEADING_LIMIT_WITHOUT_WHEELS
+    return horizontal, heading
 
 
 def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime: int) -> float:
@@ -188,7 +194,7 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
     left = max(left, 0.0)
     k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     monitor = state.consistency
-    limit = _get_horizontal_limit(setup, state) - state.gnss.outlier_allowance
+    limit = get_limits(setup, state)[0] - state.gnss.outlier_allowance
     limit -= abs(monitor.lever_arm) + monitor.horizontal_allowance
     C = nav.covariance
     p = protection_levels.compute_longest_variance(C) + settings.lever_arm_sigma**2

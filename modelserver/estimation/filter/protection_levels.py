@@ -1,8 +1,9 @@
-"""Protection levels (integrity): bounds of the horizontal and heading error at the configured risk per hour.
+"""Levels of the horizontal and heading error: at an instant, and protection levels at the configured risk per hour.
 
 Errors are correlated over `gps_correlation_time`, so an hour has 3600 / that time independent ones, each with its share
 of the risk. Horizontal: the radius of a circular normal error is Rayleigh distributed, P(r > k s) = exp(-k^2 / 2), with
-s the longest axis of the error ellipse. Heading: both sides of a normal distribution.
+s the longest axis of the error ellipse. Heading: both sides of a normal distribution. The level of an instant is that
+of the probability LEVEL_RISK, and the risk of a limit the probability that the error is beyond it now (integrity).
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ from modelserver.transforms.so3 import Array
 
 HEADING_FLOOR: Final = 0.01
 """Sigma of the heading, rad, outside the filter: mounts and the rolling frame are good to half a degree."""
+
+
+LEAST_SIGMA: Final = 1e-9
+"""A standard deviation that is as good as none, m or rad."""
+
+LEVEL_RISK: Final = 1e-4
+"""Probability that an error exceeds its level at an instant."""
 
 
 @lru_cache(maxsize=16)
@@ -54,6 +62,24 @@ def compute_heading(variance: float, settings: FilterSettings) -> float:
     """Return the heading protection level, rad, at most pi."""
     _, k = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     return min(k * math.sqrt(variance + HEADING_FLOOR**2), math.pi)
+
+
+def compute_level(sigma: float, allowance: float, heading_sigma: float) -> tuple[float, float]:
+    """Return the levels at an instant, m and rad: of standard deviations, plus the allowance for one outlier, m."""
+    horizontal, heading = compute_factors(LEVEL_RISK)
+    return horizontal * sigma + allowance, min(heading * heading_sigma, math.pi)
+
+
+def compute_limit_risk(
+    sigma: float, allowance: float, heading_sigma: float, horizontal_limit: float, heading_limit: float
+) -> float:
+    """Return the probability that the position or the heading error is beyond its limit, at most 1.
+
+    Arguments as for `compute_level`, with the limits in m and rad.
+    """
+    left = max(horizontal_limit - allowance, 0.0)
+    horizontal = math.exp(-0.5 * (left / max(sigma, LEAST_SIGMA)) ** 2)
+    return min(horizontal + math.erfc(heading_limit / (math.sqrt(2.0) * max(heading_sigma, LEAST_SIGMA))), 1.0)
 
 
 def invert_heading(level: float, settings: FilterSettings) -> float:

@@ -122,7 +122,14 @@ class RawLocalizer(RawState):
         """Return whether the vehicle is stationary, and when a fix was last used."""
         anchor = self.fixes.anchor
         is_stationary = self.quiet.is_stationary(utime, self.settings)
-        return LocalizerSummary(Mode.RAW, None, is_stationary, 0 if anchor is None else anchor.utime)
+        return LocalizerSummary(
+            Mode.RAW,
+            None,
+            is_stationary,
+            0 if anchor is None else anchor.utime,
+            horizontal_limit=self.settings.horizontal_limit,
+            heading_limit=self.settings.heading_limit,
+        )
 
     # --- IMU ------------------------------------------------------------------------------------------------
 

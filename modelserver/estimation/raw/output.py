@@ -15,7 +15,12 @@ from dataclasses import replace
 from typing import Final
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
-from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
+from modelserver.estimation.filter.protection_levels import (
+    compute_factors,
+    compute_level,
+    compute_limit_risk,
+    compute_longest_axis,
+)
 from modelserver.estimation.fix_quality import AcceptedFix
 from modelserver.estimation.origin import OriginProjection
 from modelserver.estimation.raw.heading import UNKNOWN_VARIANCE
@@ -72,6 +77,9 @@ def estimate(state: RawState, utime: int) -> Estimate:
         invalid |= Invalid.STATIONARY_HEADING if is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
     if horizontal > settings.horizontal_limit:
         invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
+    sigma, heading_sigma = math.sqrt(variance), math.sqrt(heading_variance)
+    levels = compute_level(sigma, 0.0, heading_sigma)
+    limits = (settings.horizontal_limit, settings.heading_limit)
     enu = utm = None
     if state.projection is not None and state.fixes.work is not None:
         is_far = abs(position - anchor.position) > CONVERGENCE_RANGE
@@ -90,6 +98,9 @@ def estimate(state: RawState, utime: int) -> Estimate:
         horizontal_protection_level=horizontal,
         heading_protection_level=heading_level,
         seconds_to_limit=NAN if invalid else max(remaining, 0.0),
+        horizontal_level=levels[0],
+        heading_level=levels[1],
+        limit_risk=compute_limit_risk(sigma, 0.0, heading_sigma, *limits),
     )
 
 

@@ -155,6 +155,21 @@ def test_given_a_singular_covariance_then_the_nis_is_infinite():
     assert eskf.normalized_innovation_squared(np.array((1.0,)), np.zeros((1, 1))) == math.inf
 
 
+def test_given_sigmas_then_levels_and_the_risk_of_a_limit_are_those_of_drawn_errors():
+    draws = np.random.default_rng(1).normal(size=(1_000_000, 3))
+    radius, heading = 2.0 * np.hypot(draws[:, 0], draws[:, 1]), 0.1 * np.abs(draws[:, 2])
+    level, heading_level = protection_levels.compute_level(2.0, 0.5, 0.1)
+    # beside the allowance
+    assert np.mean(radius > level - 0.5) == pytest.approx(1e-4, rel=0.3)
+    assert np.mean(heading > heading_level) == pytest.approx(1e-4, rel=0.3)
+    risk = protection_levels.compute_limit_risk(2.0, 0.5, 0.1, 6.5, 0.25)
+    assert risk == pytest.approx(np.mean(radius > 6.0) + np.mean(heading > 0.25), rel=0.05)
+    assert protection_levels.compute_limit_risk(2.0, 7.0, 0.1, 6.5, 0.25) == 1.0
+    assert protection_levels.compute_limit_risk(0.0, 0.0, 0.0, 1.0, 0.1) == 0.0
+    assert protection_levels.compute_limit_risk(math.inf, 0.0, math.inf, 1.0, 0.1) == 1.0
+    assert protection_levels.compute_level(1.0, 0.0, math.inf)[1] == math.pi
+
+
 def test_given_a_risk_per_hour_then_the_protection_levels_are_its_quantiles():
     horizontal, heading = protection_levels.get_factors(1e-5, 60.0)
     risk = 1e-5 * 60.0 / 3600.0

@@ -209,14 +209,15 @@ def test_given_no_callback_for_decisions_when_replayed_then_the_rows_are_the_sam
 
 def test_given_a_row_when_written_then_tenths_of_a_millimeter_survive() -> None:
     bounds, sigmas, place = (2.34567, 0.1234567), (0.12345, 0.23456, 0.34567, 0.0123456), (42.37, -71.1234567891, 39.7)
+    levels = (1.23456, 0.0123456, 1.234e-9)
     row = TrackRow(
-        T0, 323204.28072018, 4693737.10237474, -21.00005, (0.5, -0.5, 0.5, -0.5), True, 0, bounds, sigmas, place
+        T0, 323204.28072018, 4693737.10237474, -21.00005, (0.5, -0.5, 0.5, -0.5), True, 0, bounds, sigmas, place, levels
     )
     assert row.to_csv() == (
         "1700000000000000,323204.28072,4693737.10237,-21.00005,0.500000000,-0.500000000,0.500000000,-0.500000000,1,0,"
-        "2.3457,0.123457,0.1235,0.2346,0.3457,0.012346,42.370000000,-71.123456789,39.70000"
+        "2.3457,0.123457,0.1235,0.2346,0.3457,0.012346,42.370000000,-71.123456789,39.70000,1.2346,0.012346,1.23e-09"
     )
-    assert TrackRow(T0, invalid=3).to_csv() == "1700000000000000,nan,nan,nan,nan,nan,nan,nan,0,3,,,,,,,,,"
+    assert TrackRow(T0, invalid=3).to_csv() == "1700000000000000,nan,nan,nan,nan,nan,nan,nan,0,3,,,,,,,,,,,,"
     assert row.to_csv().count(",") == CSV_HEADER.count(",")
 
 

@@ -134,6 +134,7 @@ def test_given_json_then_every_field_is_there_and_what_is_not_known_is_null(run:
         "frame_of_interest", "frame_of_reference", "utime", "position", "quaternion", "rpy", "matrix", "covariance",
         "valid", "invalid_reasons", "flags", "initial_utm", "utm_zone", "origin_id", "pose_epoch",
         "horizontal_protection_level", "heading_protection_level", "model_revision", "geodetic",
+        "horizontal_level", "heading_level", "limit_risk",
     }  # fmt: skip
     assert found["covariance"] is found["initial_utm"] is found["horizontal_protection_level"] is None
     assert (found["valid"], found["invalid_reasons"], found["flags"], found["utime"]) == (True, [], [], 0)

@@ -35,7 +35,8 @@ pytestmark = pytest.mark.slow
 
 HEADER = (
     "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons,"
-    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg"
+    "horizontal_bound,heading_bound,sigma_east,sigma_north,sigma_up,sigma_yaw,latitude_deg,longitude_deg,heading_deg,"
+    "horizontal_level,heading_level,limit_risk"
 )
 
 SHORT_S = 15.0

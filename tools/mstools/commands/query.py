@@ -295,6 +295,10 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
                 compass = "" if math.isnan(magnetic) else f",  compass {magnetic:.2f} deg"
                 lines.append(f"  heading         {heading:.2f} deg from true north{compass}")
         lines.append(f"  epoch           {transformation.pose_epoch}, origin {origin.origin_id:016x}")
+    if not math.isnan(answer.horizontal_level):
+        heading = math.degrees(answer.heading_level)
+        risk = f"; beyond the limit: {answer.limit_risk:.1e}" if not math.isnan(answer.limit_risk) else ""
+        lines.append(f"  level           {answer.horizontal_level:.2f} m, heading {heading:.2f} deg (1e-4){risk}")
     if not math.isnan(answer.horizontal_protection_level):
         heading = math.degrees(answer.heading_protection_level)
         lines.append(f"  protection      {answer.horizontal_protection_level:.2f} m, heading {heading:.2f} deg")
@@ -330,5 +334,8 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "pose_epoch": transformation.pose_epoch,
         "horizontal_protection_level": to_json(answer.horizontal_protection_level),
         "heading_protection_level": to_json(answer.heading_protection_level),
+        "horizontal_level": to_json(answer.horizontal_level),
+        "heading_level": to_json(answer.heading_level),
+        "limit_risk": to_json(answer.limit_risk),
         "model_revision": transformation.model_revision,
     }

@@ -63,7 +63,7 @@ class StateSample:
     yaw : of the rolling frame from grid east
     velocity : of the rolling frame, true east and north, m/s
     sigma, yaw_sigma : longest axis of the horizontal position, m, and heading
-    horizontal_protection_level, heading_protection_level : of the pose
+    horizontal_protection_level, heading_protection_level, horizontal_level, heading_level : of the pose
     speed, lateral_speed, yaw_rate : forward and to the left, m/s; rad/s
     values, sigmas : the filter's states by name
     """
@@ -77,6 +77,8 @@ class StateSample:
     yaw_sigma: float = math.nan
     horizontal_protection_level: float = math.nan
     heading_protection_level: float = math.nan
+    horizontal_level: float = math.nan
+    heading_level: float = math.nan
     speed: float = math.nan
     lateral_speed: float = math.nan
     yaw_rate: float = math.nan
@@ -346,6 +348,8 @@ class ReplayCollector:
             epoch=estimate.pose_epoch,
             horizontal_protection_level=estimate.horizontal_protection_level,
             heading_protection_level=estimate.heading_protection_level,
+            horizontal_level=estimate.horizontal_level,
+            heading_level=estimate.heading_level,
             **known,
         )
 

@@ -310,21 +310,25 @@ def _render_motion(data: ReplayData) -> str:
     ):
         axis = Axis(unit, *value_range(values, min_width=width))
         drawn.append(Panel(title, axis, [level("", x, 0.0), Series("", t, values)], height))
-    for title, unit, convert, sigma, bound in (
-        ("Horizontal position", "m", float, "sigma", "horizontal_protection_level"),
-        ("Heading", "deg", math.degrees, "yaw_sigma", "heading_protection_level"),
+    for title, unit, convert, sigma, what in (
+        ("Horizontal position", "m", float, "sigma", "horizontal"),
+        ("Heading", "deg", math.degrees, "yaw_sigma", "heading"),
     ):
         lines = [
             Series(words, t, [convert(getattr(each, field)) for each in states], color)
-            for words, field, color in (("sigma", sigma, charts.BLUE), ("protection level", bound, charts.ORANGE))
+            for words, field, color in (
+                ("sigma", sigma, charts.BLUE),
+                ("level (1e-4)", f"{what}_level", charts.GREEN),
+                ("protection level", f"{what}_protection_level", charts.ORANGE),
+            )
         ]
-        axis = decade_axis(unit, [*lines[0].y, *lines[1].y])
+        axis = decade_axis(unit, [value for line in lines for value in line.y])
         drawn.append(Panel(f"{title}: uncertainty", axis, lines, 110.0))
     chart = charts.render_panels("Heading, speed and uncertainty", x, drawn, _epochs(data))
     return _render_figure(
         chart,
-        "Heading is clockwise from grid north. Below: one sigma, and the protection level at the integrity risk "
-        "localization.filter.risk_per_hour.",
+        "Heading is clockwise from grid north. Below: one sigma, the level exceeded with a probability of 1e-4 at an "
+        "instant, and the protection level at the integrity risk localization.filter.risk_per_hour.",
     )
 
 
