@@ -125,13 +125,17 @@ def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
     base, antenna = rows(base_poses)[-1], rows(out)[-1]
     assert base[0] == antenna[0]
     # the protection levels are those of the base frame
-    horizontal, heading, east, north, up, yaw, latitude, longitude, ahead = base[10:]
+    horizontal, heading, east, north, up, yaw, latitude, longitude, ahead, *levels, risk = base[10:]
     assert horizontal > 3.0 * max(east, north) > 0.0
     assert heading > 3.0 * yaw > 0.0
     assert up > 0.0
+    # and so are the levels of an instant, which are exceeded more often
+    assert 3.0 * max(east, north) < levels[0] < horizontal
+    assert 3.0 * yaw < levels[1] < heading
+    assert 0.0 <= risk < 0.01
     there = origin_at(latitude, longitude, base[3])
     assert (there.easting, there.northing) == pytest.approx((base[1], base[2]), abs=1e-3)
-    assert [math.isnan(value) for value in antenna[10:]] == [True] * 2 + [False] * 7
+    assert [math.isnan(value) for value in antenna[10:]] == [True] * 2 + [False] * 7 + [True] * 3
     assert ahead == pytest.approx(88.6, abs=1.5)  # grid east, which points 1.4 degrees north of true east there
     assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
