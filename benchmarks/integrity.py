@@ -1,12 +1,13 @@
-"""Integrity of the filter: seconds wrong and valid, per fault, over drives with errors that it does not model.
+"""Integrity of the filter: time valid and misleading, per fault, over drives with errors that it does not model.
 
     python -m benchmarks integrity
     python -m benchmarks integrity --quick
     python -m benchmarks integrity --faults spoof_02 --vehicles car --seeds 1 --minutes 30 --events
 
-An error beyond the published bound while the pose is valid is wrong; the pose is looked at five times a second, for the
-present. Faults come as events, with healthy stretches between. "Detected" is from the start of an event to the first
-invalid pose; "healed" from the first pose that is wrong or invalid to the first of 5 s of right and valid ones. Drives
+A valid pose with an error beyond its limit is misleading (HMI), here "wrong"; the time with an error beyond the level
+and beyond the protection level is counted whether it is valid or not. The pose is looked at five times a second, for
+the present. Faults come as events, with healthy stretches between. "Detected" is from the start of an event to the
+first invalid pose; "healed" from the first pose that is wrong or invalid to the first of 5 s of right and valid ones. Drives
 and sensors: `integrity_drives`.
 """
 
@@ -362,7 +363,7 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True)
 class Breach:
-    """A time wrong and valid: `what` is horizontal (m) or heading (rad); `error` and `bound` are at the worst ratio.
+    """A time wrong and valid: `what` is horizontal (m) or heading (rad); `error` and `limit` are at the worst ratio.
 
     `begin` in its session, `seconds` wrong; `since_fault`: from the start of the last event, nan before the first.
     """
@@ -375,7 +376,7 @@ class Breach:
     begin: float
     seconds: float
     error: float
-    bound: float
+    limit: float
     since_fault: float
 
 
@@ -392,8 +393,9 @@ class EventResult:
 
 @dataclass
 class Result:
-    """Result of a task. `ratio`: worst error over bound while valid; `moved` (m) and `turned` (rad) while parked.
+    """Result of a task. `ratio`: worst error over limit while valid; `moved` (m) and `turned` (rad) while parked.
 
+    `beyond_level` and `beyond_protection` are the seconds with an error beyond the level and the protection level.
     `reasons` has the seconds that the pose was not valid, by reason, `findings` how often each finding was seen, and
     `epochs` the number of new epochs.
     """
@@ -403,7 +405,9 @@ class Result:
     valid: float = 0.0
     wrong: float = 0.0
     ratio: dict[str, float] = field(default_factory=lambda: {"horizontal": 0.0, "heading": 0.0})
-    median_bound: list[float] = field(default_factory=list)
+    median_level: list[float] = field(default_factory=list)
+    beyond_level: float = 0.0
+    beyond_protection: float = 0.0
     breaches: list[Breach] = field(default_factory=list)
     events: list[EventResult] = field(default_factory=list)
     reasons: dict[str, float] = field(default_factory=dict)
@@ -415,12 +419,16 @@ class Result:
 
 
 class Looks(NamedTuple):
-    """The pose at each look: seconds, validity, errors and bounds (m, rad), the estimated x, y, yaw, the reasons."""
+    """The pose at each look: seconds, validity, errors, limits, levels and protection levels (m, rad), the estimated
+    x, y, yaw, the reasons.
+    """
 
     t: Array
     valid: Mask
     errors: dict[str, Array]
-    bounds: dict[str, Array]
+    limits: dict[str, Array]
+    levels: dict[str, Array]
+    protection: dict[str, Array]
     pose: Array
     reasons: list[Invalid]
     findings: list[str]
@@ -469,11 +477,16 @@ def observe(scenario: Scenario) -> Looks:
             if math.fmod(look, FINDINGS_PERIOD) < LOOK_PERIOD:
                 findings += [f"{each.sensor}:{each.reason}" for each in localizer.summary(utime).findings]
             if estimate.enu is None:
-                rows.append((look, 0.0, math.nan, math.nan, math.nan, math.nan, math.nan))
+                rows.append((look, 0.0, *(math.nan,) * 9))
             else:
                 x, y, _ = estimate.enu.xyz
                 yaw = estimate.enu.rpy[2]
-                bounds = (estimate.horizontal_protection_level, estimate.heading_protection_level)
+                summary = localizer.summary(utime)
+                bounds = (
+                    *(summary.horizontal_limit, summary.heading_limit),
+                    *(estimate.horizontal_level, estimate.heading_level),
+                    *(estimate.horizontal_protection_level, estimate.heading_protection_level),
+                )
                 rows.append((look, float(not estimate.invalid), x, y, yaw, *bounds))
             look = round(look + LOOK_PERIOD, 6)
         localizer, _ = localizer.process(sample)
@@ -486,6 +499,8 @@ def observe(scenario: Scenario) -> Looks:
         table[:, 1] > 0.5,
         {"horizontal": np.hypot(*apart.T), "heading": np.abs(turned)},
         {"horizontal": table[:, 5], "heading": table[:, 6]},
+        {"horizontal": table[:, 7], "heading": table[:, 8]},
+        {"horizontal": table[:, 9], "heading": table[:, 10]},
         table[:, 2:5],
         reasons,
         findings,
@@ -505,11 +520,13 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
     result.epochs += looks.epochs
     starts = np.array([begin for begin, _ in scenario.events])
     wrong_any = np.zeros(len(looks.t), bool)
+    beyond = np.zeros((2, len(looks.t)), bool)
     for what, error in looks.errors.items():
-        bound = looks.bounds[what]
-        wrong = looks.valid & ~(error <= bound)
+        limit = looks.limits[what]
+        wrong = looks.valid & ~(error <= limit)
         wrong_any |= wrong
-        ratio = np.where(looks.valid, error / bound, 0.0)
+        beyond |= np.stack((error > looks.levels[what], error > looks.protection[what]))
+        ratio = np.where(looks.valid, error / limit, 0.0)
         result.ratio[what] = max(result.ratio[what], float(ratio.max()))
         for first, last in _merge(_find_runs(wrong)):
             worst = first + int(np.argmax(ratio[first:last]))
@@ -525,13 +542,15 @@ def _evaluate(result: Result, session: int, scenario: Scenario, looks: Looks) ->
                     float(looks.t[first]),
                     float(wrong[first:last].sum()) * LOOK_PERIOD,
                     float(error[worst]),
-                    float(bound[worst]),
+                    float(limit[worst]),
                     since,
                 )
             )
     result.wrong += float(wrong_any.sum()) * LOOK_PERIOD
     if looks.valid.any():
-        result.median_bound.append(float(np.median(looks.bounds["horizontal"][looks.valid])))
+        result.median_level.append(float(np.median(looks.levels["horizontal"][looks.valid])))
+    for name, count in zip(("beyond_level", "beyond_protection"), beyond.sum(axis=1), strict=True):
+        setattr(result, name, getattr(result, name) + float(count) * LOOK_PERIOD)
     for k, begin in enumerate(starts.tolist()):
         end = starts[k + 1] if k + 1 < len(starts) else looks.t[-1] + 1.0
         result.events.append(_evaluate_event(session, looks, wrong_any, begin, end))
@@ -608,7 +627,9 @@ class Summary(NamedTuple):
     worst_error: float
     worst_heading_deg: float
     valid: float
-    bound: float
+    level: float
+    beyond_level: float
+    beyond_protection: float
     detected: float
     healed: float
     healed_worst: float
@@ -642,7 +663,7 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
             (turned, r.turned),
         )
     )
-    bounds = [bound for each in results for bound in each.median_bound]
+    levels = [level for each in results for level in each.median_level]
     return Summary(
         fault.name,
         hours,
@@ -656,7 +677,9 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
         max((breach.error for breach in breaches if breach.what == "horizontal"), default=0.0),
         math.degrees(max((breach.error for breach in breaches if breach.what == "heading"), default=0.0)),
         valid,
-        float(np.median(bounds)) if bounds else math.nan,
+        float(np.median(levels)) if levels else math.nan,
+        sum(each.beyond_level for each in results) / (hours * 3600.0),
+        sum(each.beyond_protection for each in results) / (hours * 3600.0),
         float(np.median(detected)) if detected else math.nan,
         float(np.median([x for x in healed if not math.isnan(x)] or [math.nan])),
         healed_worst,
@@ -668,12 +691,14 @@ def summarize(fault: Fault, results: list[Result]) -> Summary:
 
 HEADER: Final = (
     f"  {'fault':24}{'hours':>6}{'s/h':>8}{'longest':>8}{'event':>8}{'of events':>10}"
-    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'bound':>7}{'detected':>9}{'healed':>7}{'worst':>7}"
+    f"{'x hor':>7}{'x head':>7}{'m':>7}{'deg':>6}{'valid':>7}{'level':>7}{'> lev':>8}{'> prot':>8}"
+    f"{'detected':>9}{'healed':>7}{'worst':>7}"
     "  before -> required"
 )
 LEGEND: Final = (
     "  s/h: seconds wrong and valid per hour. longest: interval, event: sum of the worst event, of events: with any.\n"
-    "  x: worst error / bound while valid, horizontal and heading. m, deg: worst error while wrong. bound: median, m.\n"
+    "  x: worst error / limit while valid, horizontal and heading. m, deg: worst error while wrong. level: median, m.\n"
+    "  > lev, > prot: share of time with an error beyond the level (1e-4) and the protection level.\n"
     "  detected: median seconds to the first invalid pose. healed, worst: median and longest wrong or invalid, s."
 )
 
@@ -689,7 +714,8 @@ def format_summary(summary: Summary) -> str:
     row = (
         f"  {fault.name:24}{summary.hours:6.2f}{summary.wrong_per_hour:8.1f}{summary.longest:8.1f}"
         f"{summary.worst_event:8.1f}{events:>10}{summary.ratio_horizontal:7.2f}{summary.ratio_heading:7.2f}"
-        f"{summary.worst_error:7.1f}{summary.worst_heading_deg:6.1f}{summary.valid:7.1%}{number(summary.bound):>7}"
+        f"{summary.worst_error:7.1f}{summary.worst_heading_deg:6.1f}{summary.valid:7.1%}{number(summary.level):>7}"
+        f"{summary.beyond_level:8.2%}{summary.beyond_protection:8.2%}"
         f"{number(summary.detected):>9}{number(summary.healed):>7}{number(summary.healed_worst):>7}"
         f"  {fault.before or '-'} -> {fault.required.text}"
     )
@@ -707,8 +733,8 @@ def format_breach(breach: Breach) -> str:
     )
     return (
         f"    {breach.vehicle} seed {breach.seed} session {breach.session} at {breach.begin:.1f} s for "
-        f"{breach.seconds:.1f} s: {breach.what} {breach.error * factor:.2f} {unit}, bound "
-        f"{breach.bound * factor:.2f} {unit}, {since}"
+        f"{breach.seconds:.1f} s: {breach.what} {breach.error * factor:.2f} {unit}, limit "
+        f"{breach.limit * factor:.2f} {unit}, {since}"
     )
 
 

@@ -37,8 +37,8 @@ class pose_transform_t(object):
     """ The last inertial sample is too old. """
     GPS_REJECTED = 128
     """ Fixes arrive but are rejected by the gates. """
-    PROTECTION_LEVEL_EXCEEDED = 256
-    """ A protection level exceeds the configured limit (alert limit). """
+    LIMIT_EXCEEDED = 256
+    """ The error is beyond a configured limit with a probability of more than 0.01. """
     CLOCK_STEPPED = 512
     """ The clock stepped; localization restarts at the new time. """
     TILTED = 1024

@@ -228,7 +228,7 @@ def _extrapolate(last: Estimate, utime: int, dt: float, is_stale: bool) -> Estim
     invalid = Invalid.STALE_GPS | Invalid.STALE_IMU if is_stale else VALID
     left = last.seconds_to_limit - dt
     if left <= 0.0:
-        invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
+        invalid |= Invalid.LIMIT_EXCEEDED
     return replace(
         last,
         utime=utime,

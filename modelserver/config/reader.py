@@ -52,7 +52,6 @@ RENAMED_KEYS: Final[Mapping[str, str]] = {
     "localization.filter.restless_time": "gps_inflation_time",
     "localization.filter.restless_limit": "gps_inflation_limit",
     "localization.filter.follow_speed": "position_slew_rate",
-    "localization.filter.conflict_time": "rejection_timeout",
     "localization.raw.fix_error_time": "fix_correlation_time",
     "localization.raw.course_refusals": "course_rejections",
     "localization.raw.refusals": "fix_rejections",

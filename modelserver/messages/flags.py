@@ -19,7 +19,7 @@ class Invalid(IntFlag):
     STALE_GPS = 32
     STALE_IMU = 64
     GPS_REJECTED = 128
-    PROTECTION_LEVEL_EXCEEDED = 256
+    LIMIT_EXCEEDED = 256
     CLOCK_STEPPED = 512
     TILTED = 1024
     STALE_JOINT = 2048
@@ -41,7 +41,7 @@ _INVALID_TEXT = {
     Invalid.STALE_GPS: "the last usable GPS fix is too old",
     Invalid.STALE_IMU: "the last inertial sample is too old",
     Invalid.GPS_REJECTED: "GPS fixes arrive but are rejected",
-    Invalid.PROTECTION_LEVEL_EXCEEDED: "a protection level exceeds the configured limit",
+    Invalid.LIMIT_EXCEEDED: "the error may be beyond the limit: that is more probable than 0.01",
     Invalid.CLOCK_STEPPED: "the clock stepped, localization restarts at the new time",
     Invalid.TILTED: "gravity indicates a vehicle on its side: check the mount of the IMU in the geometry",
     Invalid.STALE_JOINT: "a joint on the path was silent around that time",

@@ -130,7 +130,7 @@ def test_on_a_steady_circle_with_an_unknown_latency_the_bound_covers_the_heading
     fault.inject(scenario)
     looks = integrity.observe(scenario)
     assert looks.valid.mean() > 0.7
-    error, bound = looks.errors["heading"][looks.valid], looks.bounds["heading"][looks.valid]
+    error, bound = looks.errors["heading"][looks.valid], looks.protection["heading"][looks.valid]
     assert np.all(error < bound)
     assert error.max() < 0.4
 
@@ -153,12 +153,12 @@ def test_a_silent_imu_makes_the_pose_neither_wrong_nor_invalid_for_long() -> Non
     scenario.silent = [(180.0, 183.0), (240.0, 243.0)]
     looks = integrity.observe(scenario)
     for key in ("horizontal", "heading"):
-        assert np.all(looks.errors[key][looks.valid] < looks.bounds[key][looks.valid])
+        assert np.all(looks.errors[key][looks.valid] < looks.protection[key][looks.valid])
     late = looks.valid[(looks.t > 215.0) & (looks.t < 240.0) | (looks.t > 275.0)]
     assert late.mean() > 0.9
 
 
-def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
+def test_an_error_beyond_the_limit_while_valid_is_wrong_and_one_beyond_a_level_is_counted() -> None:
     scenario = create_scenario("rover", 60.0)
     scenario.events = [(20.0, 30.0)]
     t = np.arange(1, 251) * integrity.LOOK_PERIOD
@@ -170,6 +170,8 @@ def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
         valid,
         {"horizontal": errors, "heading": 0.1 * ones},
         {"horizontal": ones, "heading": 0.2 * ones},
+        {"horizontal": 2.0 * ones, "heading": 0.2 * ones},
+        {"horizontal": 4.0 * ones, "heading": 0.2 * ones},
         np.stack((zeros, zeros, zeros), axis=1),
         [integrity.Invalid(0 if each else 256) for each in valid],
         [],
@@ -179,8 +181,9 @@ def test_an_error_beyond_the_bound_while_valid_is_wrong() -> None:
     integrity._evaluate(result, 0, scenario, looks)
     assert result.wrong == pytest.approx(2.0, abs=0.21)
     (breach,) = result.breaches
-    assert (breach.what, breach.error, breach.bound) == ("horizontal", 3.0, 1.0)
+    assert (breach.what, breach.error, breach.limit) == ("horizontal", 3.0, 1.0)
     assert breach.since_fault == pytest.approx(2.0, abs=0.21)
+    assert (result.beyond_level, result.beyond_protection) == (pytest.approx(3.0, abs=0.21), 0.0)
     (event,) = result.events
     assert event.detected == pytest.approx(4.0, abs=0.21)
     assert event.healed == pytest.approx(5.0, abs=0.21)

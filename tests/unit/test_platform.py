@@ -213,7 +213,7 @@ def test_given_a_surveyed_mount_then_its_sigmas_add_to_the_vehicles() -> None:
     [
         (Invalid.NO_FIX | Invalid.NO_ORIGIN, Invalid(0)),
         (Invalid.STALE_GPS | Invalid.GPS_REJECTED, Invalid(0)),
-        (Invalid.NOT_MOVED_YET | Invalid.STATIONARY_HEADING | Invalid.PROTECTION_LEVEL_EXCEEDED, Invalid(0)),
+        (Invalid.NOT_MOVED_YET | Invalid.STATIONARY_HEADING | Invalid.LIMIT_EXCEEDED, Invalid(0)),
         (Invalid.STALE_IMU | Invalid.STALE_GPS, Invalid.STALE_IMU),
         (Invalid.CLOCK_STEPPED, Invalid.CLOCK_STEPPED),
     ],

@@ -207,6 +207,8 @@ class ConsistencyMonitor(NamedTuple):
     lever_arm: the antenna beside its place in the geometry, as fixes show it, forward + i left, m.
     suspicion: what was taken for an error of gyro or wheels, or for agreement, and may have been one of the fixes, m.
     velocity_utime: of the last velocity of the receiver that the state has followed.
+    offset: how far the state may be off, m: by what windows leave unexplained; once there is a suspect node, by how far
+        fixes or the state are off the path since then, unless the state is at the path.
     """
 
     utime: int = 0
@@ -243,11 +245,22 @@ class ConsistencyMonitor(NamedTuple):
     lever_arm: complex = 0j
     suspicion: float = 0.0
     velocity_utime: int = 0
+    offset: float = 0.0
 
     @property
     def excludes_fixes(self) -> bool:
         """Whether fixes are not used: they have jumped away from dead reckoning."""
         return self.suspect is not None and self.is_jump
+
+    @property
+    def allowance(self) -> float:
+        """How far the state may be off by what the monitor knows, m, beside its covariance."""
+        return abs(self.lever_arm) + (self.offset if self.suspect is not None else max(self.offset, self.suspicion))
+
+    @property
+    def is_transported(self) -> bool:
+        """Whether the vehicle moves beside its own axis, so that fixes do not show its heading."""
+        return self.suspect is not None and self.cause is Cause.HEADING
 
     @property
     def _excluded(self) -> float:
@@ -262,15 +275,13 @@ class ConsistencyMonitor(NamedTuple):
     def resolve(self, found: Inconsistency, utime: int) -> ConsistencyMonitor:
         """Return the monitor after an inconsistency was found at `utime`: what is corrected begins again."""
         if found.cause not in (Cause.GNSS, Cause.HEADING):
-            # the uncertainty of a latency that was corrected covers what is left
-            cause = None if found.cause in (Cause.LATENCY, Cause.LEVER_ARM) else found.cause
             suspicion = max(self.suspicion, abs(found.discrepancy.error), self._excluded)
             path = self._replace(older=(), newest=(), num_exceeded=0, suspect=None, is_jump=False)
             if found.cause is Cause.GYRO:
                 path = path._replace(hidden=0.0)
             if found.cause is Cause.LEVER_ARM:
                 path = path._replace(lever_arm=self.lever_arm + found.lever_arm)
-            return path._replace(cause=cause, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
+            return path._replace(cause=None, since=utime, suspicion=suspicion, horizontal_allowance=suspicion)
         suspect = found.discrepancy.node
         drifts = found.cause is Cause.GNSS and not found.is_jump
         slowest = abs(found.discrepancy.error) - found.discrepancy.sigma
@@ -386,7 +397,7 @@ class ConsistencyMonitor(NamedTuple):
                 return self
         suspicion = max(self.suspicion, self._excluded)
         path = self._replace(older=(), newest=(), last=None, num_exceeded=0, has_jumped=False, suspicion=suspicion)
-        return path._replace(cause=Cause.GYRO, since=utime, suspect=None, is_jump=False)
+        return path._replace(cause=None, since=utime, suspect=None, is_jump=False)
 
     def correct(self, shift: complex, turn: float) -> ConsistencyMonitor:
         """Return the monitor after a fix moved the state by `shift`, m, and turned it by `turn`, rad: not the path."""
@@ -415,7 +426,9 @@ class ConsistencyMonitor(NamedTuple):
 
     def end_exclusion(self) -> ConsistencyMonitor:
         """Return the monitor after the state was set to fixes that have jumped, and are not trusted."""
-        return self._replace(is_jump=False, horizontal_allowance=self.largest, heading_allowance=math.pi)
+        return self._replace(
+            is_jump=False, horizontal_allowance=self.largest, heading_allowance=math.pi, offset=self.largest
+        )
 
     def append(self, node: PathNode) -> ConsistencyMonitor:
         """Return the monitor with a node more, if the last one is old enough, and the fix no outlier."""
@@ -436,7 +449,7 @@ class ConsistencyMonitor(NamedTuple):
 
     def compare(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> ConsistencyMonitor:
         """Return the monitor after the comparison of a fix with the windows."""
-        worst = latest = horizontal = heading = 0.0
+        worst = latest = horizontal = heading = offset = 0.0
         suspect = None if self.is_jump else self.suspect
         if self.is_jump and self.last is not None:
             more = self._find_stray(node.path) - self._find_stray(self.last.path)
@@ -450,6 +463,9 @@ class ConsistencyMonitor(NamedTuple):
                 found = compare_window(suspect, node, noise, settings)
                 horizontal = _bound_error(found)
                 heading = max(heading, abs(found.turn))
+                # either the fixes are wrong or the path is: the state by as much as it has left the other one
+                stray = abs(node.antenna - suspect.antenna - found.displacement)
+                offset = max(abs(found.error), stray)
         windows = self._compare_windows(node, noise, settings)
         for each in windows:
             if not each.node.is_measured:
@@ -487,6 +503,8 @@ class ConsistencyMonitor(NamedTuple):
                 num_exceeded=self.num_exceeded + 1,
                 has_jumped=self.has_jumped or step > JUMP_SIGMAS,
             )
+        if self.suspect is None:
+            offset = horizontal
         # noise of single fixes comes and goes, what is unexplained does not
         seconds = (node.utime - self.compared_utime) * 1e-6
         driven = node.distance - self.compared_distance
@@ -511,6 +529,7 @@ class ConsistencyMonitor(NamedTuple):
             horizontal_allowance=max(horizontal + suspicion, fade * self.horizontal_allowance),
             heading_allowance=max(min(heading, math.pi), heading_fade * self.heading_allowance),
             hidden=hidden,
+            offset=offset,
         )
 
     def _compare_windows(self, node: PathNode, noise: PathNoise, settings: FilterSettings) -> list[Discrepancy]:

@@ -19,7 +19,7 @@ from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.fusion import correct_path, report_event
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.latency_estimator import compute_heading_variance, is_separate
-from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
+from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LARGEST_CORRELATED, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
 from modelserver.estimation.filter.path_fits import Cause, Inconsistency, fit_drift
@@ -36,12 +36,6 @@ FIT_SHARE: Final = 0.3
 
 EXCLUSION: Final = 1.5
 """Times `recovery_time` for which fixes that have jumped are not used: then the pose follows them, and is not valid."""
-
-LARGEST_CORRELATED: Final = 3.0
-"""Standard deviations of the time-correlated error beyond which a drift was taken for it."""
-
-HEALING_TIME: Final = 5.0
-"""Seconds of agreement after a gyro or the wheels were corrected."""
 
 
 def _create_node(setup: Setup, state: Aligned, newest: PathFix) -> PathNode:
@@ -120,8 +114,6 @@ def compare_path(
             text = "dead reckoning has lasted too long: the pose follows fixes that are not trusted"
             return state, (report_event(state, KIND, Verdict.RESET, text),)
         return state, ()
-    if monitor.cause is not None and (node.utime - monitor.since) * 1e-6 > HEALING_TIME:
-        monitor = monitor._replace(cause=None)
     return state._replace(consistency=monitor), ()
 
 
@@ -135,7 +127,7 @@ def _handle(
     if nav is not state.nav:
         common = common._replace(epoch=common.epoch + 1)
     if found.is_jump:
-        gnss = gnss._replace(rejected=(), rejected_since=gnss.rejected_since or nav.utime)
+        gnss = gnss._replace(rejected=())
     after = after._replace(nav=nav, gnss=gnss, common=common)
     if monitor.excludes_fixes and not after.consistency.excludes_fixes:
         # the path was wrong, and the state has followed it

@@ -111,7 +111,6 @@ class GnssMonitor(NamedTuple):
     used_utime: the last fix that was used or confirmed.
     num_confirmed: fixes that were used.
     rejected: fixes rejected in a row, beside the path.
-    rejected_since: the first of them; 0: none.
     num_rejected: how many.
     noise_inflation: factor of the process noise of the time-correlated error, at least 1.
     offset: of the published position.
@@ -124,7 +123,6 @@ class GnssMonitor(NamedTuple):
     used_utime: int = 0
     num_confirmed: int = 0
     rejected: tuple[PathFix, ...] = ()
-    rejected_since: int = 0
     num_rejected: int = 0
     noise_inflation: float = 1.0
     offset: OutputOffset = OutputOffset()
@@ -137,11 +135,10 @@ class GnssMonitor(NamedTuple):
             used_utime=utime,
             num_confirmed=min(self.num_confirmed + 1, MAX_CONFIRMED),
             rejected=(),
-            rejected_since=0,
             num_rejected=0,
         )
 
-    def reject(self, utime: int, fix: PathFix, settings: FilterSettings, *, is_speed_measured: bool) -> GnssMonitor:
+    def reject(self, fix: PathFix, settings: FilterSettings, *, is_speed_measured: bool) -> GnssMonitor:
         """Return the monitor after a rejected fix; `is_speed_measured`: whether wheels measure the path beside it."""
         allowance = self.outlier_allowance
         if not is_speed_measured and self.num_rejected + 1 >= CONFIRMATIONS:
@@ -150,13 +147,12 @@ class GnssMonitor(NamedTuple):
         return self._replace(
             outlier_allowance=allowance,
             rejected=heading_alignment.append_fix(self.rejected, fix, 2.0 * settings.recovery_time),
-            rejected_since=self.rejected_since or utime,
             num_rejected=self.num_rejected + 1,
         )
 
     def restart(self, utime: int) -> GnssMonitor:
         """Return the monitor of fixes that are trusted again from `utime` on."""
-        return self._replace(rejected=(), rejected_since=0, num_rejected=0, used_utime=utime)
+        return self._replace(rejected=(), num_rejected=0, used_utime=utime)
 
     def place(self, utime: int) -> GnssMonitor:
         """Return the monitor after the position was set at `utime`: the offset was that of the former one."""

@@ -308,7 +308,7 @@ def _gate_fix(
     nav = latency_estimator.inflate_latency(
         nav, innovation.residual.tolist(), min(since, 2.0), setup.layout, is_speed_measured=is_measured
     )
-    gnss = gnss.reject(utime, newest, settings, is_speed_measured=is_measured)
+    gnss = gnss.reject(newest, settings, is_speed_measured=is_measured)
     state = state._replace(nav=nav, gnss=gnss)
     pending = state.common.pending
     is_due = state.consistency.may_reset and not any(each.resets_position for each in pending)

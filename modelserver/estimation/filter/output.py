@@ -13,10 +13,9 @@ from modelserver.estimation.filter import eskf, latency_estimator, propagation, 
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.measurements.constraints import compute_tilt
-from modelserver.estimation.filter.measurements.gnss import LATENCY
+from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LARGEST_CORRELATED, LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
 from modelserver.estimation.filter.odometry import Odometry
-from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, Navigating
 from modelserver.messages import NAN, Estimate, Invalid, NavigationState, Quality, VehicleMotion
@@ -29,14 +28,10 @@ CONVERGENCE_CELL: Final = 200.0
 
 HEADING_LIMIT: Final = 0.6
 HEADING_LIMIT_WITHOUT_WHEELS: Final = 0.35
-"""Heading protection level of a valid pose at most, rad, if the settings have none: while wheels measure the speed, and
-while they do not."""
+"""Limit of the heading error, rad, if the settings have none: while wheels measure the speed, and while they do not."""
 
 FIRST_ORDER_LAG: Final = 0.15
 """Seconds over which the covariance of a pose is propagated to first order."""
-
-JUMP_TIME: Final = 15.0
-"""Seconds for which dead reckoning is trusted after fixes have jumped: few reflections last longer on a drive."""
 
 SLOW: Final = 0.3
 """Speed, m/s, below which only the gyros measure the heading."""
@@ -82,21 +77,19 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     horizontal_limit, heading_limit = get_limits(setup, state)
     sigma = math.sqrt(protection_levels.compute_longest_variance(P) + settings.lever_arm_sigma**2)
     heading_sigma = math.sqrt(float(P[5, 5]) + protection_levels.HEADING_FLOOR**2)
-    allowance = gnss.outlier_allowance + abs(monitor.lever_arm)
-    levels = protection_levels.compute_level(sigma, allowance, heading_sigma)
-    risk = protection_levels.compute_limit_risk(sigma, allowance, heading_sigma, horizontal_limit, heading_limit)
+    allowance = _get_allowance(setup, state)
+    level, heading_level = protection_levels.compute_level(sigma, allowance, heading_sigma)
+    risks = protection_levels.compute_limit_risks(sigma, heading_sigma, horizontal_limit - allowance, heading_limit)
+    if sum(risks) > protection_levels.LIMIT_RISK:
+        invalid |= 8192 if monitor.cause is not None else 0  # GNSS_INCONSISTENT
+        if risks[1] > risks[0]:
+            invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, LIMIT_EXCEEDED
+        else:
+            invalid |= 256 | (128 if gnss.num_rejected else 0)  # LIMIT_EXCEEDED, GPS_REJECTED
     horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
     heading = protection_levels.compute_heading(float(P[5, 5]), settings)
     horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
     heading = monitor.bound_heading(heading, utime)
-    if heading > heading_limit:
-        invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, PROTECTION_LEVEL_EXCEEDED
-    if horizontal > horizontal_limit:
-        invalid |= 256  # PROTECTION_LEVEL_EXCEEDED
-        if gnss.num_rejected:
-            invalid |= 128  # GPS_REJECTED
-    if invalid & 256 and monitor.cause is not None:
-        invalid |= 8192  # GNSS_INCONSISTENT
     enu = utm = None
     if geodesy is not None:
         x, y, z = nav.point(setup.rig.base)
@@ -117,9 +110,9 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         heading,
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
         compute_motion(setup, predicted, nav, velocity),
-        horizontal_level=levels[0],
-        heading_level=levels[1],
-        limit_risk=risk,
+        horizontal_level=level,
+        heading_level=heading_level,
+        limit_risk=min(sum(risks), 1.0),
     )
 
 
@@ -181,6 +174,20 @@ def get_limits(setup: Setup, state: Aligned) -> tuple[float, float]:
     return horizontal, heading
 
 
+def _get_allowance(setup: Setup, state: Aligned) -> float:
+    """Return by how much the position may be off beside its covariance, m.
+
+    By an outlier, and by what the consistency monitor knows, or by an error of the fixes that is larger than such
+    errors are: the state may be off instead.
+    """
+    gnss, allowance = state.gnss, state.consistency.allowance
+    if gnss.last_fix is not None:
+        at = setup.layout.extra_index(CORRELATED_ERROR[0])
+        sigmas = math.hypot(*state.nav.extras[at : at + 2])
+        allowance = max(allowance, (sigmas - LARGEST_CORRELATED) * gnss.last_fix.correlated)
+    return gnss.outlier_allowance + allowance
+
+
 def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime: int) -> float:
     """Return the seconds until a limit is exceeded without further samples.
 
@@ -192,10 +199,8 @@ def _compute_seconds_to_limit(setup: Setup, state: Aligned, nav: NavState, utime
     if state.gnss.used_utime and setup.uses_gnss(state.common.mode):
         left = min(left, settings.gps_timeout - (utime - state.gnss.used_utime) * 1e-6)
     left = max(left, 0.0)
-    k, _ = protection_levels.get_factors(settings.risk_per_hour, settings.gps_correlation_time)
-    monitor = state.consistency
-    limit = get_limits(setup, state)[0] - state.gnss.outlier_allowance
-    limit -= abs(monitor.lever_arm) + monitor.horizontal_allowance
+    k, _ = protection_levels.compute_factors(protection_levels.LIMIT_RISK)
+    limit = get_limits(setup, state)[0] - _get_allowance(setup, state)
     C = nav.covariance
     p = protection_levels.compute_longest_variance(C) + settings.lever_arm_sigma**2
     v, c = max(C.item(3, 3), C.item(4, 4)), 2.0 * max(C.item(0, 3), C.item(1, 4), 0.0)
@@ -257,7 +262,7 @@ _to_quality = lru_cache(maxsize=256)(Quality)
 
 
 def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
-    """Return the reasons against an estimate at `utime`, except for its protection levels."""
+    """Return the reasons against an estimate at `utime`, except for the risk of its limits."""
     return _to_invalid(_find_invalid_bits(setup, state, utime))
 
 
@@ -270,15 +275,7 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
         is_stale = gnss.used_utime and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
         if is_stale and setup.uses_gnss(common.mode):
             invalid |= 32  # STALE_GPS
-        if gnss.rejected_since and (utime - gnss.rejected_since) * 1e-6 > settings.rejection_timeout:
-            invalid |= 128  # GPS_REJECTED
-        monitor = state.consistency
-        # after a jump of the fixes dead reckoning is right for a while; the bound covers what fixes that drift do, and
-        # not the heading of a vehicle that moves beside its own axis
-        is_covered = monitor.suspect is not None and monitor.cause is not Cause.HEADING
-        if monitor.is_jump and (utime - monitor.since) * 1e-6 > JUMP_TIME:
-            is_covered = False
-        if monitor.cause is not None and not is_covered:
+        if state.consistency.is_transported:
             invalid |= 8192  # GNSS_INCONSISTENT
     else:
         invalid |= 8  # NOT_MOVED_YET

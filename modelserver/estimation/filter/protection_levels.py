@@ -20,6 +20,9 @@ HEADING_FLOOR: Final = 0.01
 """Sigma of the heading, rad, outside the filter: mounts and the rolling frame are good to half a degree."""
 
 
+LIMIT_RISK: Final = 0.01
+"""Probability of an error beyond its limit with which a pose is valid at most."""
+
 LEAST_SIGMA: Final = 1e-9
 """A standard deviation that is as good as none, m or rad."""
 
@@ -65,21 +68,20 @@ def compute_heading(variance: float, settings: FilterSettings) -> float:
 
 
 def compute_level(sigma: float, allowance: float, heading_sigma: float) -> tuple[float, float]:
-    """Return the levels at an instant, m and rad: of standard deviations, plus the allowance for one outlier, m."""
+    """Return the levels at an instant, m and rad: of standard deviations, plus an allowance."""
     horizontal, heading = compute_factors(LEVEL_RISK)
     return horizontal * sigma + allowance, min(heading * heading_sigma, math.pi)
 
 
-def compute_limit_risk(
-    sigma: float, allowance: float, heading_sigma: float, horizontal_limit: float, heading_limit: float
-) -> float:
-    """Return the probability that the position or the heading error is beyond its limit, at most 1.
+def compute_limit_risks(
+    sigma: float, heading_sigma: float, horizontal_limit: float, heading_limit: float
+) -> tuple[float, float]:
+    """Return the probabilities that the position and the heading error are beyond their limits, m and rad.
 
-    Arguments as for `compute_level`, with the limits in m and rad.
+    Errors have the standard deviations; the limits are less the allowances, and 0 or less is beyond them.
     """
-    left = max(horizontal_limit - allowance, 0.0)
-    horizontal = math.exp(-0.5 * (left / max(sigma, LEAST_SIGMA)) ** 2)
-    return min(horizontal + math.erfc(heading_limit / (math.sqrt(2.0) * max(heading_sigma, LEAST_SIGMA))), 1.0)
+    horizontal = math.exp(-0.5 * (max(horizontal_limit, 0.0) / max(sigma, LEAST_SIGMA)) ** 2)
+    return horizontal, math.erfc(max(heading_limit, 0.0) / (math.sqrt(2.0) * max(heading_sigma, LEAST_SIGMA)))
 
 
 def invert_heading(level: float, settings: FilterSettings) -> float:

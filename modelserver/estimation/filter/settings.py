@@ -189,8 +189,6 @@ class FilterSettings(FixSettings):
     """How long they must have agreed, seconds: a reflection seldom lasts through 20 s of driving."""
     recovery_distance: float = 5.0
     """How far the vehicle must have moved meanwhile, meters: at rest a wrong fix agrees as well as a right one."""
-    rejection_timeout: float = 30.0
-    """After how long of nothing but refused fixes the pose is not valid, seconds, however sure odometry is."""
     jump_epoch: float = 1.0
     """A single correction that moves the pose by more, meters, starts a new epoch: a discontinuity for its users."""
 
@@ -210,11 +208,11 @@ class FilterSettings(FixSettings):
     risk_per_hour: float = 1e-5
     """Probability in an hour that the true position, or heading, is outside its bound."""
     horizontal_limit: float | None = None
-    """Horizontal protection level beyond which a pose is not valid, meters. If not given it is by the receiver's class:
-    10 m with carrier corrections, 20 m with code corrections, 36 m without."""
+    """Position error that a pose may have, meters: it is valid while a larger one has a probability of less than 0.01.
+    If not given it is by the receiver's class: 10 m with carrier corrections, 20 m with code corrections, else 36 m."""
     heading_limit: float | None = None
-    """Heading protection level beyond which a pose is not valid, radians. If not given 0.6; while no wheels measure the
-    speed 0.35, since nothing shows then that the vehicle moves along its own axis, as the heading by fixes assumes."""
+    """The same of the heading error, radians. If not given 0.6; while no wheels measure the speed 0.35, since nothing
+    shows then that the vehicle moves along its own axis, as the heading by fixes assumes."""
     maximum_tilt: float = 1.05
     """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
     maximum_speed: float = 60.0

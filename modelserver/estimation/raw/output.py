@@ -16,9 +16,10 @@ from typing import Final
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
 from modelserver.estimation.filter.protection_levels import (
+    LIMIT_RISK,
     compute_factors,
     compute_level,
-    compute_limit_risk,
+    compute_limit_risks,
     compute_longest_axis,
 )
 from modelserver.estimation.fix_quality import AcceptedFix
@@ -72,14 +73,14 @@ def estimate(state: RawState, utime: int) -> Estimate:
     k_horizontal, k_heading = compute_factors(settings.risk)
     horizontal = k_horizontal * math.sqrt(variance)
     heading_level = min(k_heading * math.sqrt(heading_variance), math.pi)
-    if heading.is_known and heading_level > settings.heading_limit:
-        is_stationary = state.quiet.is_stationary(utime, settings)
-        invalid |= Invalid.STATIONARY_HEADING if is_stationary else Invalid.PROTECTION_LEVEL_EXCEEDED
-    if horizontal > settings.horizontal_limit:
-        invalid |= Invalid.PROTECTION_LEVEL_EXCEEDED
     sigma, heading_sigma = math.sqrt(variance), math.sqrt(heading_variance)
     levels = compute_level(sigma, 0.0, heading_sigma)
-    limits = (settings.horizontal_limit, settings.heading_limit)
+    risks = compute_limit_risks(sigma, heading_sigma, settings.horizontal_limit, settings.heading_limit)
+    if heading.is_known and risks[1] > max(risks[0], LIMIT_RISK):
+        is_stationary = state.quiet.is_stationary(utime, settings)
+        invalid |= Invalid.STATIONARY_HEADING if is_stationary else Invalid.LIMIT_EXCEEDED
+    elif risks[0] > LIMIT_RISK or (heading.is_known and sum(risks) > LIMIT_RISK):
+        invalid |= Invalid.LIMIT_EXCEEDED
     enu = utm = None
     if state.projection is not None and state.fixes.work is not None:
         is_far = abs(position - anchor.position) > CONVERGENCE_RANGE
@@ -100,7 +101,7 @@ def estimate(state: RawState, utime: int) -> Estimate:
         seconds_to_limit=NAN if invalid else max(remaining, 0.0),
         horizontal_level=levels[0],
         heading_level=levels[1],
-        limit_risk=compute_limit_risk(sigma, 0.0, heading_sigma, *limits),
+        limit_risk=min(sum(risks), 1.0),
     )
 
 
@@ -158,11 +159,11 @@ def _fill_covariance(
 
 
 def compute_seconds_to_limit(variance: float, age: float, speed_sigma: float, settings: RawSettings) -> float:
-    """Return the seconds without fixes until the horizontal protection level exceeds its limit; 0 if it does.
+    """Return the seconds without fixes until the position is beyond its limit with LIMIT_RISK; 0 if it is.
 
     `variance` is that of the longest axis without growth, which is a quadratic of x = t^2.
     """
-    room = (settings.horizontal_limit / compute_factors(settings.risk)[0]) ** 2 - variance
+    room = (settings.horizontal_limit / compute_factors(LIMIT_RISK)[0]) ** 2 - variance
     if room <= 0.0:
         return 0.0
     a, b = (0.5 * settings.usual_acceleration) ** 2, speed_sigma**2

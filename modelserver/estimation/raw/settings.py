@@ -108,9 +108,9 @@ class RawSettings(FixSettings):
     risk: float = 1e-3
     """Probability that the error of position, or of heading, exceeds its protection level."""
     horizontal_limit: float = 20.0
-    """Horizontal protection level above which a pose is invalid, meters."""
+    """Position error that a pose may have, meters: it is valid while a larger one is less probable than 0.01."""
     heading_limit: float = 0.6
-    """Heading protection level above which a pose is invalid, radians."""
+    """The same of the heading error, radians."""
 
     def __post_init__(self) -> None:
         FixSettings.__post_init__(self)

@@ -162,11 +162,11 @@ def test_given_sigmas_then_levels_and_the_risk_of_a_limit_are_those_of_drawn_err
     # beside the allowance
     assert np.mean(radius > level - 0.5) == pytest.approx(1e-4, rel=0.3)
     assert np.mean(heading > heading_level) == pytest.approx(1e-4, rel=0.3)
-    risk = protection_levels.compute_limit_risk(2.0, 0.5, 0.1, 6.5, 0.25)
-    assert risk == pytest.approx(np.mean(radius > 6.0) + np.mean(heading > 0.25), rel=0.05)
-    assert protection_levels.compute_limit_risk(2.0, 7.0, 0.1, 6.5, 0.25) == 1.0
-    assert protection_levels.compute_limit_risk(0.0, 0.0, 0.0, 1.0, 0.1) == 0.0
-    assert protection_levels.compute_limit_risk(math.inf, 0.0, math.inf, 1.0, 0.1) == 1.0
+    risks = protection_levels.compute_limit_risks(2.0, 0.1, 6.0, 0.25)
+    assert risks == pytest.approx((np.mean(radius > 6.0), np.mean(heading > 0.25)), rel=0.05)
+    assert protection_levels.compute_limit_risks(2.0, 0.1, -0.5, 0.0) == (1.0, 1.0)
+    assert protection_levels.compute_limit_risks(0.0, 0.0, 1.0, 0.1) == (0.0, 0.0)
+    assert protection_levels.compute_limit_risks(math.inf, math.inf, 1.0, 0.1) == (1.0, 1.0)
     assert protection_levels.compute_level(1.0, 0.0, math.inf)[1] == math.pi
 
 

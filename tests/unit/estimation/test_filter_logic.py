@@ -456,7 +456,7 @@ def test_given_fixes_that_are_rejected_again_and_again_then_the_bound_covers_the
     fix = create_segment(0.0)[0]
     for n, distance in enumerate((2.0, 4.0, 6.0, 8.0, 7.0)):
         away = fix._replace(utime=T0 + n * 500_000, position=fix.path + distance * 1j)
-        monitor = monitor.reject(away.utime, away, SETTINGS, is_speed_measured=is_measured)
+        monitor = monitor.reject(away, SETTINGS, is_speed_measured=is_measured)
         found.append(monitor.outlier_allowance)
     assert found == pytest.approx(allowances)
 

@@ -16,7 +16,7 @@ from support_localization import GEODESY, MOUNTS, START
 
 from modelserver.errors import UnknownFrameError
 from modelserver.estimation.filter.clock_monitor import StampVerdict
-from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
+from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_factors, compute_longest_axis
 from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.origin import OriginCapture
 from modelserver.estimation.raw import output, track
@@ -409,10 +409,10 @@ def test_protection_levels_are_exceeded_with_the_stated_probability():
     assert math.erfc(heading / math.sqrt(2)) == pytest.approx(1e-3)
 
 
-def test_the_time_to_the_limit_ends_where_the_protection_level_reaches_it():
+def test_the_time_to_the_limit_ends_where_the_position_is_beyond_it_with_the_stated_probability():
     variance, sigma_v = 4.0, 0.3
     t = output.compute_seconds_to_limit(variance, 0.0, sigma_v, S)
-    level = compute_factors(S.risk)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
+    level = compute_factors(LIMIT_RISK)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
     assert level == pytest.approx(S.horizontal_limit)
     assert output.compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
 

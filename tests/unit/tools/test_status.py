@@ -105,7 +105,7 @@ NEVER_RECEIVED = (
 QUIET = tuple(replace(each, rate_hz=0.0, age=9.0, silent=True) for each in (GPS, IMU))
 LEVELING = LocalizationHealth(Mode.FULL, Phase.LEVELING)
 DRIVING = LocalizationHealth(Mode.FULL, Phase.ALIGNED, False, 1.5, 0.05, 12.0, 0.3)
-STALE = Invalid.STALE_IMU | Invalid.PROTECTION_LEVEL_EXCEEDED
+STALE = Invalid.STALE_IMU | Invalid.LIMIT_EXCEEDED
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,9 @@ from modelserver.transforms.so3 import Array, Vector3
 CORRELATED_ERROR: Final = ("gps_wander_east", "gps_wander_north", "gps_wander_up")
 """States: the time-correlated GNSS error in units of the sigma of the fix, Gauss-Markov of standard deviation 1."""
 
+LARGEST_CORRELATED: Final = 3.0
+"""Standard deviations beyond which an error was taken for a time-correlated one: of 370 such errors one is larger."""
+
 LATENCY: Final = "gps_latency"
 """State: seconds by which the position of a fix is older than its stamp."""
 
