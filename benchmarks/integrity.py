@@ -7,8 +7,8 @@
 A valid pose with an error beyond its limit is misleading (HMI), here "wrong"; the time with an error beyond the level
 and beyond the protection level is counted whether it is valid or not. The pose is looked at five times a second, for
 the present. Faults come as events, with healthy stretches between. "Detected" is from the start of an event to the
-first invalid pose; "healed" from the first pose that is wrong or invalid to the first of 5 s of right and valid ones. Drives
-and sensors: `integrity_drives`.
+first invalid pose; "healed" from the first pose that is wrong or invalid to the first of 5 s of right and valid ones.
+Drives and sensors: `integrity_drives`.
 """
 
 from __future__ import annotations

@@ -14,11 +14,11 @@ class localization_health_t(object):
     @part
     """
 
-    __slots__ = ["mode", "phase", "stationary", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "fix_age", "latitude_deg", "longitude_deg", "height", "heading_deg", "sigma_horizontal", "sigma_up"]
+    __slots__ = ["mode", "phase", "stationary", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "fix_age", "latitude_deg", "longitude_deg", "height", "heading_deg", "sigma_horizontal", "sigma_up", "horizontal_level", "heading_level", "limit_risk", "horizontal_limit", "heading_limit"]
 
-    __typenames__ = ["int8_t", "int8_t", "boolean", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double"]
+    __typenames__ = ["int8_t", "int8_t", "boolean", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None]
 
     def __init__(self):
         self.mode = 0
@@ -112,6 +112,41 @@ class localization_health_t(object):
         LCM Type: double
         """
 
+        self.horizontal_level = 0.0
+        """
+        Horizontal level, as in pose_transform_t, meters; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.heading_level = 0.0
+        """
+        Heading level, as in pose_transform_t, radians; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.limit_risk = 0.0
+        """
+        Probability that the error is beyond a limit, as in pose_transform_t; nan = not known.
+        @default nan
+        LCM Type: double
+        """
+
+        self.horizontal_limit = 0.0
+        """
+        Limit of the horizontal error of a valid pose, meters; nan = not known yet.
+        @default nan
+        LCM Type: double
+        """
+
+        self.heading_limit = 0.0
+        """
+        Limit of the heading error of a valid pose, radians; nan = not known yet.
+        @default nan
+        LCM Type: double
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -120,7 +155,7 @@ class localization_health_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">bbbdddddddddd", self.mode, self.phase, self.stationary, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up))
+        buf.write(struct.pack(">bbbddddddddddddddd", self.mode, self.phase, self.stationary, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up, self.horizontal_level, self.heading_level, self.limit_risk, self.horizontal_limit, self.heading_limit))
 
     @staticmethod
     def decode(data: bytes):
@@ -137,13 +172,13 @@ class localization_health_t(object):
         self = localization_health_t()
         self.mode, self.phase = struct.unpack(">bb", buf.read(2))
         self.stationary = bool(struct.unpack('b', buf.read(1))[0])
-        self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up = struct.unpack(">dddddddddd", buf.read(80))
+        self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.fix_age, self.latitude_deg, self.longitude_deg, self.height, self.heading_deg, self.sigma_horizontal, self.sigma_up, self.horizontal_level, self.heading_level, self.limit_risk, self.horizontal_limit, self.heading_limit = struct.unpack(">ddddddddddddddd", buf.read(120))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if localization_health_t in parents: return 0
-        tmphash = (0x5e40d8ceabe42f9c) & 0xffffffffffffffff
+        tmphash = (0xd2f6ba436dfcb094) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

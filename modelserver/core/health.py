@@ -217,6 +217,11 @@ def _make_localization_health(
         *((messages.NAN,) * 4 if geodetic is None else geodetic),
         messages.NAN if P is None else math.sqrt(compute_longest_axis(P[0], P[7], P[1])),
         messages.NAN if P is None else math.sqrt(P[14]),
+        estimate.horizontal_level,
+        estimate.heading_level,
+        estimate.limit_risk,
+        summary.horizontal_limit,
+        summary.heading_limit,
     )
 
 

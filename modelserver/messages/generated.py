@@ -915,6 +915,16 @@ class LocalizationHealth:
         Largest standard deviation of the horizontal position, meters; nan = not known.
     sigma_up
         Standard deviation of the height, meters; nan = not known.
+    horizontal_level
+        Horizontal level, as in pose_transform_t, meters; nan = not known.
+    heading_level
+        Heading level, as in pose_transform_t, radians; nan = not known.
+    limit_risk
+        Probability that the error is beyond a limit, as in pose_transform_t; nan = not known.
+    horizontal_limit
+        Limit of the horizontal error of a valid pose, meters; nan = not known yet.
+    heading_limit
+        Limit of the heading error of a valid pose, radians; nan = not known yet.
     """
 
     mode: Mode | None = None
@@ -930,6 +940,11 @@ class LocalizationHealth:
     heading_deg: float = NAN
     sigma_horizontal: float = NAN
     sigma_up: float = NAN
+    horizontal_level: float = NAN
+    heading_level: float = NAN
+    limit_risk: float = NAN
+    horizontal_limit: float = NAN
+    heading_limit: float = NAN
 
 
 @dataclass(frozen=True, slots=True)

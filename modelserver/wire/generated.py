@@ -161,10 +161,10 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "get_transformations_reply_t": bytes.fromhex("5c17dce904d61a93"),
     "get_transformations_request_t": bytes.fromhex("d71f006e179d5a75"),
     "gps_t": bytes.fromhex("661a4b5c1827f64c"),
-    "health_t": bytes.fromhex("9b50996b327d40fb"),
+    "health_t": bytes.fromhex("6e281f3e3adf44dd"),
     "imu_t": bytes.fromhex("a488946aa26727f7"),
     "joints_t": bytes.fromhex("2f8bc69e04097f3d"),
-    "localization_health_t": bytes.fromhex("bc81b19d57c85f38"),
+    "localization_health_t": bytes.fromhex("a5ed7486dbf96129"),
     "localization_mode_t": bytes.fromhex("5862804cd0a8b608"),
     "measurement_t": bytes.fromhex("a98787409a8c023c"),
     "model_snapshot_t": bytes.fromhex("0ed3b5078061bb8f"),
@@ -215,9 +215,9 @@ _S19 = struct.Struct(">qb")
 _S20 = struct.Struct(">bhdddddddd9d3d9dddddddd")
 _S21 = struct.Struct(">qd")
 _S22 = struct.Struct(">biiqqqiqqdddd")
-_S23 = struct.Struct(">iiqdbbbdddddddddddddddi")
+_S23 = struct.Struct(">iiqdbbbddddddddddddddddddddi")
 _S24 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S25 = struct.Struct(">bbbdddddddddd")
+_S25 = struct.Struct(">bbbddddddddddddddd")
 _S26 = struct.Struct(">iii")
 _S27 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
 _S28 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
@@ -1098,6 +1098,11 @@ def pack_health(value: Health) -> bytes:
                 value.localization.heading_deg,
                 value.localization.sigma_horizontal,
                 value.localization.sigma_up,
+                value.localization.horizontal_level,
+                value.localization.heading_level,
+                value.localization.limit_risk,
+                value.localization.horizontal_limit,
+                value.localization.heading_limit,
                 value.stability.margin,
                 value.stability.margin_sigma,
                 value.stability.dynamic_margin,
@@ -1159,6 +1164,11 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         localization_heading_deg,
         localization_sigma_horizontal,
         localization_sigma_up,
+        localization_horizontal_level,
+        localization_heading_level,
+        localization_limit_risk,
+        localization_horizontal_limit,
+        localization_heading_limit,
         stability_margin,
         stability_margin_sigma,
         stability_dynamic_margin,
@@ -1167,7 +1177,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         stability_num_contacts,
     ) = _S23.unpack_from(data, at)
     check_count(stability_num_contacts, "num_contacts", MAX_CONTACTS)
-    stability_contacts, at = read_each(read_text, data, at + 151, stability_num_contacts)
+    stability_contacts, at = read_each(read_text, data, at + 191, stability_num_contacts)
     stability_loads, at = read_numbers("d", data, at, stability_num_contacts)
     (num_channels,) = _S5.unpack_from(data, at)
     check_count(num_channels, "num_channels")
@@ -1218,6 +1228,11 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
             localization_heading_deg,
             localization_sigma_horizontal,
             localization_sigma_up,
+            localization_horizontal_level,
+            localization_heading_level,
+            localization_limit_risk,
+            localization_horizontal_limit,
+            localization_heading_limit,
         ),
         StabilityHealth(
             stability_margin,
@@ -1429,6 +1444,11 @@ def pack_localization_health(value: LocalizationHealth) -> bytes:
         value.heading_deg,
         value.sigma_horizontal,
         value.sigma_up,
+        value.horizontal_level,
+        value.heading_level,
+        value.limit_risk,
+        value.horizontal_limit,
+        value.heading_limit,
     )
 
 
@@ -1448,6 +1468,11 @@ def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth
         heading_deg,
         sigma_horizontal,
         sigma_up,
+        horizontal_level,
+        heading_level,
+        limit_risk,
+        horizontal_limit,
+        heading_limit,
     ) = _S25.unpack_from(data, at)
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
@@ -1463,7 +1488,12 @@ def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth
         heading_deg,
         sigma_horizontal,
         sigma_up,
-    ), at + 83
+        horizontal_level,
+        heading_level,
+        limit_risk,
+        horizontal_limit,
+        heading_limit,
+    ), at + 123
 
 
 def pack_localization_mode(value: SwitchMode) -> bytes:

@@ -122,6 +122,8 @@ STALE = Invalid.STALE_IMU | Invalid.LIMIT_EXCEEDED
         (DRIVING, (GPS, IMU), Invalid(0),
          "mode full, aligned, moving; last fix used 300 ms ago",
          "protection level 1.50 m, heading 2.9 deg; 12.0 s to the limit"),
+        (replace(DRIVING, horizontal_level=1.0, heading_level=0.03, horizontal_limit=20.0, heading_limit=0.6), (GPS, IMU), Invalid(0),
+         "mode full, aligned, moving", "level 1.00 of 20 m, heading 1.7 of 34 deg; protection level 1.50 m"),
         (DRIVING, (GPS, QUIET[1]), STALE,
          "mode full; aligned and moving at the last IMU sample; last fix used 300 ms ago", "protection level 1.50 m"),
         (replace(DRIVING, mode=Mode.NO_IMU), QUIET, Invalid.STALE_GPS,

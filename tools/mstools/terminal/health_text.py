@@ -132,13 +132,18 @@ def _format_stability(stability: StabilityHealth) -> str:
 
 
 def _format_bounds(localization: LocalizationHealth) -> str:
-    """Format the protection levels."""
+    """Format the levels beside their limits, and the protection levels."""
     position, heading = localization.horizontal_protection_level, localization.heading_protection_level
     if not math.isfinite(position) and not math.isfinite(heading):
         return "protection levels unknown"
     meters = f"{position:.2f} m" if math.isfinite(position) else "of position unknown"
     degrees = f"{math.degrees(heading):.1f} deg" if math.isfinite(heading) else "unknown"
-    return f"protection level {meters}, heading {degrees}"
+    protection = f"protection level {meters}, heading {degrees}"
+    level, limit = localization.horizontal_level, localization.horizontal_limit
+    if not math.isfinite(level + limit):
+        return protection
+    heading_level, heading_limit = map(math.degrees, (localization.heading_level, localization.heading_limit))
+    return f"level {level:.2f} of {limit:g} m, heading {heading_level:.1f} of {heading_limit:.0f} deg; {protection}"
 
 
 def is_current(health: Health) -> bool:
