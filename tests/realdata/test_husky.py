@@ -75,16 +75,16 @@ def test_given_the_bag_when_imported_then_the_units_are_right(husky_log: tuple[P
     assert turned == pytest.approx(-3.46, abs=0.02)  # the same as the odometry's own yaw, end minus start
 
 
-def test_given_the_recording_when_replayed_then_the_pose_is_valid_until_fixes_contradict_the_path_and_again_after(
+def test_given_the_recording_when_replayed_then_the_pose_is_valid_although_fixes_wander(
     antenna: npt.NDArray[np.float64],
 ) -> None:
-    valid = antenna[:, 4] > 0
-    assert antenna[np.argmax(valid), 0] < 25.0
-    # its fixes move 5 m aside within 7 s, while it drives straight ahead for 100 s more: which is right shows in turns
-    t = antenna[:, 0]
-    assert not valid[(t > 60.0) & (t < 130.0)].any()
-    assert valid[(t > 210.0) & (t < 300.0)].all()
-    assert valid[t > 15.0].mean() > 0.4
+    # its fixes move 5 m aside within 7 s, while it drives straight ahead: after two minutes dead reckoning has drifted so
+    # far from them, 16 m, that either may be beyond the limit of 20 m for half a minute
+    valid = antenna[np.argmax(antenna[:, 4] > 0) :, 4] > 0
+    assert antenna[np.argmax(antenna[:, 4] > 0), 0] < 12.0
+    assert valid.mean() > 0.9
+    # at 10 Hz
+    assert max(map(len, "".join("v" if each else "i" for each in valid).split("v"))) < 350
 
 
 def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_within_their_noise(
