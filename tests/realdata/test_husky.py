@@ -78,8 +78,8 @@ def test_given_the_bag_when_imported_then_the_units_are_right(husky_log: tuple[P
 def test_given_the_recording_when_replayed_then_the_pose_is_valid_although_fixes_wander(
     antenna: npt.NDArray[np.float64],
 ) -> None:
-    # its fixes move 5 m aside within 7 s, while it drives straight ahead: after two minutes dead reckoning has drifted so
-    # far from them, 16 m, that either may be beyond the limit of 20 m for half a minute
+    # its fixes move 5 m aside within 7 s, while it drives straight ahead: after two minutes dead reckoning is 16 m from
+    # them, and for half a minute either may be beyond the limit of 20 m
     valid = antenna[np.argmax(antenna[:, 4] > 0) :, 4] > 0
     assert antenna[np.argmax(antenna[:, 4] > 0), 0] < 12.0
     assert valid.mean() > 0.9
