@@ -169,6 +169,7 @@ class Receiver(Enum):
     STATED = "sigma 0.9 m, stated"
     RTK = "sigma 0.02 m, stated"
     UNSTATED = "3D, sigma 2.1 m correlated over minutes, nothing stated but an HDOP of 1"
+    WANDERING = "2 m rms horizontally that change within seconds, 6 m at most, sigma 0.9 m stated"
 
 
 class Segment(NamedTuple):
@@ -193,8 +194,9 @@ class Scenario:
     added to fixes; `age` is how old their position is at their stamp beside the latency, and `stamp_shift` is added to
     the stamp, seconds. `gyro_bias` (rad/s) is about the vehicle's z axis, `mount_yaw` (rad) how far the IMU is turned,
     `antenna_error` (m) how far the antenna is, from where the geometry has it. `idling` is the vibration of a
-    stationary vehicle, as a share of that at top speed. `platform_velocity` (n, 2) in m/s along east and north,
-    `platform_rate` (rad/s), `lift` (m), `tilt` (n, 2: roll, pitch, rad).
+    stationary vehicle, as a share of that at top speed. `stated_more` (n) is added to the stated sigma of fixes, m.
+    `dead_axes` are times at which an axis of the gyro (0 to 2) reads 0: begin, end, axis. `platform_velocity` (n, 2) in
+    m/s along east and north, `platform_rate` (rad/s), `lift` (m), `tilt` (n, 2: roll, pitch, rad).
     """
 
     vehicle: Vehicle
@@ -210,6 +212,7 @@ class Scenario:
     outages: list[Window] = field(default_factory=list)
     stuck: list[Window] = field(default_factory=list)
     silent: list[Window] = field(default_factory=list)
+    dead_axes: list[tuple[float, float, int]] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
     latency: float = 0.0
     mount_yaw: float = 0.0
@@ -220,6 +223,7 @@ class Scenario:
     age: Array = field(default_factory=_zeros)
     stamp_shift: Array = field(default_factory=_zeros)
     fix_offset: Array = field(default_factory=_zeros)
+    stated_more: Array = field(default_factory=_zeros)
     velocity_offset: Array = field(default_factory=_zeros)
     platform_velocity: Array = field(default_factory=_zeros)
     platform_rate: Array = field(default_factory=_zeros)
@@ -230,7 +234,7 @@ class Scenario:
         n = self.size
         self.latency = float(self.rng.uniform(0.06, 0.1))
         self.gyro_bias, self.age, self.stamp_shift = np.zeros(n), np.zeros(n), np.zeros(n)
-        self.fix_offset, self.velocity_offset = np.zeros((n, 2)), np.zeros((n, 2))
+        self.fix_offset, self.velocity_offset, self.stated_more = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n)
         self.platform_velocity, self.platform_rate = np.zeros((n, 2)), np.zeros(n)
         self.lift, self.tilt = np.zeros(n), np.zeros((n, 2))
 
@@ -521,6 +525,8 @@ def measure_imu(scenario: Scenario, truth: Truth) -> Iterator[Received]:
                 values[:, axis] += rng.normal(0.0, bias) + rng.normal(0.0, heat) * warm
                 values[:, axis] += flicker(rng, n, dt, instability)
                 values[:, axis] += noise * rng.standard_normal(n)
+    for begin, end, axis in scenario.dead_axes:
+        rate[(t >= begin) & (t < end), axis] = 0.0
     lost = np.zeros(n, bool)
     for begin, end in scenario.silent:
         lost |= (t >= begin) & (t < end)
@@ -599,6 +605,8 @@ def _fix_errors(scenario: Scenario, truth: Truth, when: Array) -> Array:
         white, parts = 0.008, ((0.01, 10.0, pace), (0.012, 120.0, None), (0.008, 600.0, None))
     elif scenario.receiver is Receiver.UNSTATED:
         white, parts = 0.2, ((0.5, 10.0, pace), (1.7, 80.0, None), (1.1, 600.0, None))
+    elif scenario.receiver is Receiver.WANDERING:
+        white, parts = 0.1, ((0.5, 40.0, None), (0.4, 600.0, None))
     else:
         white, parts = 0.2, ((0.35, 10.0, pace), (0.55, 120.0, None), (0.55, 600.0, None))
     for axis, factor in enumerate((1.0, 1.0, 1.6)):
@@ -606,7 +614,10 @@ def _fix_errors(scenario: Scenario, truth: Truth, when: Array) -> Array:
         for sigma, tau, of_turns in parts:
             e[:, axis] += gauss_markov(rng, m, dt, sigma, tau, of_turns)
         e[:, axis] *= factor
-    if scenario.receiver is not Receiver.RTK:
+    if scenario.receiver is Receiver.WANDERING:
+        e[:, :2] += np.stack([1.05 * np.interp(when, scenario.t, wander(rng, scenario.size, 8.0)) for _ in range(2)], 1)
+        e[:, :2] *= np.minimum(1.0, 6.0 / np.linalg.norm(e[:, :2], axis=1))[:, None]
+    elif scenario.receiver is not Receiver.RTK:
         for at in np.flatnonzero(rng.uniform(size=m) < dt / 150.0).tolist():
             angle, size = rng.uniform(-math.pi, math.pi), min(rng.exponential(1.5), 6.0)
             last = at + int(rng.integers(1, 8))
@@ -645,12 +656,14 @@ def measure_fixes(scenario: Scenario, truth: Truth) -> Iterator[Received]:
     fix_type, sigma = vehicle.fix_type, 0.9
     if scenario.receiver is Receiver.RTK:
         fix_type, sigma = FixType.RTK_FIXED, 0.02
-    covariance = (sigma**2, 0.0, 0.0, 0.0, sigma**2, 0.0, 0.0, 0.0, (1.6 * sigma) ** 2)
-    stated = None if scenario.receiver is Receiver.UNSTATED else covariance
-    if stated is None:
+    is_stated = scenario.receiver is not Receiver.UNSTATED
+    if not is_stated:
         fix_type = FixType.FIX_3D
+    variances = ((sigma + np.interp(stamps, scenario.t, scenario.stated_more)) ** 2).tolist()
     accuracy = (0.05**2, 0.0, 0.0, 0.0, 0.05**2, 0.0, 0.0, 0.0, 0.05**2)
     for k in np.flatnonzero(~lost).tolist():
+        variance = variances[k]
+        covariance = (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, 1.6**2 * variance)
         yield (
             float(arrival[k]),
             GpsSample(
@@ -661,7 +674,7 @@ def measure_fixes(scenario: Scenario, truth: Truth) -> Iterator[Received]:
                 float(height[k]),
                 satellites=9,
                 hdop=1.0,
-                position_covariance=stated,
+                position_covariance=covariance if is_stated else None,
                 velocity=tuple(velocity[k].tolist()) if scenario.has_velocity else None,
                 velocity_covariance=accuracy if scenario.has_velocity else None,
             ),

@@ -112,14 +112,20 @@ def test_every_fault_changes_its_drive(fault: integrity.Fault) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["none", "gps_age"])
-def test_two_minutes_with_a_small_fault_hold(fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_minutes_with_a_small_fault_have_no_wrong_pose(
+    fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = ["--faults", fault, "--vehicles", "rover", "--seeds", "1", "--minutes", "2", "--jobs", "1", "--events"]
-    assert integrity.main([*arguments, "--json", str(tmp_path / "figures.json")]) == 0
+    code = integrity.main([*arguments, "--json", str(tmp_path / "figures.json")])
     (figures,) = json.loads((tmp_path / "figures.json").read_text())["faults"]
-    assert (figures["fault"], figures["wrong_per_hour"], figures["healed"]) == (fault, 0.0, None)
+    assert (figures["fault"], figures["hmi"], figures["healed"]) == (fault, 0.0, None)
+    # the start takes a tenth of the time, which a healthy drive may not
+    assert 0.8 < figures["valid"] < 0.97
+    assert (code, figures["missed"] != []) == ((1, True) if fault == "none" else (0, False))
+    assert figures["rmse_ratio"] == pytest.approx(1.0, abs=0.3)
     output = capsys.readouterr().out
     assert "rover: 0.0 s/h" in output
-    assert "OUT OF BOUNDS" not in output
+    assert ("OUT OF BOUNDS: valid" in output) == (code == 1)
 
 
 @pytest.mark.slow
@@ -176,6 +182,7 @@ def test_an_error_beyond_the_limit_while_valid_is_wrong_and_one_beyond_a_level_i
         [integrity.Invalid(0 if each else 256) for each in valid],
         [],
         0,
+        2.0 * ones,
     )
     result = integrity.Result(integrity.Task("none", "rover", 1, 60.0))
     integrity._evaluate(result, 0, scenario, looks)
@@ -187,5 +194,10 @@ def test_an_error_beyond_the_limit_while_valid_is_wrong_and_one_beyond_a_level_i
     (event,) = result.events
     assert event.detected == pytest.approx(4.0, abs=0.21)
     assert event.healed == pytest.approx(5.0, abs=0.21)
-    strict = replace(integrity.BY_NAME["none"], required=integrity.Required("", event=1.0))
-    assert not integrity.summarize(strict, [result]).holds
+    fault = integrity.BY_NAME["none"]
+    allowed = integrity.Required(hmi=200.0, valid=0.9, beyond_level=0.1, rmse_ratio=0.5)
+    summary = integrity.summarize(replace(fault, required=allowed), [result])
+    assert (summary.holds, summary.rmse) == (True, pytest.approx(math.sqrt((14 * 9.0 + 236 * 0.25) / 250)))
+    for name, bar in (("hmi", 100.0), ("valid", 0.96), ("beyond_level", 0.05), ("rmse_ratio", 0.4)):
+        summary = integrity.summarize(replace(fault, required=replace(allowed, **{name: bar})), [result])
+        assert len(summary.missed) == 1
