@@ -299,12 +299,16 @@ def test_given_gaps_when_scored_then_the_known_error_of_an_estimate_comes_out(
 def test_given_a_required_figure_when_it_is_missed_then_the_line_is_marked() -> None:
     recording = accuracy.RECORDINGS[0]
     required = recording.targets["half"].required
-    good = protocols.ReplayScore(400, 0, 1.0, rmse=required - 0.01, p95=0.6, max=1.0)
+    times = protocols.Integrity(seconds=400.0, valid=400.0)
+    good = protocols.ReplayScore(400, 0, 1.0, rmse=required - 0.01, p95=0.6, max=1.0, integrity=times)
     assert accuracy.ResultLine(recording, "half", (good,)).is_met
     for bad in (
         replace(good, rmse=required + 0.01),
         replace(good, missing=1),
         replace(good, max=1000.0),
+        replace(good, integrity=replace(times, valid=380.0)),
+        replace(good, integrity=replace(times, misleading=1.0)),
+        replace(good, integrity=replace(times, beyond_level=1.0)),
         protocols.ReplayScore(0, 400, 0.0),
     ):
         line = accuracy.ResultLine(recording, "half", (bad,))
