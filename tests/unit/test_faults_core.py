@@ -85,7 +85,7 @@ def test_given_fixes_with_unconfigured_latency_then_the_pose_stays_within_its_pr
     if seconds < 0.5 or (seconds < 1.0 and not since):
         # a latency that jumps by more, or is more than that of any receiver, is one of fixes that contradict the path
         assert np.mean([each.is_valid for each in found.between(8.0, SECONDS)]) > 0.8
-        assert all(each.position_error < 0.5 * 3.0 * seconds for each in found.between(SECONDS - 2.0, SECONDS))
+        assert all(each.position_error < 0.8 * 3.0 * seconds for each in found.between(SECONDS - 2.0, SECONDS))
 
 
 def test_given_late_fixes_in_a_circle_from_the_start_then_the_heading_uncertainty_covers_their_latency() -> None:

@@ -112,10 +112,22 @@ def test_every_fault_changes_its_drive(fault: integrity.Fault) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["none", "gps_age"])
-def test_two_minutes_with_a_small_fault_have_no_wrong_pose(
+def test_some_minutes_with_a_small_fault_have_no_wrong_pose(
     fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--faults", fault, "--vehicles", "rover", "--seeds", "1", "--minutes", "2", "--jobs", "1", "--events"]
+    arguments = [
+        "--faults",
+        fault,
+        "--vehicles",
+        "rover",
+        "--seeds",
+        "1",
+        "--minutes",
+        "2.5",
+        "--jobs",
+        "1",
+        "--events",
+    ]
     code = integrity.main([*arguments, "--json", str(tmp_path / "figures.json")])
     (figures,) = json.loads((tmp_path / "figures.json").read_text())["faults"]
     assert (figures["fault"], figures["hmi"], figures["healed"]) == (fault, 0.0, None)

@@ -6,7 +6,6 @@ decisions); `fuse_measurement` is the one for every kind that needs no logic of 
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -15,10 +14,8 @@ from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, latency_estimator, propagation
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
-from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.own import OwnMeasurement
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
-from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, FilterState, Leveling, N, Navigating, PreviousSample
 from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
@@ -39,9 +36,6 @@ from modelserver.named_tuples import new_tuple
 
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
-
-LONGEST_MEAN: Final = 1.0
-"""Seconds for which a residual of the speed is that of its mean, at most."""
 
 HELD_SPEED: Final = 1.5
 HELD_TILT: Final = 0.05
@@ -217,15 +211,7 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
         # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would change
         # the bias for good, and make bias and heading known that are not
         nav = hold_bias(before, nav, (8, 11))
-    state = state._replace(nav=nav)
-    if isinstance(state, Aligned) and not state.common.measures_wheel_speed(utime):
-        # the constraint turns the heading to the course of the fixes
-        turn = wrap_angle(state.nav.yaw - before.yaw)
-        state = state._replace(consistency=state.consistency.correct(0j, turn))
-    elif isinstance(state, Aligned):
-        aside = float(innovation.residual[0]) * min(dt, LONGEST_MEAN)
-        state = state._replace(consistency=state.consistency.follow_wheels(cmath.rect(aside, before.yaw) * 1j, utime))
-    return state, decision
+    return state._replace(nav=nav), decision
 
 
 def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) -> NavState:
@@ -234,25 +220,6 @@ def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) 
     for axis in axes:
         P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
     return after.change(11, before.gyro_bias[2] - after.gyro_bias[2])._replace(covariance=P)
-
-
-def _excludes(state: Aligned, item: Item) -> bool:
-    """Return whether a measurement of GNSS must not move the state: fixes have jumped, or its velocity may drift."""
-    monitor = state.consistency
-    if monitor.excludes_fixes:
-        return True
-    # it would bend the path by which the fixes are judged
-    is_drifting = monitor.suspect is not None and monitor.cause is Cause.GNSS
-    return is_drifting and item.kind == "gps_velocity" and state.common.measures_wheel_speed(item.utime)
-
-
-def correct_path(setup: Setup, state: Aligned, before: NavState) -> Aligned:
-    """Return the state after a correction by GNSS, with a path that did not follow it; `before` is that before it."""
-    nav = state.nav
-    lever = setup.rig.lever_arm(setup.rig.gps_frame)
-    (x, y, _), (a, b, _) = nav.point(lever), before.point(lever)
-    turn = wrap_angle(nav.yaw - before.yaw)
-    return state._replace(consistency=state.consistency.correct(complex(x - a, y - b), turn))
 
 
 def release_motion(state: N) -> N:
@@ -283,14 +250,10 @@ def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:
     if isinstance(innovation, str):
         return state, ((reject(item, innovation),) if innovation else NOTHING)
     is_gnss = isinstance(sample, GpsSample)
-    if is_gnss and isinstance(state, Aligned) and _excludes(state, item):
+    if is_gnss and isinstance(state, Aligned) and state.bank is not None and state.bank.excludes_fixes:
         innovation = innovation._replace(monitored="inconsistent")
     nav, decision = eskf.update(context.nav, innovation, setup.settings, item.utime, item.source, item.seq, item.kind)
     state = state._replace(nav=nav)
-    if is_gnss and isinstance(state, Aligned) and decision.verdict is Verdict.USED:
-        state = correct_path(setup, state, context.nav)
-        if item.kind == "gps_velocity":
-            state = state._replace(consistency=state.consistency._replace(velocity_utime=item.utime))
     if isinstance(state, Aligned) and decision.verdict is Verdict.USED and not is_gnss:
         measures = innovation.jacobian[:, :3] != 0.0
         offset = state.gnss.offset

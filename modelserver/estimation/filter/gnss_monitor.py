@@ -25,12 +25,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.estimation.filter import heading_alignment
-from modelserver.estimation.filter.consistency_monitor import CONFIRMATIONS
 from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.heading_alignment import PathFit, PathFix
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.turn_monitor import CONFIRMATIONS
 from modelserver.messages import Decision
 from modelserver.transforms.so3 import Vector3
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic, origin_at
 from modelserver.estimation.filter import (
-    consistency_step,
+    bank_step,
     eskf,
     gnss_monitor,
     heading_alignment,
@@ -29,10 +29,10 @@ from modelserver.estimation.filter.fusion import (
     Fused,
     Item,
     accept_fix,
-    correct_path,
     create_context,
     fuse_measurement,
     reject,
+    report_event,
     report_reset,
 )
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
@@ -43,6 +43,7 @@ from modelserver.estimation.filter.measurements.gnss import (
     read_velocity,
     split_variance,
 )
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import (
     Aligned,
@@ -54,6 +55,7 @@ from modelserver.estimation.filter.state import (
     Unaligned,
     is_speed_known,
 )
+from modelserver.estimation.filter.turn_monitor import TurnMonitor, TurnNode, find_turn
 from modelserver.estimation.fix_quality import AcceptedFix
 from modelserver.messages import Decision, FixType, GpsSample, Verdict
 from modelserver.transforms import so3
@@ -177,18 +179,21 @@ def _fuse_aligned(
         state, decisions = _check_heading(setup, state, newest)
         if decisions:
             return state, decisions
-    if is_used and heading_step.is_heading_lost(setup, state):
+    bank = state.bank
+    if is_used and bank is None and heading_step.is_heading_lost(setup, state):
         lost, decisions = _fuse_unaligned(setup, heading_step.lose_heading(state), item, sample, fix, is_used)
         return lost, (report_reset(item, "the heading is lost"), *decisions)
     adds_nothing = _adds_nothing(setup, state, fix)
     decisions = NOTHING
     # a restored heading has its own check
-    if is_used and state.heading_check is None:
-        # a stationary vehicle does not follow the fixes
-        is_compared = not adds_nothing or state.consistency.suspect is not None
-        state, decisions = consistency_step.compare_path(setup, state, newest, is_compared=is_compared)
-        if state.consistency.excludes_fixes:
+    if is_used and state.bank is not None:
+        state, decisions = bank_step.advance(setup, state, newest)
+        if state.bank is not None and state.bank.excludes_fixes:
             return state, (*decisions, reject(item, "inconsistent"))
+    if is_used and not (adds_nothing and not state.turns.is_transported):
+        # a stationary vehicle does not follow the fixes
+        state, more = _compare_turns(setup, state, newest)
+        decisions += more
     nav = state.nav
     if not adds_nothing:
         inflated = gnss_monitor.inflate_correlated_error(nav, state.gnss.noise_inflation, since, layout, settings)
@@ -205,8 +210,6 @@ def _fuse_aligned(
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
         state = state._replace(nav=latency_estimator.hold_latency(uncorrected, state.nav, layout))
-        state = correct_path(setup, state, uncorrected)
-        state = state._replace(consistency=consistency_step.hold_heading(setup, state, nav))
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)
         nav = latency_estimator.inflate_latency(
@@ -219,6 +222,9 @@ def _fuse_aligned(
         sigma = (newest.correlated, newest.correlated, 0.0)
         offset = gnss.offset.update(nav, sigma, since, slice(0, 2), layout, settings)
         state = state._replace(nav=nav, gnss=gnss._replace(offset=offset))
+    if state.heading_check is None:
+        settled, more = bank_step.settle(setup, state, bank)
+        return settled, (*decisions, decision, *more)
     return state, (*decisions, decision)
 
 
@@ -311,7 +317,7 @@ def _gate_fix(
     gnss = gnss.reject(newest, settings, is_speed_measured=is_measured)
     state = state._replace(nav=nav, gnss=gnss)
     pending = state.common.pending
-    is_due = state.consistency.may_reset and not any(each.resets_position for each in pending)
+    is_due = state.bank is None and not any(each.resets_position for each in pending)
     if is_due and state.gnss.fit_rejected(nav, settings) is not None:
         state = _wait_horizon(setup, state, PendingDecision(utime, resets_position=True))
     return state, decision
@@ -363,6 +369,69 @@ def fuse_height(setup: Setup, state: FilterState, item: Item) -> Fused:
     return state, decisions
 
 
+def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
+    """Return the state after the comparison of its heading with its gyro at a fix, where there is no bank.
+
+    Where there is one, its headings are what those after it are compared with.
+    """
+    nav, reckoning, settings = state.nav, state.reckoning, setup.settings
+    if nav.utime - reckoning.gyro_utime > settings.rate_hold * 1e6:
+        return state, NOTHING
+    P = nav.covariance
+    if not math.isfinite(P[0, 0] + P[8, 8] + P[11, 11]):
+        return state, NOTHING  # it has diverged
+    turn = reckoning.turn + 1e-6 * reckoning.rate * (nav.utime - reckoning.gyro_utime)
+    node = TurnNode(
+        nav.utime,
+        newest.position,
+        newest.white,
+        nav.yaw,
+        turn,
+        nav.gyro_bias[2],
+        float(P[8, 8]),
+        float(P[11, 11]),
+        reckoning.turn_variance,
+    )
+    before = state.turns
+    if state.common.measures_wheel_speed(nav.utime):
+        return state._replace(turns=before.append(node)), NOTHING
+    noise = propagation.select_noise(setup, state, nav).yaw
+    turns = before.compare(node, noise, settings.gyro_bias_walk**2, math.hypot(*nav.velocity))
+    state = state._replace(turns=turns)
+    if turns.suspect is None:
+        if not before.is_transported:
+            return state, NOTHING
+        text = "the vehicle drives by itself: its heading turns as the gyro does"
+        return state, (report_event(state, bank_step.KIND, Verdict.USED, text),)
+    if not before.is_transported:
+        turned = math.degrees(abs(find_turn(turns.suspect, node)))
+        text = f"the vehicle moves {turned:.0f} deg beside its own axis"
+        return state, (report_event(state, bank_step.KIND, Verdict.RESET, text),)
+    shown = turns.find_own_course()
+    if shown is None:
+        return state, NOTHING
+    heading, sigma = shown
+    angle = wrap_angle(heading - nav.yaw)
+    if abs(angle) > 0.5 * math.pi:
+        return state, NOTHING  # it may drive in reverse
+    if abs(angle) > 2.0 * math.hypot(sigma, math.sqrt(float(P[8, 8]))):
+        P = P.copy()
+        P[8, :] = P[:, 8] = 0.0
+        turned_nav = heading_alignment.rotate(nav._replace(covariance=P), Rotation(angle, sigma), setup.layout)
+        # fixes show the velocity, whatever the heading
+        state = state._replace(nav=turned_nav._replace(position=nav.position, velocity=nav.velocity))
+    common = state.common._replace(epoch=state.common.epoch + 1)
+    state = state._replace(common=common, turns=TurnMonitor())
+    text = "the vehicle drives by itself: its course turns as it does"
+    return state, (report_event(state, bank_step.KIND, Verdict.RESET, text),)
+
+
+def _place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state at a fix, in a new epoch."""
+    nav = heading_alignment.place(state.nav, newest, 0j, setup.rig.lever_arm(setup.rig.gps_frame), setup.layout)
+    return start_epoch(state._replace(nav=nav, gnss=state.gnss.place(newest.utime)))
+
+
 def _check_heading(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after a fix more for the check of a restored heading: confirmed, corrected, or still neither."""
     check, rotation, decision = heading_check.update(setup, state, newest)
@@ -384,11 +453,11 @@ def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | No
     sigma = math.hypot(fit.rotation.sigma, math.sqrt(nav.covariance[8, 8]))
     rotation = fit.rotation if abs(fit.rotation.angle) > 3.0 * sigma else Rotation(0.0, 0.0)
     newest = state.gnss.rejected[-1]
-    if rotation is fit.rotation and not state.common.measures_wheel_speed(nav.utime) and state.consistency.last:
+    if rotation is fit.rotation and not state.common.measures_wheel_speed(nav.utime) and state.turns.newest:
         # fixes show a course alone, which is not the heading of a vehicle that is transported
         text = f"fixes move {math.degrees(abs(rotation.angle)):.0f} deg beside the vehicle's own axis"
         decision = Decision(nav.utime, "filter", 0, "gps_position", Verdict.RESET, text)
-        return consistency_step.follow_transport(setup, state, newest), decision
+        return _place(setup, state._replace(turns=state.turns.transport()), newest), decision
     state = heading_step.initialize(setup, state, nav, rotation, newest)
     if rotation is fit.rotation:
         state = _allow_start(state, newest, fit.distance)
@@ -402,8 +471,7 @@ def _allow_start(state: Aligned, newest: PathFix, distance: float) -> Aligned:
     """Return the state after fixes along a path of some length, m, have shown its heading."""
     fix_sigma = math.hypot(newest.white, newest.correlated)
     is_measured = state.common.measures_wheel_speed(newest.utime)
-    monitor = state.consistency.start_heading(fix_sigma, distance, is_measured=is_measured)
-    return state._replace(consistency=monitor)
+    return state._replace(turns=state.turns.start_heading(fix_sigma, distance, is_measured=is_measured))
 
 
 def start_epoch(state: Aligned) -> Aligned:

@@ -164,6 +164,7 @@ def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor
         nav,
         state.imu,
         state.stationary,
+        state.reckoning,
         state.constraints,
         state.common._replace(is_clock_stepped=False),
         Earth.at(latitude, height),
@@ -177,7 +178,7 @@ def is_heading_lost(setup: Setup, state: Aligned) -> bool:
 
     It is not lost while fixes are suspect: those that would show another one are the same.
     """
-    if state.consistency.suspect is not None:
+    if state.turns.is_transported:
         return False
     variance = float(state.nav.covariance[8, 8])
     return protection_levels.compute_heading(variance, setup.settings) >= math.pi
@@ -198,6 +199,7 @@ def lose_heading(state: Aligned) -> Unaligned:
         nav._replace(covariance=P),
         state.imu,
         state.stationary,
+        state.reckoning,
         HeadingAlignment(last_fix=state.gnss.last_fix),
         state.constraints,
         state.common._replace(epoch=state.common.epoch + 1),

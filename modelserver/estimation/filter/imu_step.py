@@ -31,7 +31,6 @@ from modelserver.estimation.filter.fusion import (
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
-from modelserver.estimation.filter.path_fits import Cause
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
@@ -108,18 +107,7 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         if max(np.diagonal(state.nav.covariance)[6:9]) > LOST_ATTITUDE_SIGMA**2:
             restarted = Leveling(state.common.restart())
             return restarted, (report_reset(item, "leveling again after a gap in the IMU samples"),)
-        if isinstance(state, Aligned):
-            gap = (utime - state.imu.used_utime) * 1e-6
-            silent = min(gap, (utime - state.common.wheels.used_utime) * 1e-6)
-            turned, moved = (
-                propagation.select_noise(setup, state, state.nav).yaw * gap,
-                0.5 * settings.gap_acceleration * silent**2,
-            )
-            state = state._replace(consistency=state.consistency.lose(turned, moved))
         decisions += (reject(item, "gap")._replace(verdict=Verdict.MONITORED),)
-    elif isinstance(state, Aligned) and imu.is_interpolated:
-        turned = setup.interpolated.yaw * (utime - used_utime) * 1e-6
-        state = state._replace(consistency=state.consistency.lose(turned, 0.0))
     state = propagation.propagate_imu(setup, state, utime, rate, force, detector, imu)
     state, more = _fuse_constraints(setup, state, utime)
     return state, decisions + more if more else decisions
@@ -150,7 +138,10 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
         P = nav.covariance.copy()
         P[11, 11] += settings.gyro_bias_walk**2 * lag
         nav = nav._replace(covariance=P)
-    state = state._replace(nav=nav, imu=imu, stationary=detector)
+    reckoning = state.reckoning
+    gap = (utime - reckoning.gyro_utime) * 1e-6
+    missed = (settings.gap_rate_sigma * gap) ** 2 / 3.0 if gap > settings.rate_hold else 0.0
+    state = state._replace(nav=nav, imu=imu, stationary=detector, reckoning=reckoning.follow_gyro(utime, rate, missed))
     if not (
         state.is_stationary and detector.sum_time > 1.0 and detector.get_quiet_time(utime) >= settings.recapture_time
     ):
@@ -187,7 +178,7 @@ def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Deci
     wheels_utime = state.common.wheels.used_utime
     if wheels_utime and (utime - wheels_utime) * 1e-6 < settings.wheel_period + CONSTRAINT_PERIOD:
         return state, NOTHING  # the next wheel sample brings it
-    if isinstance(state, Aligned) and state.consistency.cause is Cause.HEADING:
+    if isinstance(state, Aligned) and state.turns.is_transported:
         return state, NOTHING  # it moves beside its own axis
     state, decision = fuse_non_holonomic(setup, state, utime)
     return state, (decision,)
@@ -211,6 +202,8 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
         )
         state = release_motion(state)._replace(stationary=StationaryDetector(), common=common)
         state = state._replace(constraints=state.constraints._replace(contradiction=0.0))
+        if isinstance(state, Aligned):
+            state = state._replace(bank=None, bounds=None)
         return state, (*decisions, report_event(state, constraints.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
     detector = state.stationary
     if detector.sum_time > 0.0:
@@ -252,10 +245,7 @@ def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float
     # the mean may be from before it too
     P[[9, 10, 11], [9, 10, 11]] = change**2 + variance
     if isinstance(state, Aligned):
-        monitor = state.consistency.relearn(float(turn[2]) / time, nav.utime)
-        allowance = state.consistency.heading_allowance if monitor.suspect is None else 0.0
-        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), allowance) ** 2
-        state = state._replace(consistency=monitor)
+        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), state.turns.allowance) ** 2
     nav = nav._replace(gyro_bias=to_vector3(turn / time), covariance=P)
     state = state._replace(nav=nav, constraints=rest._replace(rest_turn=ZERO, rest_time=0.0))
     text = f"the bias of a gyro has changed by {math.degrees(np.abs(change).max()):.2f} deg/s"

@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from modelserver.earth.geodesy import geodetic_from_ecef
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.error_layout import ACCELEROMETER_BIAS, GYRO_BIAS, STRAPDOWN, VELOCITY
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, Earth, NavState, level_attitude
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
@@ -73,6 +74,7 @@ def level(setup: Setup, state: Leveling, utime: int, rate: Vector3, force: Vecto
         nav._replace(rate=rate, force=force),
         state.imu,
         state.stationary,
+        DeadReckoning(),
         HeadingAlignment(),
         MotionConstraints(state.is_stationary, utime, utime),
         state.common,
@@ -146,6 +148,7 @@ def start_level(setup: Setup, state: Leveling, utime: int) -> Unaligned:
         nav,
         state.imu,
         state.stationary,
+        DeadReckoning(),
         HeadingAlignment(),
         MotionConstraints(state.is_stationary, utime, utime),
         state.common,
@@ -181,6 +184,7 @@ def start_from(setup: Setup, first: Leveling, last: Estimate, before: Estimate) 
         ),
         ImuMonitor(used_utime=last.utime),
         first.stationary,
+        DeadReckoning(),
         MotionConstraints(False, last.utime, last.utime),
         first.common,
         Earth.at(latitude, height),

@@ -12,6 +12,7 @@ from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodeti
 from modelserver.estimation.filter import eskf, latency_estimator, propagation, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
+from modelserver.estimation.filter.hypothesis_bank import Bounds
 from modelserver.estimation.filter.measurements.constraints import compute_tilt
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LARGEST_CORRELATED, LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
@@ -69,27 +70,24 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     if nav.lag > FIRST_ORDER_LAG:
         nav = eskf.propagate_covariance(nav, propagation.select_noise(setup, predicted, nav), setup.layout)
     P = _compute_base_covariance(nav, setup, propagation.select_noise(setup, predicted, nav))
+    own = protection_levels.compute_longest_variance(P), float(P[5, 5])
     silent = 0.0 if state.is_stationary else (utime - gnss.used_utime) * 1e-6
     offset, variance = gnss.offset.decay(silent, settings)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
     P[5, 5] += latency_estimator.compute_heading_variance(nav, setup.layout)
-    monitor = state.consistency
-    horizontal_limit, heading_limit = get_limits(setup, state)
-    sigma = math.sqrt(protection_levels.compute_longest_variance(P) + settings.lever_arm_sigma**2)
-    heading_sigma = math.sqrt(float(P[5, 5]) + protection_levels.HEADING_FLOOR**2)
-    allowance = _get_allowance(setup, state)
-    level, heading_level = protection_levels.compute_level(sigma, allowance, heading_sigma)
-    risks = protection_levels.compute_limit_risks(sigma, heading_sigma, horizontal_limit - allowance, heading_limit)
+    limits = get_limits(setup, state)
+    if state.bounds is None:
+        levels = _compute_levels(setup, state, P, limits)
+    else:
+        levels = state.bounds.grow(own, limits, settings)
+    risks = levels.horizontal_risk, levels.heading_risk
     if sum(risks) > protection_levels.LIMIT_RISK:
-        invalid |= 8192 if monitor.cause is not None else 0  # GNSS_INCONSISTENT
+        is_suspect = state.turns.is_transported if state.bank is None else state.bank.is_suspect
+        invalid |= 8192 if is_suspect else 0  # GNSS_INCONSISTENT
         if risks[1] > risks[0]:
             invalid |= 16 if state.is_stationary else 256  # STATIONARY_HEADING, LIMIT_EXCEEDED
         else:
             invalid |= 256 | (128 if gnss.num_rejected else 0)  # LIMIT_EXCEEDED, GPS_REJECTED
-    horizontal = protection_levels.compute_horizontal(P, gnss.outlier_allowance, settings)
-    heading = protection_levels.compute_heading(float(P[5, 5]), settings)
-    horizontal += abs(monitor.lever_arm) + monitor.horizontal_allowance
-    heading = monitor.bound_heading(heading, utime)
     enu = utm = None
     if geodesy is not None:
         x, y, z = nav.point(setup.rig.base)
@@ -106,14 +104,41 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         quality,
         epoch,
         origin,
-        horizontal,
-        heading,
+        levels.horizontal_protection,
+        levels.heading_protection,
         NAN if invalid else _compute_seconds_to_limit(setup, state, nav, utime),
         compute_motion(setup, predicted, nav, velocity),
-        horizontal_level=level,
-        heading_level=heading_level,
+        horizontal_level=levels.horizontal_level,
+        heading_level=levels.heading_level,
         limit_risk=min(sum(risks), 1.0),
     )
+
+
+def _compute_levels(setup: Setup, state: Aligned, P: Array, limits: tuple[float, float]) -> Bounds:
+    """Return levels and risks of a pose with the covariance P, without a bank.
+
+    They are those of the covariance, beside what outliers and inconsistent fixes may have moved it by.
+    """
+    settings = setup.settings
+    variances = protection_levels.compute_longest_variance(P), float(P[5, 5])
+    sigma = math.sqrt(variances[0] + settings.lever_arm_sigma**2)
+    heading_sigma = math.sqrt(variances[1] + protection_levels.HEADING_FLOOR**2)
+    allowance = _get_allowance(setup, state)
+    level, heading_level = protection_levels.compute_level(sigma, allowance, heading_sigma)
+    turned = state.turns.allowance if state.turns.is_transported else 0.0
+    risks = protection_levels.compute_limit_risks(sigma, heading_sigma, limits[0] - allowance, limits[1] - turned)
+    horizontal = protection_levels.compute_horizontal(P, state.gnss.outlier_allowance, settings)
+    heading = min(protection_levels.compute_heading(variances[1], settings) + state.turns.allowance, math.pi)
+    heading_level = min(heading_level + turned, math.pi)
+    return Bounds(level, heading_level, horizontal, heading, *risks, variances)
+
+
+def get_heading_protection(setup: Setup, state: Aligned) -> float:
+    """Return the protection level of the heading at the state's instant, rad."""
+    if state.bounds is not None:
+        return state.bounds.heading_protection
+    variance = float(state.nav.covariance[8, 8]) + latency_estimator.compute_heading_variance(state.nav, setup.layout)
+    return min(protection_levels.compute_heading(variance, setup.settings) + state.turns.allowance, math.pi)
 
 
 def _get_sensor_delay_us(setup: Setup, state: Navigating) -> int:
@@ -130,6 +155,11 @@ def _get_sensor_delay_us(setup: Setup, state: Navigating) -> int:
         return 0
     delay = -latency - math.sqrt(max(nav.covariance[at, at], 0.0))
     return round(1e6 * delay) if delay > 0.0 else 0
+
+
+def compute_covariance(setup: Setup, state: Aligned) -> Array:
+    """Return the covariance (6, 6) of the rolling frame along N at the state's instant, without what is published."""
+    return _compute_base_covariance(state.nav, setup, propagation.select_noise(setup, state, state.nav))
 
 
 def _compute_base_covariance(nav: NavState, setup: Setup, noise: ProcessNoise) -> Array:
@@ -180,7 +210,10 @@ def _get_allowance(setup: Setup, state: Aligned) -> float:
     By an outlier, and by what the consistency monitor knows, or by an error of the fixes that is larger than such
     errors are: the state may be off instead.
     """
-    gnss, allowance = state.gnss, state.consistency.allowance
+    if state.bounds is not None:
+        k, _ = protection_levels.compute_factors(protection_levels.LEVEL_RISK)
+        return max(state.bounds.horizontal_level - k * math.sqrt(state.bounds.variances[0]), 0.0)
+    gnss, allowance = state.gnss, 0.0
     if gnss.last_fix is not None:
         at = setup.layout.extra_index(CORRELATED_ERROR[0])
         sigmas = math.hypot(*state.nav.extras[at : at + 2])
@@ -272,11 +305,10 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
     invalid = 0
     if isinstance(state, Aligned):
         gnss = state.gnss
-        is_stale = gnss.used_utime and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
+        excludes = state.bank is not None and state.bank.excludes_fixes
+        is_stale = gnss.used_utime and not excludes and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
         if is_stale and setup.uses_gnss(common.mode):
             invalid |= 32  # STALE_GPS
-        if state.consistency.is_transported:
-            invalid |= 8192  # GNSS_INCONSISTENT
     else:
         invalid |= 8  # NOT_MOVED_YET
         if isinstance(state, Leveling) or state.alignment.last_fix is None:

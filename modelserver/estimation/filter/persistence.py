@@ -9,7 +9,7 @@ from typing import Final
 
 from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.errors import quote
-from modelserver.estimation.filter import consistency_step, propagation, protection_levels
+from modelserver.estimation.filter import output, propagation, protection_levels
 from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, Leveling
@@ -39,8 +39,8 @@ def get_persisted_state(setup: Setup, state: FilterState, invalid: int) -> Persi
     nav = state.nav
     P = nav.covariance
     if isinstance(state, Aligned):
-        # the monitor is not stored: its bound of the heading is
-        bound = consistency_step.hold_heading(setup, state, nav).held
+        # neither bank nor monitor are stored: their level of the heading is
+        bound = output.get_heading_protection(setup, state)
         P = P.copy()
         P[8, 8] = max(float(P[8, 8]), protection_levels.invert_heading(bound, setup.settings))
     numbers = tuple(P.ravel().tolist())

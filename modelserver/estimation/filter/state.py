@@ -15,14 +15,16 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeAlias, TypeVar
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame
-from modelserver.estimation.filter.consistency_monitor import ConsistencyMonitor
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.eskf import ZERO, Earth, NavState
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment
+from modelserver.estimation.filter.hypothesis_bank import Bounds, HypothesisBank
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.receiver_monitor import ReceiverMonitor
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.estimation.filter.turn_monitor import TurnMonitor
 from modelserver.estimation.filter.wheel_monitor import WheelMonitor
 from modelserver.estimation.origin import OriginCapture
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode
@@ -179,13 +181,14 @@ class Leveling(NamedTuple):
 class Unaligned(NamedTuple):
     """Level, at an unknown heading: N is where the filter started, rotated about up by an unknown angle.
 
-    The four that change with each IMU sample are first. `site` is the tangent plane at the first fix, `leveled_since`
+    The five that change with each IMU sample are first. `site` is the tangent plane at the first fix, `leveled_since`
     the first sample of leveling.
     """
 
     nav: NavState
     imu: ImuMonitor
     stationary: StationaryDetector
+    reckoning: DeadReckoning
     alignment: HeadingAlignment
     constraints: MotionConstraints
     common: Common
@@ -203,10 +206,12 @@ class Unaligned(NamedTuple):
         """Whether the vehicle is stationary."""
         return self.constraints.is_stationary
 
-    def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Unaligned:
+    def with_imu(
+        self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector, reckoning: DeadReckoning
+    ) -> Unaligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
         alignment = self.alignment.update(self.nav, nav) if nav.utime > self.nav.utime else self.alignment
-        return new_tuple(Unaligned, (nav, imu, stationary, alignment, *self[4:]))
+        return new_tuple(Unaligned, (nav, imu, stationary, reckoning, alignment, *self[5:]))
 
     def with_nav(self, nav: NavState) -> Unaligned:
         """Return the state propagated to a later instant."""
@@ -217,19 +222,24 @@ class Unaligned(NamedTuple):
 class Aligned(NamedTuple):
     """The vehicle in the world: N is east, north, up of the tangent plane `site`.
 
-    `heading_check` is what a restored heading is compared with, until it is confirmed or wrong.
+    `heading_check` is what a restored heading is compared with, until it is confirmed or wrong. `bank` judges fixes
+    where wheels and a gyro measure the path, and `bounds` are those of the pose by it; `turns` compares
+    the heading with the gyro where wheels do not.
     """
 
     nav: NavState
     imu: ImuMonitor
     stationary: StationaryDetector
+    reckoning: DeadReckoning
     constraints: MotionConstraints
     common: Common
     earth: Earth
     site: LocalFrame
     gnss: GnssMonitor = GnssMonitor()
-    consistency: ConsistencyMonitor = ConsistencyMonitor()
+    turns: TurnMonitor = TurnMonitor()
     heading_check: HeadingCheck | None = None
+    bank: HypothesisBank | None = None
+    bounds: Bounds | None = None
 
     @property
     def phase(self) -> Phase:
@@ -241,9 +251,11 @@ class Aligned(NamedTuple):
         """Whether the vehicle is stationary."""
         return self.constraints.is_stationary
 
-    def with_imu(self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector) -> Aligned:
+    def with_imu(
+        self, nav: NavState, imu: ImuMonitor, stationary: StationaryDetector, reckoning: DeadReckoning
+    ) -> Aligned:
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
-        return new_tuple(Aligned, (nav, imu, stationary, *self[3:]))
+        return new_tuple(Aligned, (nav, imu, stationary, reckoning, *self[4:]))
 
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""

@@ -59,7 +59,7 @@ def _apply_pending(setup: Setup, state: FilterState, utime: int) -> Fused:
         if each.origin is not None:
             common = common._replace(geodesy=Geodesy(each.origin))
         state = state._replace(common=common)
-        if each.resets_position and isinstance(state, Aligned) and state.consistency.may_reset:
+        if each.resets_position and isinstance(state, Aligned) and state.bank is None:
             state = propagation.propagate_covariance(setup, state)
             state, decision = gnss_step.reset_position(setup, state)
             decisions += () if decision is None else (decision,)

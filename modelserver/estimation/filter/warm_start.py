@@ -301,6 +301,7 @@ def _restore_pose(
         ),
         state.imu,
         state.stationary,
+        state.reckoning,
         state.constraints,
         common._replace(epoch=pose.pose_epoch + 1, warm_start=None),
         Earth.at(pose.latitude_deg, pose.height),

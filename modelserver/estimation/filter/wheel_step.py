@@ -12,11 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, latency_estimator, leveling, propagation
+from modelserver.estimation.filter import bank_step, eskf, latency_estimator, leveling, propagation
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
-    LONGEST_MEAN,
     NOTHING,
     ZUPT_PERIOD,
     Fused,
@@ -94,6 +93,8 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if decisions and decisions[0].limit > 0.0:
         state, more = _judge(setup, state, item, decisions[0], are_stationary=are_stationary is True)
         decisions += more
+    if state.reckoning.utime != item.utime:
+        state = state._replace(reckoning=bank_step.predict_path(setup, state))
     nav = state.nav._replace(travel=ZERO, rotation=ZERO)
     state = state._replace(nav=nav, common=remember(state.common, (item.source, item.kind), item))
     if not has_imu:
@@ -104,6 +105,9 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if not state.is_stationary and (is_first_speed or since >= 0.5 * CONSTRAINT_PERIOD):
         state, decision = fuse_non_holonomic(setup, state, item.utime)
         decisions += (decision,)
+    if isinstance(state, Aligned) and state.bank is not None:
+        state, more = bank_step.advance(setup, state)
+        decisions += more
     return state, decisions
 
 
@@ -163,11 +167,12 @@ def _fuse_speed(
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
-        # not where the gate has rejected some of them, or inflated their noise
-        if isinstance(state, Aligned) and not decision.reason and age < math.inf and not is_first_speed:
-            missed = float(innovation.residual.mean()) * min(age, LONGEST_MEAN)
-            monitor = state.consistency.follow_wheels(cmath.rect(missed, context.nav.yaw), item.utime)
-            state = state._replace(consistency=monitor)
+        if age < math.inf:
+            missed = float(innovation.residual.mean()) * age
+            distance = bank_step.get_wheel_travel(setup, context.nav) + missed
+            # beyond the gate either the wheels are wrong or the state is
+            variance = missed**2 if decision.reason else 0.0
+            state = state._replace(reckoning=state.reckoning.drive(item.utime, distance, variance))
     common = state.common._replace(wheels=wheels, mount=mount)
     return state._replace(nav=nav, common=common), (decision,), is_first_speed
 
@@ -190,6 +195,9 @@ def _judge(
         return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
     if state.is_stationary or judged.has_held:
         state = release_motion(state)
+    if isinstance(state, Aligned):
+        # its path is that of wheels that were stuck
+        state = state._replace(bank=None, bounds=None)
     state = state._replace(stationary=state.stationary._replace(wheels_stationary=None))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 

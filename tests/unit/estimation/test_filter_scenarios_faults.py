@@ -196,8 +196,11 @@ def test_given_gaps_of_the_imu_then_they_are_bridged_and_the_protection_level_co
 def test_given_wheels_that_fail_with_fixes_then_the_pose_stays_right(encoder):
     found = drive(simulation(EIGHT, wheels_model=WheelsModel(WHEELS_TIMING, encoder=encoder)), 50.0)
 
-    _check_all(found, 22.0, most=1.5)
-    assert not any(row.estimate.invalid for row in found.between(26.0))
+    rows = found.between(22.0)
+    assert all(row.off < min(1.5, row.estimate.horizontal_level) for row in rows)
+    assert all(abs(row.heading) < math.radians(6.0) for row in rows)
+    # wheels that contradict fixes and gyro are a path of unknown length
+    assert sum(row.valid for row in rows) > 0.9 * len(rows)
 
 
 def test_given_gravity_along_another_axis_than_by_the_mount_then_the_pose_is_never_valid_and_the_reason_is_reported():

@@ -10,6 +10,7 @@ from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_na
 from support_filter import skip_if_compiled
 
 from modelserver.estimation.filter import eskf, propagation
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, Earth, NavState, ProcessNoise
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
@@ -196,7 +197,14 @@ def test_given_a_gap_then_the_last_sample_is_held_for_a_while_and_then_the_state
     nav = some_nav(setup, 1)._replace(attitude=so3.IDENTITY, velocity=(2.0, 0.0, 0.0), gyro_bias=ZERO)
     nav = nav._replace(rate=(0.0, 0.0, 0.5), force=(0.0, 0.0, eskf.STANDARD_GRAVITY), accelerometer_bias=ZERO)
     state = Aligned(
-        nav, ImuMonitor(used_utime=nav.utime), StationaryDetector(), MotionConstraints(), Common(), Earth(), SITE
+        nav,
+        ImuMonitor(used_utime=nav.utime),
+        StationaryDetector(),
+        DeadReckoning(),
+        MotionConstraints(),
+        Common(),
+        Earth(),
+        SITE,
     )
     held = propagation.predict_nav(setup, state, nav.utime + 150_000)
     assert held.yaw == pytest.approx(0.075)

@@ -14,6 +14,7 @@ from support_filter import ORIGIN, drive, simulation
 from support_restart import TO_A_STOP, skip_samples
 
 from modelserver.estimation.filter import step
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.eskf import Earth, NavState
 from modelserver.estimation.filter.fusion import get_steering_angle, split_sample
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
@@ -207,7 +208,7 @@ def test_given_two_wheels_without_angles_then_they_measure_the_turn_rate(speed, 
 def create_aligned(nav: NavState, steering: SteeringAngle) -> Aligned:
     """Return an aligned state with a steering angle."""
     common = Common(wheels=WheelMonitor(steering=steering))
-    return Aligned(nav, ImuMonitor(), StationaryDetector(), MotionConstraints(), common, Earth(), SITE)
+    return Aligned(nav, ImuMonitor(), StationaryDetector(), DeadReckoning(), MotionConstraints(), common, Earth(), SITE)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])

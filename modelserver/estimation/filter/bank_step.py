@@ -1,0 +1,332 @@
+"""Hypothesis bank of an aligned vehicle: started, advanced by dead reckoning and fixes, and what follows from it.
+
+The bank judges the state, and corrects it: it is set to the published hypothesis where that excludes fixes, begins a
+fault of gyro, wheels or latency, or is elsewhere, or where the state's own pose is too likely beyond its limits.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from modelserver.estimation.filter import heading_alignment, heading_step, hypothesis_bank, output
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning
+from modelserver.estimation.filter.error_layout import STRAPDOWN
+from modelserver.estimation.filter.eskf import NavState
+from modelserver.estimation.filter.fusion import report_event
+from modelserver.estimation.filter.gnss_monitor import AIDED_TIME
+from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
+from modelserver.estimation.filter.hypothesis_bank import (
+    BIAS,
+    DELAY,
+    HEADING,
+    MOVED,
+    SHARE_OF_LIMIT,
+    TURNED,
+    WHEEL_SCALE,
+    Fault,
+    HypothesisBank,
+    PlanarFix,
+)
+from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
+from modelserver.estimation.filter.measurements.wheels import SCALE
+from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_longest_variance
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Aligned, Navigating, Unaligned
+from modelserver.estimation.filter.turn_monitor import START_ERROR
+from modelserver.messages import Decision, Verdict
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Array
+
+KIND: Final = "consistency"
+
+STEP_US: Final = 400_000
+"""Microseconds between two fixes that the bank uses, at least: those between show the same errors."""
+
+LONGEST_STEP_US: Final = 1_500_000
+"""Microseconds of a step without a fix."""
+
+SILENT_US: Final = 5_000_000
+"""Microseconds without wheels after which a moving vehicle has no path to judge fixes by."""
+
+UNMEASURED_SPEED: Final = 1.0
+UNMEASURED_SHARE: Final = 0.3
+"""Standard deviation of a speed that wheels do not measure, m/s, or as a share of it; it lasts a second."""
+
+CLEARLY_LESS: Final = 0.1
+"""Risk of the hypothesis' pose, relative to that of the state's, with which it is another one."""
+
+MOVED_RISK: Final = 0.5
+"""Probability that a vehicle moves whose fixes move away while it stands, as on a ferry: fixes that drift are alike."""
+
+CERTAIN_SIGMAS: Final = 3.0
+"""Standard deviations of a hypothesis' heading by which another one is wrong."""
+
+SKID_SLIP: Final = 3.0
+"""Slip of the wheels of a skid-steered vehicle beside that of others: they slide in every turn."""
+
+_STATES: Final = (
+    hypothesis_bank.EAST,
+    hypothesis_bank.NORTH,
+    HEADING,
+    BIAS,
+    WHEEL_SCALE,
+    DELAY,
+    hypothesis_bank.ERROR,
+    hypothesis_bank.ERROR + 1,
+)
+"""States of a hypothesis that the filter has too."""
+
+
+class _Shared(NamedTuple):
+    """Those states by the filter: values (8), and their rows of its error state (8, n)."""
+
+    values: Array
+    rows: Array
+
+
+def can_judge(setup: Setup, state: Aligned, utime: int) -> bool:
+    """Return whether wheels and a gyro measure a path to judge fixes by."""
+    mode = state.common.mode
+    if setup.wheels is None or not setup.uses_gnss(mode) or not state.reckoning.gyro_utime:
+        return False
+    if not (setup.uses_imu(mode) or setup.yaw_gyro is not None):
+        return False
+    if utime - max(state.gnss.offset.aided_utimes) < AIDED_TIME * 1e6:
+        return False  # another source measures the position, and the bank does not know it
+    return state.is_stationary or utime - state.reckoning.utime < SILENT_US
+
+
+def predict_path(setup: Setup, state: Navigating) -> DeadReckoning:
+    """Return dead reckoning at the instant of the state, after the way that it has travelled since the last wheels.
+
+    Where wheels do not measure the speed, the state's own is as good as there is.
+    """
+    nav, reckoning = state.nav, state.reckoning
+    variance = 0.0
+    if not state.common.measures_wheel_speed(nav.utime):
+        seconds = (nav.utime - reckoning.utime) * 1e-6
+        speed = nav.body_velocity(setup.rig.base)[0]
+        sigma = max(UNMEASURED_SPEED, UNMEASURED_SHARE * abs(speed))
+        variance = sigma**2 * seconds * max(seconds, 1.0)
+    return reckoning.drive(nav.utime, get_wheel_travel(setup, nav), variance)
+
+
+def get_wheel_travel(setup: Setup, nav: NavState) -> float:
+    """Return the way since the last wheel sample as wheels measure it: with their scale, m."""
+    scale = nav.extras[setup.layout.extra_index(SCALE)] if SCALE in setup.layout else 0.0
+    return (1.0 + scale) * nav.travel[0]
+
+
+def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tuple[Aligned, tuple[Decision, ...]]:
+    """Return the state with its bank at its instant, after a fix or none, and set to a hypothesis that excludes fixes.
+
+    A bank without a path any more ends.
+    """
+    bank, utime = state.bank, state.nav.utime
+    if bank is None:
+        return state, ()
+    if not can_judge(setup, state, utime):
+        return state._replace(bank=None, bounds=None), ()
+    if utime - bank.utime < (STEP_US if newest is not None else LONGEST_STEP_US):
+        return state, ()
+    now = predict_path(setup, state)
+    step = now.since(bank.reckoning, is_stationary=state.is_stationary)
+    fix = None if newest is None else _read_fix(setup, state, newest)
+    after = bank.advance(utime, step, fix, setup.settings, _get_slip(setup))._replace(reckoning=now)
+    after = after.judge_fixes(output.get_limits(setup, state)[0], is_stationary=state.is_stationary)
+    state = state._replace(bank=after)
+    if newest is None:
+        return _judge(setup, state), ()
+    if not after.excludes_fixes:
+        if not bank.excludes_fixes:
+            return state, ()
+        state = state._replace(gnss=state.gnss.restart(utime))
+        text = "fixes are trusted again: they agree with dead reckoning"
+        return state, (report_event(state, KIND, Verdict.USED, text),)
+    decisions: tuple[Decision, ...] = ()
+    if not bank.excludes_fixes or bank.fault is not after.fault:
+        what = "they jumped" if after.jumped[after.published] else "they drift"
+        text = f"fixes are {abs(after.offset):.1f} m off dead reckoning: {what}"
+        decisions = (report_event(state, KIND, Verdict.RESET, text),)
+    return _judge(setup, _follow(setup, state)), decisions
+
+
+def settle(
+    setup: Setup, state: Aligned, before: HypothesisBank | None
+) -> tuple[Aligned | Unaligned, tuple[Decision, ...]]:
+    """Return the state after a fix was used, judged by its bank, and set to its hypothesis where it must be.
+
+    `before`: the bank before the fix. A bank begins with a fix that the state agrees with.
+    """
+    bank, utime = state.bank, state.nav.utime
+    if bank is None:
+        if not (can_judge(setup, state, utime) and state.common.measures_wheel_speed(utime)):
+            return state, ()
+        if state.gnss.used_utime != utime or state.gnss.last_fix is None or state.is_stationary:
+            return state, ()
+        if state.turns.is_transported:
+            text = "the wheels roll again after the vehicle was transported: its heading is lost"
+            return heading_step.lose_heading(state), (report_event(state, KIND, Verdict.RESET, text),)
+        return _judge(setup, _start(setup, state, state.gnss.last_fix)), ()
+    if bank is before:
+        return state, ()
+    state = _judge(setup, state)
+    assert state.bounds is not None
+    text = _describe(bank)
+    ends = before is not None and before.excludes_fixes and _has_moved(setup, state)
+    if not text and _is_turned(setup, state):
+        text = "the heading is not that of dead reckoning which fixes agree with"
+    if not text and (ends or state.bounds.risk > LIMIT_RISK):
+        own = bank.compute_bounds(bank.pose, output.get_limits(setup, state), setup.settings)
+        if ends or own.risk < CLEARLY_LESS * state.bounds.risk:
+            text = "fixes agree with dead reckoning, the pose does not"
+    if not text:
+        return state, ()
+    state = _judge(setup, _follow(setup, state))
+    return state, (report_event(state, KIND, Verdict.RESET, text),)
+
+
+def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state with a bank at its pose."""
+    nav, settings = state.nav, setup.settings
+    shared = _share(setup, nav, newest)
+    covariance = shared.rows @ nav.covariance @ shared.rows.T
+    # fixes have shown the heading, and the allowance for their error decays as others confirm it
+    covariance[2, 2] += (state.turns.allowance / START_ERROR) ** 2
+    sigma = math.hypot(newest.white, newest.correlated)
+    bank = hypothesis_bank.start_bank(nav.utime, sigma, settings)
+    means, covariances = bank.means.copy(), bank.covariances.copy()
+    prior = covariances[0][np.ix_(_STATES, _STATES)]
+    means[0, _STATES] = shared.values
+    covariances[0][np.ix_(_STATES, _STATES)] = covariance + prior
+    bank = bank._replace(means=means, covariances=covariances, reckoning=predict_path(setup, state))
+    return state._replace(bank=bank)
+
+
+def _read_fix(setup: Setup, state: Aligned, newest: PathFix) -> PlanarFix:
+    """Return a fix as the bank has it."""
+    nav = state.nav
+    back = cmath.rect(1.0, -nav.yaw)
+    velocity = to_horizontal(nav.point_velocity(setup.rig.lever_arm(setup.rig.gps_frame)))
+    sigma = math.hypot(newest.white, newest.correlated)
+    return PlanarFix(newest.position, sigma, newest.arm * back, velocity * back, nav.angular_rate[2])
+
+
+def _get_slip(setup: Setup) -> float:
+    assert setup.wheels is not None
+    return setup.settings.slip_ratio * (SKID_SLIP if setup.wheels.skid else 1.0)
+
+
+def _share(setup: Setup, nav: NavState, newest: PathFix) -> _Shared:
+    """Return the states of the filter that a hypothesis has too."""
+    layout, n = setup.layout, setup.layout.size
+    base = nav.point(setup.rig.base)
+    x, y, z = so3.rotate(nav.attitude, setup.rig.base)
+    rows = np.zeros((len(_STATES), n))
+    rows[0, (0, 7, 8)] = 1.0, z, -y
+    rows[1, (1, 6, 8)] = 1.0, -z, x
+    rows[2, 8] = rows[3, 11] = 1.0
+    values = [base[0], base[1], nav.yaw, nav.gyro_bias[2], 0.0, 0.0, 0.0, 0.0]
+    named = ((4, SCALE, 1.0), (5, LATENCY, 1.0), *((6 + k, CORRELATED_ERROR[k], newest.correlated) for k in (0, 1)))
+    for row, name, unit in named:
+        if name in layout:
+            at = layout.index(name)
+            rows[row, at] = unit
+            values[row] = unit * nav.extras[at - STRAPDOWN]
+    return _Shared(np.array(values), rows)
+
+
+def _follow(setup: Setup, state: Aligned) -> Aligned:
+    """Return the state set to the published hypothesis: its values, and their covariance by Jeffrey's rule.
+
+    P' = P + K (C - S) K', K = P H' S^-1, S = H P H': what else the state knows is as it was given them (R. Jeffrey,
+    "The Logic of Decision", 1983, 11). In a new epoch, if the pose moves.
+    """
+    bank, newest, nav = state.bank, state.gnss.last_fix, state.nav
+    assert bank is not None
+    assert newest is not None
+    has_moved = _has_moved(setup, state)
+    mean = bank.means[bank.published]
+    target = bank.covariances[bank.published][np.ix_(_STATES, _STATES)]
+    turn = wrap_angle(float(mean[HEADING]) - nav.yaw)
+    place = nav.position
+    nav = heading_alignment.rotate(nav, Rotation(turn, 0.0), setup.layout)._replace(position=place)
+    shared = _share(setup, nav, newest)
+    change = mean[list(_STATES)] - shared.values
+    error = np.zeros(setup.layout.size)
+    error[:2], error[11] = change[:2], change[3]
+    for row in range(4, len(_STATES)):
+        if shared.rows[row].any():
+            at = int(np.flatnonzero(shared.rows[row])[0])
+            error[at] = change[row] / shared.rows[row, at]
+    used = shared.rows.any(axis=1)
+    H, target = shared.rows[used], target[np.ix_(used, used)]
+    P = nav.covariance
+    PH = P @ H.T
+    S = H @ PH
+    S.reshape(-1)[:: len(S) + 1] += 1e-12
+    gain = np.linalg.solve(S, PH.T).T
+    P = P + gain @ (target - S) @ gain.T
+    nav = nav.inject(error, 0.5 * (P + P.T))
+    common = state.common._replace(epoch=state.common.epoch + 1) if has_moved else state.common
+    gnss = state.gnss.place(state.gnss.used_utime)
+    offset = gnss.offset.update(
+        nav, (newest.correlated, newest.correlated, 0.0), math.inf, slice(0, 2), setup.layout, setup.settings
+    )
+    gnss = gnss._replace(offset=offset, outlier_allowance=0.0)
+    return state._replace(nav=nav, gnss=gnss, common=common)
+
+
+def _get_pose(setup: Setup, state: Aligned) -> tuple[float, float, float]:
+    """Return the pose that is published: east, north (m) and heading (rad) of the rolling frame."""
+    x, y, _ = state.nav.point(setup.rig.base)
+    a, b, _ = state.gnss.offset.value
+    return x + a, y + b, state.nav.yaw
+
+
+def _has_moved(setup: Setup, state: Aligned) -> bool:
+    """Return whether the published hypothesis is another pose than the state's."""
+    assert state.bank is not None
+    (x, y, heading), (a, b, _) = state.bank.pose, state.nav.point(setup.rig.base)
+    return math.hypot(x - a, y - b) > MOVED or abs(wrap_angle(heading - state.nav.yaw)) > TURNED
+
+
+def _is_turned(setup: Setup, state: Aligned) -> bool:
+    """Return whether the published hypothesis has another heading, by what matters and for certain."""
+    bank = state.bank
+    assert bank is not None
+    _, limit = output.get_limits(setup, state)
+    sigma = math.sqrt(float(bank.covariances[bank.published, HEADING, HEADING]))
+    turned = abs(wrap_angle(bank.pose[2] - state.nav.yaw))
+    return turned > max(SHARE_OF_LIMIT * limit, CERTAIN_SIGMAS * sigma)
+
+
+def _judge(setup: Setup, state: Aligned) -> Aligned:
+    """Return the state with the error by its bank of its pose."""
+    assert state.bank is not None
+    P = output.compute_covariance(setup, state)
+    variances = compute_longest_variance(P), float(P[5, 5])
+    limits = output.get_limits(setup, state)
+    bounds = state.bank.compute_bounds(_get_pose(setup, state), limits, setup.settings, variances)
+    if state.bank.may_be_transported:
+        # it is where fixes are, or where it stood
+        off = abs(state.bank.offset)
+        bounds = bounds._replace(horizontal_level=bounds.horizontal_level + off, horizontal_risk=MOVED_RISK)
+    return state._replace(bounds=bounds)
+
+
+def _describe(bank: HypothesisBank) -> str:
+    """Return in words what has become certain, and is corrected."""
+    mean = bank.means[bank.published]
+    if bank.settled is Fault.GYRO:
+        return f"fixes disagree with dead reckoning: the gyro's bias is {math.degrees(mean[BIAS]):.2f} deg/s now"
+    if bank.settled is Fault.WHEELS:
+        return f"fixes disagree with dead reckoning: the wheels' scale is {100.0 * mean[WHEEL_SCALE]:.1f} % off now"
+    if bank.settled is Fault.LATENCY:
+        return f"fixes disagree with dead reckoning: they are {mean[DELAY]:.2f} s late now"
+    return ""

@@ -1,0 +1,674 @@
+"""Hypothesis bank: what may be wrong with fixes, gyro and wheels, as planar Kalman filters beside each other.
+
+Each hypothesis has its own estimate of the vehicle's place and heading, and a posterior probability (multiple model
+estimation: Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 11.6). All
+share the increments of dead reckoning since the last step, which no fix has corrected (`dead_reckoning`): turn theta,
+path u and its moment m = int (t - t0) du, in the heading of the first instant. They differ in what was opened
+and when.
+
+State of a hypothesis, 19: place p and heading psi of the rolling frame; bias b and scale g of the yaw gyro, scale s of
+the wheels; latency l of fixes; error a of the antenna's lever arm; ordinary error w of fixes and its rate v; offset o
+and drift d of faulty fixes; jump j. With the turn theta' = (1 - g) theta - b T:
+
+    p' = p + e^{i psi} ((1 - s) u - i b m - i g theta u / 2),   psi' = psi + theta'                               (1)
+    w' = e^{-T/tau_w} w + T v,  v' = e^{-T/tau_v} v,   o' = e^{-T/tau_o} o + T d,  d' = e^{-T/tau_d} d            (2)
+    z = p + e^{i psi} (lever + a) + w + o + j - l v_a + l^2 a_a / 2 + white noise                                 (3)
+
+Noise classes are no faults: the ordinary error of fixes wanders with the stated sigma, or with a rate v of 0.4 or 0.8
+of it a second, bounded. Faults are those of `Fault`, and jumps. At each step the likeliest hypotheses have children in
+which one of them begins or ends, with the rate of `FAULTS` as prior. The weight of each is multiplied by the likelihood
+of the fix, with shares of outliers and of fixes that show nothing, so that no single fix settles a cause. Hypotheses of
+one kind that began at about the same time are merged by their moments.
+
+One of them is published: the likeliest, once those near it weigh `CERTAIN` together. The error of a pose is then the
+mixture sum_h w_h N(p_h - p, P_h): its tails are the levels, and the risk of a limit (`compute_bounds`). The protection
+level covers each hypothesis at an equal share of the risk, so also a fault that cannot be seen yet.
+
+Limits: fixes that drift slower than wheels and gyro are known (2 % of the speed) are found in turns only. Without
+wheels or a gyro there is no bank.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.estimation.filter.dead_reckoning import DeadReckoning, Increment
+from modelserver.estimation.filter.protection_levels import (
+    HEADING_FLOOR,
+    LEVEL_RISK,
+    compute_factors,
+    compute_limit_risks,
+    get_factors,
+)
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.transforms.so3 import Array
+
+Labels = npt.NDArray[np.int64]
+
+EAST, NORTH, HEADING, BIAS, WHEEL_SCALE, DELAY, ARM, GYRO_SCALE = 0, 1, 2, 3, 4, 5, 6, 8
+ERROR, ERROR_RATE, OFFSET, DRIFT, JUMP, SIZE = 9, 11, 13, 15, 17, 19
+"""Indices of the states; those of ARM and from ERROR on have two numbers, along the vehicle or east and north."""
+
+
+class Fault(IntEnum):
+    """What lasts until it is corrected or ends. SPOOFING is a drift at a constant rate, without bound."""
+
+    NONE = 0
+    DRIFT = 1
+    SPOOFING = 2
+    GYRO = 3
+    WHEELS = 4
+    LATENCY = 5
+
+
+class NoiseClass(NamedTuple):
+    """How the ordinary error of fixes wanders: rate of change in sigmas a second, its time and that of the error (s),
+    and how often an hour it begins.
+    """
+
+    rate: float
+    rate_time: float
+    time: float
+    per_hour: float
+
+
+NOISE_CLASSES: Final = (
+    NoiseClass(0.0, 1.0, 60.0, 10.0),
+    NoiseClass(0.4, 5.0, 10.0, 30.0),
+    NoiseClass(0.8, 5.0, 10.0, 10.0),
+)
+"""The first is the stated error (time of the setting `gps_correlation_time`); the others are those of receivers that
+state half or a quarter of what they wander by."""
+
+DRIFT_RATE: Final = 0.3
+JUMP_SIZE: Final = 20.0
+"""Standard deviations of a drift of fixes (m/s) and of a jump (m): reflections at buildings."""
+
+FAULTS: Final[dict[Fault, tuple[float, tuple[tuple[int, float], ...]]]] = {
+    Fault.DRIFT: (0.5, ((DRIFT, DRIFT_RATE), (DRIFT + 1, DRIFT_RATE))),
+    Fault.SPOOFING: (0.1, ((DRIFT, DRIFT_RATE), (DRIFT + 1, DRIFT_RATE))),
+    Fault.GYRO: (0.1, ((BIAS, 0.01),)),
+    Fault.WHEELS: (0.1, ((WHEEL_SCALE, 0.05),)),
+    Fault.LATENCY: (0.01, ((DELAY, 0.3),)),
+}
+"""How often an hour each begins, and the standard deviations that it opens."""
+
+JUMPS_PER_HOUR: Final = 1.0
+JUMP_ENDS_PER_HOUR: Final = 60.0
+DRIFT_ENDS_PER_HOUR: Final = 6.0
+"""Jumps last a minute, drifts ten."""
+
+DRIFT_TIME, DRIFT_OFFSET_TIME, SPOOFING_TIME = 30.0, 100.0, 1e4
+"""Seconds in which the rate and the offset of a drift decay, and the rate of spoofed fixes."""
+
+OUTLIER_SHARE, OUTLIER_SIGMA = 0.01, 10.0
+"""Share of fixes that are off by meters for themselves, and their standard deviation, m."""
+
+VOID_SHARE: Final = 0.02
+"""Share of fixes, and of mean rates at rest, that show nothing: by so much one of them may lower a weight."""
+
+OUTLIER_NIS: Final = 13.8
+"""NIS of two numbers beyond which the gain is reduced: 0.1 % of a normal error."""
+
+ARM_SIGMA_LEAST: Final = 0.3
+RATE_FLOOR: Final = 3e-4
+"""Sigma of a mean rate at rest beside its noise, rad/s: an idling engine, and what a vehicle sways."""
+
+START_BIAS: Final = 0.003
+"""Standard deviation of the bias of a gyro beside what alignment has shown, rad/s: what it changes by while warming up.
+"""
+
+TURNING_RATE: Final = 0.03
+CONSTANT_RATE: Final = 0.005
+"""Rate of a vehicle that begins to turn, rad/s, and by what that of one at rest differs from step to step: the noise of
+half a second, three times."""
+
+LATENCY_SIGMA: Final = 0.1
+LATENCY_WALK: Final = 0.002
+"""Standard deviation of a latency that is not stated, s (Groves 2013, 10.3), and its walk, s per root of a second."""
+
+TURN_NOISE: Final = 0.003
+"""Noise of a turn beside the gyro's scale, as a share of it: cross-coupling of axes in hills."""
+
+SLIP_IN_TURN: Final = 0.03
+"""Error along the path by a turn, m per rad."""
+
+AGES_US: Final = np.array((2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)) * 1e6
+"""Ages up to which hypotheses of one kind are merged."""
+
+MOST_HYPOTHESES: Final = 40
+LEAST_WEIGHT: Final = 1e-10
+CERTAIN: Final = 0.9
+SETTLED: Final = 0.999
+"""Weights from which on a hypothesis is published, and is no longer a fault but a corrected state."""
+
+SHARE_OF_LIMIT: Final = 0.2
+"""Share of a limit that matters: fixes that are off by less cost less than dead reckoning does."""
+
+PLACE_SIGMA: Final = 0.1
+"""Sigma of the place of the rolling frame beside the states, m."""
+
+MOVED, TURNED = 1.0, 0.1
+"""Distance (m) and angle (rad) by which another hypothesis is another pose."""
+
+NEVER: Final = np.iinfo(np.int64).min // 2
+GRID: Final = np.linspace(0.0, 1.0, 33)[:, None, None]
+
+LONGEST_STEP: Final = 5.0
+"""Seconds of a step for which something may have fault_number in it."""
+
+
+class PlanarFix(NamedTuple):
+    """A fix east + i north (m) and its sigma; `lever` from the rolling frame to the antenna, forward + i left (m);
+    `velocity` of the antenna in the same axes (m/s), `turn_rate` (rad/s).
+    """
+
+    position: complex
+    sigma: float
+    lever: complex
+    velocity: complex
+    turn_rate: float
+
+
+class Bounds(NamedTuple):
+    """The error of a pose by the mixture: levels, protection levels (m, rad) and risks of the limits.
+
+    `variances` are those of the pose's own covariance then: longest axis (m2) and heading (rad2).
+    """
+
+    horizontal_level: float
+    heading_level: float
+    horizontal_protection: float
+    heading_protection: float
+    horizontal_risk: float
+    heading_risk: float
+    variances: tuple[float, float]
+
+    @property
+    def risk(self) -> float:
+        """Probability that position or heading are beyond their limits."""
+        return self.horizontal_risk + self.heading_risk
+
+    def grow(self, variances: tuple[float, float], limits: tuple[float, float], settings: FilterSettings) -> Bounds:
+        """Return the bounds of a pose that is predicted from then on, by the growth of its own covariance."""
+        (before, heading_before), (after, heading_after) = self.variances, variances
+        if not (after > before or heading_after > heading_before):
+            return self
+        floor = HEADING_FLOOR**2
+        sigmas = math.sqrt(before), math.sqrt(heading_before + floor)
+        grown = math.sqrt(max(after, before)), math.sqrt(max(heading_after, heading_before) + floor)
+        level, heading_level = compute_factors(LEVEL_RISK)
+        protection, heading_protection = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+        more, turned = grown[0] - sigmas[0], grown[1] - sigmas[1]
+        allowance = max(self.horizontal_level - level * sigmas[0], 0.0)
+        least = compute_limit_risks(*sigmas, limits[0] - allowance, limits[1])
+        risks = compute_limit_risks(*grown, limits[0] - allowance, limits[1])
+        return Bounds(
+            self.horizontal_level + level * more,
+            min(self.heading_level + heading_level * turned, math.pi),
+            self.horizontal_protection + protection * more,
+            min(self.heading_protection + heading_protection * turned, math.pi),
+            min(self.horizontal_risk + risks[0] - least[0], 1.0),
+            min(self.heading_risk + risks[1] - least[1], 1.0),
+            variances,
+        )
+
+
+class HypothesisBank(NamedTuple):
+    """Hypotheses at `utime`; arrays have one entry for each of k.
+
+    Attributes
+    ----------
+    means (k, 19), covariances (k, 19, 19), weights (k): the estimates and their posterior probabilities.
+    faults, jumped, noises, onsets (k): what each assumes, and since when (utime, NEVER).
+    published: index of the one that is published.
+    inflation: of the white noise of fixes, learned, 1 to 4.
+    rest_rate: mean turn rate of the step before, rad/s, of a vehicle at rest; nan: it was not.
+    sigma: of the last fix, m.
+    settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
+    excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
+    may_be_transported: whether that began while the vehicle stood: a ferry or a trailer may move it.
+    reckoning: dead reckoning at `utime`.
+    """
+
+    utime: int
+    means: Array
+    covariances: Array
+    weights: Array
+    faults: Labels
+    jumped: Labels
+    noises: Labels
+    onsets: Labels
+    published: int = 0
+    inflation: float = 1.0
+    rest_rate: float = math.nan
+    sigma: float = 1.0
+    settled: Fault = Fault.NONE
+    excludes_fixes: bool = False
+    may_be_transported: bool = False
+    reckoning: DeadReckoning = DeadReckoning()
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """East, north (m) and heading (rad) of the published hypothesis."""
+        x, y, heading = self.means[self.published, :3].tolist()
+        return x, y, heading
+
+    @property
+    def fault(self) -> Fault:
+        """The fault of the published hypothesis."""
+        return Fault(int(self.faults[self.published]))
+
+    @property
+    def assumption(self) -> tuple[Fault, bool]:
+        """Which fault the published hypothesis assumes, and whether fixes have jumped."""
+        return self.fault, bool(self.jumped[self.published])
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether something seems to be wrong with fixes, gyro or wheels, or may be."""
+        is_certain = self.weights[self.published] > CERTAIN
+        return self.assumption != (Fault.NONE, False) or not is_certain
+
+    def judge_fixes(self, limit: float, *, is_stationary: bool) -> HypothesisBank:
+        """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
+
+        They are not once they are certain to be off, by a share of the limit that matters; that lasts as long as the
+        published hypothesis has them off.
+        """
+        off = (self.jumped > 0) | (self.faults == Fault.DRIFT) | (self.faults == Fault.SPOOFING)
+        excludes = bool(off[self.published])
+        if excludes and not self.excludes_fixes:
+            is_far = abs(self.offset) > SHARE_OF_LIMIT * limit
+            excludes = is_far and bool(self.weights[off].sum() > SETTLED)
+        begins_at_rest = not self.excludes_fixes and is_stationary and not self.jumped[self.published]
+        may_be_transported = excludes and (self.may_be_transported or begins_at_rest)
+        return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported)
+
+    @property
+    def offset(self) -> complex:
+        """How far fixes are off by the published hypothesis, east + i north, m."""
+        x = self.means[self.published]
+        return complex(x[OFFSET] + x[JUMP], x[OFFSET + 1] + x[JUMP + 1])
+
+    def advance(
+        self, utime: int, step: Increment, fix: PlanarFix | None, settings: FilterSettings, slip: float
+    ) -> HypothesisBank:
+        """Return the bank at a later instant, after dead reckoning and, if there is one, a fix."""
+        seconds = step.seconds
+        rate = step.turn / seconds
+        bias = self.means[self.published, BIAS]
+        # it begins to turn before wheels and accelerations show it, and a bias that has changed is constant
+        is_constant = abs(rate - self.rest_rate) < CONSTANT_RATE
+        is_stationary = step.is_stationary and (is_constant or abs(rate - bias) < TURNING_RATE)
+        stands = step.is_stationary
+        step = step._replace(is_stationary=is_stationary)
+        bank = self if fix is None else self._replace(sigma=fix.sigma)
+        bank = bank._predict(step, settings, slip)
+        if is_stationary and not math.isnan(bank.rest_rate):
+            # the mean ended a step ago: the vehicle has stood since
+            bank = bank._measure_rest(bank.rest_rate, seconds, settings)
+        bank = bank._spawn(utime, min(seconds, LONGEST_STEP), fix)
+        if fix is not None:
+            bank, nis = bank._fuse(fix, settings)
+            if bank.weights[bank.published] > CERTAIN:
+                change = min(seconds, 2.0) / 30.0 * (min(0.5 * nis, 9.0) - 1.0)
+                bank = bank._replace(inflation=min(max(bank.inflation * (1.0 + change), 1.0), 4.0))
+        return bank._reduce(utime)._replace(rest_rate=rate if stands else math.nan)
+
+    def _predict(self, step: Increment, settings: FilterSettings, slip: float) -> HypothesisBank:
+        """Return the bank after dead reckoning, equations (1) and (2)."""
+        X, T, theta = self.means.copy(), step.seconds, step.turn
+        k = len(X)
+        F = np.zeros((k, SIZE, SIZE))
+        F.reshape(k, -1)[:, :: SIZE + 1] = 1.0
+        if not step.is_stationary:
+            spin = np.exp(1j * X[:, HEADING])
+            u, half = step.path, 0.5j * theta * step.path
+            way = spin * ((1.0 - X[:, WHEEL_SCALE]) * u - 1j * X[:, BIAS] * step.moment - X[:, GYRO_SCALE] * half)
+            columns = (
+                (HEADING, 1j * way),
+                (WHEEL_SCALE, -spin * u),
+                (BIAS, -1j * spin * step.moment),
+                (GYRO_SCALE, -spin * half),
+            )
+            for at, column in columns:
+                F[:, EAST, at], F[:, NORTH, at] = column.real, column.imag
+            F[:, HEADING, BIAS], F[:, HEADING, GYRO_SCALE] = -T, -theta
+            X[:, EAST] += way.real
+            X[:, NORTH] += way.imag
+            X[:, HEADING] += theta - X[:, BIAS] * T - X[:, GYRO_SCALE] * theta
+        noise = _NOISES[self.noises]
+        times = np.where(self.noises == 0, settings.gps_correlation_time, noise[:, 2])
+        drifts = self.faults == Fault.DRIFT
+        fades = (
+            (ERROR, ERROR_RATE, np.exp(-T / times), np.exp(-T / noise[:, 1])),
+            (
+                OFFSET,
+                DRIFT,
+                np.where(drifts, math.exp(-T / DRIFT_OFFSET_TIME), 1.0),
+                np.where(drifts, math.exp(-T / DRIFT_TIME), math.exp(-T / SPOOFING_TIME)),
+            ),
+        )
+        for at, rate_at, fade, rate_fade in fades:
+            for axis in (0, 1):
+                F[:, at + axis, at + axis], F[:, rate_at + axis, rate_at + axis] = fade, rate_fade
+                F[:, at + axis, rate_at + axis] = T
+            X[:, at : at + 2] = fade[:, None] * X[:, at : at + 2] + T * X[:, rate_at : rate_at + 2]
+            X[:, rate_at : rate_at + 2] *= rate_fade[:, None]
+        P = F @ self.covariances @ F.transpose(0, 2, 1)
+        diagonal = P.reshape(k, -1)[:, :: SIZE + 1]
+        if not step.is_stationary:
+            self._add_path_noise(P, step, settings, slip)
+            turned = settings.gyro_noise**2 * T + (TURN_NOISE * theta) ** 2 + step.turn_variance
+            diagonal[:, HEADING] += turned
+        diagonal[:, BIAS] += settings.gyro_bias_walk**2 * T
+        diagonal[:, WHEEL_SCALE] += settings.wheel_scale_walk**2 * T
+        diagonal[:, DELAY] += LATENCY_WALK**2 * T
+        correlated = (1.0 - settings.gps_white_share**2) * self.sigma**2
+        steady = correlated * (1.0 - math.exp(-2.0 * T / settings.gps_correlation_time))
+        rates = (self.sigma * noise[:, 0]) ** 2 * (1.0 - fades[0][3] ** 2)
+        drifting = DRIFT_RATE**2 * (1.0 - fades[1][3] ** 2) * (drifts | (self.faults == Fault.SPOOFING))
+        for axis in (0, 1):
+            diagonal[:, ERROR + axis] += steady
+            diagonal[:, ERROR_RATE + axis] += rates
+            diagonal[:, DRIFT + axis] += drifting
+        return self._replace(means=X, covariances=P)
+
+    def _add_path_noise(self, P: Array, step: Increment, settings: FilterSettings, slip: float) -> None:
+        """Add the variance of the path along and across the heading: slip of wheels, sideways slip, roll point."""
+        T, theta = step.seconds, step.turn
+        lateral = abs(theta / T) * step.driven / T
+        along = settings.slip_time * (slip * step.driven) ** 2 / T + (SLIP_IN_TURN * theta) ** 2
+        across = (
+            settings.slip_time * settings.side_sigma**2 * T
+            + (settings.roll_point_sigma * theta) ** 2
+            + (settings.side_slip * lateral * step.driven) ** 2 * max(settings.slip_time / T, 1.0)
+        )
+        along, across = along + step.path_variance, across + step.path_variance
+        middle = self.means[:, HEADING] + 0.5 * theta
+        c, s = np.cos(middle), np.sin(middle)
+        P[:, EAST, EAST] += along * c * c + across * s * s
+        P[:, NORTH, NORTH] += along * s * s + across * c * c
+        cross = (along - across) * c * s
+        P[:, EAST, NORTH] += cross
+        P[:, NORTH, EAST] += cross
+
+    def _measure_rest(self, mean: float, seconds: float, settings: FilterSettings) -> HypothesisBank:
+        """Return the bank after the mean turn rate of a vehicle at rest, which is the bias."""
+        X, P = self.means, self.covariances
+        residual = mean - X[:, BIAS]
+        S = P[:, BIAS, BIAS] + settings.gyro_noise**2 / seconds + RATE_FLOOR**2
+        gain = P[:, :, BIAS] / S[:, None]
+        weights = self._weigh(-0.5 * (residual**2 / S + np.log(S)))
+        covariances = P - gain[:, :, None] * P[:, None, BIAS, :]
+        return self._replace(means=X + gain * residual[:, None], covariances=covariances, weights=weights)
+
+    def _fuse(self, fix: PlanarFix, settings: FilterSettings) -> tuple[HypothesisBank, float]:
+        """Return the bank after a fix, equation (3), and the NIS of the published hypothesis."""
+        X, P = self.means, self.covariances
+        k = len(X)
+        spin = np.exp(1j * X[:, HEADING])
+        arm, velocity = spin * (fix.lever + X[:, ARM] + 1j * X[:, ARM + 1]), spin * fix.velocity
+        acceleration, latency = 1j * fix.turn_rate * velocity, X[:, DELAY]
+        antenna = X[:, EAST] + 1j * X[:, NORTH] + arm + (0.5 * latency * acceleration - velocity) * latency
+        errors = X[:, ERROR] + X[:, OFFSET] + X[:, JUMP] + 1j * (X[:, ERROR + 1] + X[:, OFFSET + 1] + X[:, JUMP + 1])
+        residual = fix.position - antenna - errors
+        y = np.stack((residual.real, residual.imag), axis=1)
+        H = np.zeros((k, 2, len(_FIX_STATES)))
+        H[:, 0, 0] = H[:, 1, 1] = 1.0
+        H[:, (0, 0, 0), (6, 8, 10)] = H[:, (1, 1, 1), (7, 9, 11)] = 1.0
+        turned, later = 1j * (arm - latency * velocity), latency * acceleration - velocity
+        for at, column in ((2, turned), (3, later), (4, spin), (5, 1j * spin)):
+            H[:, 0, at], H[:, 1, at] = column.real, column.imag
+        PH = P[:, :, _FIX_STATES] @ H.transpose(0, 2, 1)
+        S = H @ PH[:, _FIX_STATES, :]
+        white = (settings.gps_white_share * fix.sigma) ** 2 * self.inflation
+        a, b, c = S[:, 0, 0] + white, S[:, 0, 1], S[:, 1, 1] + white
+        det = a * c - b * b
+        inverse = np.stack((c, -b, -b, a), axis=1).reshape(k, 2, 2) / det[:, None, None]
+        weighed = (inverse @ y[:, :, None])[:, :, 0]
+        nis = (y * weighed).sum(axis=1)
+        likely = -0.5 * (nis + np.log(det)) + math.log1p(-OUTLIER_SHARE)
+        outlier = math.log(OUTLIER_SHARE) - 0.5 * (y * y).sum(axis=1) / OUTLIER_SIGMA**2 - 2.0 * math.log(OUTLIER_SIGMA)
+        weights = self._weigh(np.logaddexp(likely, outlier))
+        gain = PH @ (inverse / np.maximum(nis / OUTLIER_NIS, 1.0)[:, None, None])
+        covariances = P - gain @ PH.transpose(0, 2, 1)
+        means = X + (gain @ y[:, :, None])[:, :, 0]
+        return self._replace(means=means, covariances=covariances, weights=weights), float(nis[self.published])
+
+    def _weigh(self, log_likelihood: Array) -> Array:
+        """Return the weights after a measurement that shows nothing with a probability of VOID_SHARE."""
+        likelihood = np.exp(log_likelihood - log_likelihood.max())
+        weights: Array = self.weights * ((1.0 - VOID_SHARE) * likelihood + VOID_SHARE)
+        weights /= weights.sum()
+        return weights
+
+    def _spawn(self, utime: int, seconds: float, fix: PlanarFix | None) -> HypothesisBank:
+        """Return the bank with the children of the likeliest hypotheses, in which something begins or ends.
+
+        A jump that begins may be as large as the fix shows.
+        """
+        jump = JUMP_SIZE
+        if fix is not None:
+            x, y, heading = self.pose
+            jump = max(jump, abs(fix.position - complex(x, y) - cmath.rect(1.0, heading) * fix.lever))
+        order = np.argsort(-self.weights, kind="stable")[:8].tolist()
+        children: list[tuple[int, float, int, int, int, int]] = []
+        opened: list[Sequence[tuple[int, float]]] = []
+        closed: list[slice | None] = []
+
+        def add(
+            parent: int,
+            per_hour: float,
+            kind: tuple[int, int, int],
+            opens: Sequence[tuple[int, float]] = (),
+            closes: slice | None = None,
+            onset: int | None = None,
+        ) -> None:
+            since = int(self.onsets[parent]) if onset is None else onset
+            children.append((parent, per_hour, *kind, since))
+            opened.append(opens)
+            closed.append(closes)
+
+        seen: set[tuple[int, int]] = set()
+        for parent in order:
+            fault, jumped, noise = int(self.faults[parent]), int(self.jumped[parent]), int(self.noises[parent])
+            if (fault, jumped) in seen or len(seen) >= 3:
+                continue
+            seen.add((fault, jumped))
+            if jumped:
+                add(parent, JUMP_ENDS_PER_HOUR, (fault, 0, noise), closes=slice(JUMP, SIZE))
+            else:
+                add(parent, JUMPS_PER_HOUR, (fault, 1, noise), ((JUMP, jump), (JUMP + 1, jump)))
+            if fault in (Fault.DRIFT, Fault.SPOOFING):
+                add(parent, DRIFT_ENDS_PER_HOUR, (0, jumped, noise), closes=slice(OFFSET, JUMP), onset=NEVER)
+            if noise:
+                add(parent, NOISE_CLASSES[0].per_hour, (fault, jumped, 0), closes=slice(ERROR_RATE, OFFSET))
+                continue
+            for number, each in enumerate(NOISE_CLASSES[1:], start=1):
+                rate = self.sigma * each.rate
+                add(parent, each.per_hour, (fault, jumped, number), ((ERROR_RATE, rate), (ERROR_RATE + 1, rate)))
+        best = order[0]
+        if self.faults[best] not in (Fault.DRIFT, Fault.SPOOFING):
+            for new, (per_hour, opened_by) in FAULTS.items():
+                add(best, per_hour, (new, int(self.jumped[best]), int(self.noises[best])), opened_by, onset=utime)
+        parents = np.array([each[0] for each in children])
+        means, covariances = self.means[parents], self.covariances[parents]
+        for n, (opens, closes) in enumerate(zip(opened, closed, strict=True)):
+            if closes is not None:
+                means[n, closes] = 0.0
+                covariances[n, closes, :] = 0.0
+                covariances[n, :, closes] = 0.0
+            for at, sigma in opens:
+                covariances[n, at, at] += sigma * sigma
+        rates = np.array([each[1] for each in children])
+        labels = np.array([each[2:5] for each in children])
+        return self._replace(
+            means=np.concatenate((self.means, means)),
+            covariances=np.concatenate((self.covariances, covariances)),
+            weights=np.concatenate((self.weights, self.weights[parents] * rates * (seconds / 3600.0))),
+            faults=np.concatenate((self.faults, labels[:, 0])),
+            jumped=np.concatenate((self.jumped, labels[:, 1])),
+            noises=np.concatenate((self.noises, labels[:, 2])),
+            onsets=np.concatenate((self.onsets, np.array([each[5] for each in children], np.int64))),
+        )
+
+    def _reduce(self, utime: int) -> HypothesisBank:
+        """Return the bank with like hypotheses merged, the unlikely ones removed, and the one to publish."""
+        weights = self.weights / self.weights.sum()
+        bins = np.where(self.onsets == NEVER, -1, np.searchsorted(AGES_US, utime - self.onsets, side="right"))
+        keys = ((self.faults * 2 + self.jumped) * len(NOISE_CLASSES) + self.noises) * (len(AGES_US) + 2) + bins + 1
+        stays = weights >= LEAST_WEIGHT
+        stays[self.published] = True
+        left = np.flatnonzero(stays)
+        _, group = np.unique(keys[left], return_inverse=True)
+        sums = np.bincount(group, weights[left])
+        if len(sums) > MOST_HYPOTHESES:
+            ranked = sums.copy()
+            ranked[group[np.searchsorted(left, self.published)]] += 1.0
+            best = np.argsort(-ranked, kind="stable")[:MOST_HYPOTHESES]
+            number = np.full(len(sums), -1)
+            number[best] = np.arange(len(best))
+            inside = number[group] >= 0
+            left, group, sums = left[inside], number[group[inside]], sums[best]
+        shares = np.zeros((len(sums), len(left)))
+        shares[group, np.arange(len(left))] = weights[left] / np.maximum(sums[group], 1e-300)
+        means = shares @ self.means[left]
+        apart = self.means[left] - means[group]
+        spread = self.covariances[left] + apart[:, :, None] * apart[:, None, :]
+        covariances = (shares @ spread.reshape(len(left), -1)).reshape(len(sums), SIZE, SIZE)
+        first = left[np.argmax(shares, axis=1)]
+        bank = HypothesisBank(
+            utime,
+            means,
+            0.5 * (covariances + covariances.transpose(0, 2, 1)),
+            sums / sums.sum(),
+            self.faults[first],
+            self.jumped[first],
+            self.noises[first],
+            self.onsets[first],
+            int(group[np.searchsorted(left, self.published)]),
+            self.inflation,
+            self.rest_rate,
+            self.sigma,
+            excludes_fixes=self.excludes_fixes,
+            may_be_transported=self.may_be_transported,
+            reckoning=self.reckoning,
+        )
+        return bank._select()
+
+    def _select(self) -> HypothesisBank:
+        """Return the bank with the likeliest hypothesis published, if those near it are certain together."""
+        weights, published = self.weights, self.published
+        best = int(np.argmax(weights))
+        if best != published:
+            sigma, heading_sigma = self._get_sigmas()
+            horizontal, heading = compute_factors(LEVEL_RISK)
+            separation, turned = self._separate(self.means[best, :3])
+            near = (separation < 0.5 * (horizontal * sigma[best] + 1.0)) & (
+                turned < 0.5 * heading * heading_sigma[best]
+            )
+            if weights[near].sum() > CERTAIN and not (near[published] and weights[best] < 0.5):
+                published = best
+        faults = self.faults
+        fault = Fault(int(faults[published]))
+        is_own = fault in (Fault.GYRO, Fault.WHEELS, Fault.LATENCY)
+        if is_own and weights[published] > SETTLED and not self.jumped[published]:
+            faults, onsets = faults.copy(), self.onsets.copy()
+            faults[published], onsets[published] = Fault.NONE, NEVER
+            return self._replace(published=published, faults=faults, onsets=onsets, settled=fault)
+        return self._replace(published=published)
+
+    def _get_sigmas(self) -> tuple[Array, Array]:
+        """Return the standard deviations along the longest axis (k), m, and of the heading (k), rad."""
+        P = self.covariances
+        a, b, c = P[:, EAST, EAST], P[:, NORTH, NORTH], P[:, EAST, NORTH]
+        longest = 0.5 * (a + b) + np.hypot(0.5 * (a - b), c)
+        return np.sqrt(longest + PLACE_SIGMA**2), np.sqrt(P[:, HEADING, HEADING] + HEADING_FLOOR**2)
+
+    def _separate(self, pose: Array | tuple[float, float, float]) -> tuple[Array, Array]:
+        """Return how far each hypothesis is from a pose: distance (k), m, and angle (k), rad."""
+        apart = self.means[:, :3] - np.asarray(pose)
+        turned = np.abs(np.remainder(apart[:, 2] + math.pi, math.tau) - math.pi)
+        return np.hypot(apart[:, 0], apart[:, 1]), turned
+
+    def compute_bounds(
+        self,
+        pose: tuple[float, float, float],
+        limits: tuple[float, float],
+        settings: FilterSettings,
+        variances: tuple[float, float] = (0.0, 0.0),
+    ) -> Bounds:
+        """Return what is known of the error of a pose: east, north (m), heading (rad).
+
+        `limits` are those of the position and the heading, m and rad.
+        """
+        weights = self.weights
+        distances, sigmas = np.array(self._separate(pose)), np.array(self._get_sigmas())
+        tail = _compute_tails(np.array(limits)[None, :, None], distances, sigmas) @ weights
+        levels = _find_level(weights, distances, sigmas, LEVEL_RISK)
+        risk = settings.risk_per_hour * settings.gps_correlation_time / 3600.0
+        share = np.minimum(risk / (len(weights) * np.maximum(weights, 1e-30)), 1.0)
+        factor = -2.0 * np.log(share)
+        # the heading is one number: the tail of a normal distribution is that of a circle by 1 / k at least
+        factors = np.sqrt(np.stack((factor, np.maximum(factor - np.log(np.maximum(factor, 1.0)), 0.0))))
+        protection = np.where(share < 1.0, distances + factors * sigmas, 0.0).max(axis=1)
+        return Bounds(
+            float(levels[0]),
+            min(float(levels[1]), math.pi),
+            float(protection[0]),
+            min(float(protection[1]), math.pi),
+            float(tail[0, 0]),
+            float(tail[0, 1]),
+            variances,
+        )
+
+
+_NOISES: Final = np.array([each[:3] for each in NOISE_CLASSES])
+_FIX_STATES: Final = np.array(
+    (EAST, NORTH, HEADING, DELAY, ARM, ARM + 1, ERROR, ERROR + 1, OFFSET, OFFSET + 1, JUMP, JUMP + 1)
+)
+
+
+def _compute_tails(limits: Array, distances: Array, sigmas: Array) -> Array:
+    """Return the probabilities (n, 2, k) that the error of a pose is beyond limits (n, 2, 1), by each hypothesis."""
+    tails: Array = np.exp(-0.5 * (np.maximum(limits - distances, 0.0) / sigmas) ** 2)
+    return tails
+
+
+def _find_level(weights: Array, distances: Array, sigmas: Array, risk: float) -> Array:
+    """Return the least levels (2) that the error of a pose exceeds with a probability of `risk` at most.
+
+    By two grids, the second within one step of the first: to a thousandth of the largest.
+    """
+    low, width = np.zeros(2), (distances + 8.0 * sigmas).max(axis=1)
+    for _ in range(2):
+        grid = low[None, :, None] + width[None, :, None] * GRID
+        beyond = _compute_tails(grid, distances, sigmas) @ weights > risk
+        steps = beyond.sum(axis=0)
+        width = width / (len(GRID) - 1)
+        low += np.maximum(steps - 1, 0) * width
+    low += width
+    return low
+
+
+def start_bank(utime: int, sigma: float, settings: FilterSettings) -> HypothesisBank:
+    """Return a bank of one hypothesis: what is known of gyro, latency and lever arm before a vehicle drives.
+
+    `sigma` is that of a fix, m. Pose and ordinary error of fixes are 0 without variance.
+    """
+    P = np.zeros((1, SIZE, SIZE))
+    arm = max(settings.lever_arm_sigma, ARM_SIGMA_LEAST)
+    sigmas = {BIAS: START_BIAS, DELAY: LATENCY_SIGMA, GYRO_SCALE: settings.gyro_scale_sigma, ARM: arm, ARM + 1: arm}
+    for at, each in sigmas.items():
+        P[0, at, at] = each**2
+    none = np.zeros(1, np.int64)
+    return HypothesisBank(utime, np.zeros((1, SIZE)), P, np.ones(1), none, none, none, np.full(1, NEVER), sigma=sigma)
