@@ -125,6 +125,9 @@ def answer(epoch: int = 3) -> PoseAnswer:
         1.5,
         0.05,
         12.0,
+        0.75,
+        0.025,
+        1e-3,
     )
 
 

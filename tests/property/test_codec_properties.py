@@ -75,7 +75,7 @@ def answers(draw: st.DrawFn) -> messages.PoseAnswer:
         ),
         origin,
         messages.Quality(draw(st.integers(0, 63))),
-        *draw(st.tuples(numbers, numbers, numbers)),
+        *draw(st.tuples(*[numbers] * 6)),
     )
 
 
