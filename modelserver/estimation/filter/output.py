@@ -113,6 +113,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         horizontal_level=level,
         heading_level=heading_level,
         limit_risk=min(sum(risks), 1.0),
+        horizontal_allowance=allowance,
     )
 
 
