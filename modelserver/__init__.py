@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from modelserver.messages import Policy as Policy
     from modelserver.messages import PoseAnswer as PoseAnswer
     from modelserver.messages import Quality as Quality
+    from modelserver.messages import Unmet as Unmet
     from modelserver.messages import YawSource as YawSource
     from modelserver.transforms.pose import Pose as Pose
     from modelserver.transforms.transformation import Transformation as Transformation
@@ -90,6 +91,7 @@ _LAZY = {
     "Invalid": "modelserver.messages",
     "Policy": "modelserver.messages",
     "Quality": "modelserver.messages",
+    "Unmet": "modelserver.messages",
     "Pose": "modelserver.transforms.pose",
     "Transformation": "modelserver.transforms.transformation",
 }

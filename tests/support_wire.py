@@ -55,6 +55,7 @@ from modelserver.messages import (
     PoseAnswer,
     PoseBatch,
     PoseBatchReply,
+    PoseDemand,
     PublishDecisions,
     Quality,
     RangeSample,
@@ -73,6 +74,7 @@ from modelserver.messages import (
     SwitchMode,
     TimeQuery,
     TransformReply,
+    Unmet,
     VehicleCommand,
     VehicleMode,
     VehicleStatusSample,
@@ -90,6 +92,7 @@ _REQUEST = RequestHeader(-(1 << 63), "REPLY_TEST")
 _OK = ReplyHeader((1 << 63) - 1, UTIME, model_revision="ab12")
 _UNKNOWN = ReplyHeader(1, UTIME, Status.UNKNOWN_FRAME, "no frame 'Raptor:GC'", ("Raptor:CG", "Räptor:CG"), "ab12")
 _TIME = TimeQuery(UTIME, Policy.PREDICTED, 250)
+_DEMAND = PoseDemand(0.5, 0.05, 0.2, 0.999)
 _NINE = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
 
 
@@ -125,6 +128,10 @@ def answer(epoch: int = 3) -> PoseAnswer:
         1.5,
         0.05,
         12.0,
+        0.75,
+        0.025,
+        1e-3,
+        0.4,
     )
 
 
@@ -230,19 +237,20 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     ),
     "get_transformation_request_t": (
         GetTransformation(_REQUEST, "Raptor:CG", "World:UTM"),
-        GetTransformation(_REQUEST, "", "Räptor:CG", _TIME),
+        GetTransformation(_REQUEST, "", "Räptor:CG", _TIME, _DEMAND),
     ),
     "get_body_list_request_t": (GetBodyList(_REQUEST), GetBodyList(RequestHeader(0, ""))),
     "get_body_frame_list_request_t": (GetBodyFrameList(_REQUEST, "Raptor"), GetBodyFrameList(_REQUEST, "")),
-    "get_state_vector_request_t": (GetStateVector(_REQUEST), GetStateVector(_REQUEST, _TIME)),
-    "get_h_transform_request_t": (GetHTransform(_REQUEST), GetHTransform(_REQUEST, True, _TIME)),
+    "get_state_vector_request_t": (GetStateVector(_REQUEST), GetStateVector(_REQUEST, _TIME, _DEMAND)),
+    "get_h_transform_request_t": (GetHTransform(_REQUEST), GetHTransform(_REQUEST, True, _TIME, _DEMAND)),
     "get_history_request_t": (GetHistory(_REQUEST, UTIME, UTIME + 1_000_000, 10.0),),
     "get_transformation_reply_t": (
         TransformReply(_UNKNOWN),
         TransformReply(_OK, answer()),
         TransformReply(_OK, bare_answer()),
+        TransformReply(_OK, answer(), Unmet.HORIZONTAL | Unmet.NOT_VALID, "älter als 1 s"),
     ),
-    "get_state_vector_reply_t": (StateVectorReply(_UNKNOWN), StateVectorReply(_OK, answer())),
+    "get_state_vector_reply_t": (StateVectorReply(_UNKNOWN), StateVectorReply(_OK, answer(), Unmet.AGE, "old")),
     "name_list_reply_t": (NameListReply(_UNKNOWN), NameListReply(_OK, ("Raptor", "Camera"), ("the vehicle", ""))),
     "get_history_reply_t": (
         HistoryReply(_UNKNOWN),

@@ -743,14 +743,14 @@ def _values_module(body: str) -> str:
         "from dataclasses import dataclass\nfrom enum import IntEnum\nfrom typing import NamedTuple\n\n"
         "from modelserver.errors import Status\n"
         "from modelserver.messages.answers import PoseAnswer\n"
-        "from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality\n"
+        "from modelserver.messages.flags import MET, NAN, NO_FLAGS, VALID, Invalid, Quality, Unmet\n"
         "from modelserver.transforms.pose import Pose\n"
         "from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3\n\n"
         f"\n{body}\n"
     )
 
 
-HAND_VALUES: Final = ("Invalid", "Quality")
+HAND_VALUES: Final = ("Invalid", "Quality", "Unmet")
 """Flags that no .lcm file declares."""
 
 _WORD: Final = re.compile(r"\b[A-Za-z]\w+\b")

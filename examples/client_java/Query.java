@@ -7,6 +7,7 @@ import lcm.lcm.LCM;
 import lcm.lcm.LCMDataInputStream;
 import mslcm.get_transformation_reply_t;
 import mslcm.get_transformation_request_t;
+import mslcm.pose_demand_t;
 import mslcm.pose_transform_t;
 import mslcm.reply_header_t;
 import mslcm.request_header_t;
@@ -79,6 +80,7 @@ public final class Query {
         request.frame_of_interest = arguments[0];
         request.frame_of_reference = arguments[1];
         request.time = new time_query_t(); // all zero: the latest time
+        request.demand = new pose_demand_t(); // all zero: nothing is asked of the pose
         get_transformation_reply_t reply;
         try {
             // the bus of $LCM_DEFAULT_URL, else LCM's own default, which stays on this machine

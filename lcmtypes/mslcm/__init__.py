@@ -38,6 +38,7 @@ from .model_snapshot_t import model_snapshot_t as model_snapshot_t
 from .name_list_reply_t import name_list_reply_t as name_list_reply_t
 from .navigation_state_t import navigation_state_t as navigation_state_t
 from .path_edge_t import path_edge_t as path_edge_t
+from .pose_demand_t import pose_demand_t as pose_demand_t
 from .pose_transform_t import pose_transform_t as pose_transform_t
 from .pose_vector_t import pose_vector_t as pose_vector_t
 from .range_t import range_t as range_t

@@ -16,11 +16,11 @@ class get_h_transform_request_t(object):
     @value GetHTransform tuple
     """
 
-    __slots__ = ["header", "inverse", "time"]
+    __slots__ = ["header", "inverse", "time", "demand"]
 
-    __typenames__ = ["mslcm.request_header_t", "boolean", "mslcm.time_query_t"]
+    __typenames__ = ["mslcm.request_header_t", "boolean", "mslcm.time_query_t", "mslcm.pose_demand_t"]
 
-    __dimensions__ = [None, None, None]
+    __dimensions__ = [None, None, None, None]
 
     def __init__(self):
         self.header = mslcm.request_header_t()
@@ -43,6 +43,13 @@ class get_h_transform_request_t(object):
         LCM Type: mslcm.time_query_t
         """
 
+        self.demand = mslcm.pose_demand_t()
+        """
+        What the pose is needed for; all 0 = nothing is asked for.
+        @default PoseDemand()
+        LCM Type: mslcm.pose_demand_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -56,6 +63,8 @@ class get_h_transform_request_t(object):
         buf.write(struct.pack(">b", self.inverse))
         assert self.time._get_packed_fingerprint() == mslcm.time_query_t._get_packed_fingerprint()
         self.time._encode_one(buf)
+        assert self.demand._get_packed_fingerprint() == mslcm.pose_demand_t._get_packed_fingerprint()
+        self.demand._encode_one(buf)
 
     @staticmethod
     def decode(data: bytes):
@@ -73,13 +82,14 @@ class get_h_transform_request_t(object):
         self.header = mslcm.request_header_t._decode_one(buf)
         self.inverse = bool(struct.unpack('b', buf.read(1))[0])
         self.time = mslcm.time_query_t._decode_one(buf)
+        self.demand = mslcm.pose_demand_t._decode_one(buf)
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_h_transform_request_t in parents: return 0
         newparents = parents + [get_h_transform_request_t]
-        tmphash = (0xe34256b0a467b894+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xcc1fedcf1861d5d7+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)+ mslcm.pose_demand_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -15,11 +15,11 @@ class get_state_vector_reply_t(object):
     @value StateVectorReply tuple
     """
 
-    __slots__ = ["header", "pose"]
+    __slots__ = ["header", "pose", "unmet", "unmet_reason"]
 
-    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_vector_t"]
+    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_vector_t", "int32_t", "string"]
 
-    __dimensions__ = [None, None]
+    __dimensions__ = [None, None, None, None]
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
@@ -35,6 +35,20 @@ class get_state_vector_reply_t(object):
         LCM Type: mslcm.pose_vector_t
         """
 
+        self.unmet = 0
+        """
+        What is unmet of the request's demand, bit by bit as in get_transformation_reply_t; 0 = nothing.
+        @flags Unmet @default MET
+        LCM Type: int32_t
+        """
+
+        self.unmet_reason = ""
+        """
+        What is unmet, by how much, and what was asked for, for a person; empty when unmet is 0.
+        @default ""
+        LCM Type: string
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -47,6 +61,11 @@ class get_state_vector_reply_t(object):
         self.header._encode_one(buf)
         assert self.pose._get_packed_fingerprint() == mslcm.pose_vector_t._get_packed_fingerprint()
         self.pose._encode_one(buf)
+        buf.write(struct.pack(">i", self.unmet))
+        __unmet_reason_encoded = self.unmet_reason.encode('utf-8')
+        buf.write(struct.pack('>I', len(__unmet_reason_encoded)+1))
+        buf.write(__unmet_reason_encoded)
+        buf.write(b"\0")
 
     @staticmethod
     def decode(data: bytes):
@@ -63,13 +82,16 @@ class get_state_vector_reply_t(object):
         self = get_state_vector_reply_t()
         self.header = mslcm.reply_header_t._decode_one(buf)
         self.pose = mslcm.pose_vector_t._decode_one(buf)
+        self.unmet = struct.unpack(">i", buf.read(4))[0]
+        __unmet_reason_len = struct.unpack('>I', buf.read(4))[0]
+        self.unmet_reason = buf.read(__unmet_reason_len)[:-1].decode('utf-8', 'replace')
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_state_vector_reply_t in parents: return 0
         newparents = parents + [get_state_vector_reply_t]
-        tmphash = (0xe10feebec5c97663+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_vector_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x62887f197c7d24fc+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_vector_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

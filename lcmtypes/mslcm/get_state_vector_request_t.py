@@ -15,11 +15,11 @@ class get_state_vector_request_t(object):
     @value GetStateVector tuple
     """
 
-    __slots__ = ["header", "time"]
+    __slots__ = ["header", "time", "demand"]
 
-    __typenames__ = ["mslcm.request_header_t", "mslcm.time_query_t"]
+    __typenames__ = ["mslcm.request_header_t", "mslcm.time_query_t", "mslcm.pose_demand_t"]
 
-    __dimensions__ = [None, None]
+    __dimensions__ = [None, None, None]
 
     def __init__(self):
         self.header = mslcm.request_header_t()
@@ -35,6 +35,13 @@ class get_state_vector_request_t(object):
         LCM Type: mslcm.time_query_t
         """
 
+        self.demand = mslcm.pose_demand_t()
+        """
+        What the pose is needed for; all 0 = nothing is asked for.
+        @default PoseDemand()
+        LCM Type: mslcm.pose_demand_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -47,6 +54,8 @@ class get_state_vector_request_t(object):
         self.header._encode_one(buf)
         assert self.time._get_packed_fingerprint() == mslcm.time_query_t._get_packed_fingerprint()
         self.time._encode_one(buf)
+        assert self.demand._get_packed_fingerprint() == mslcm.pose_demand_t._get_packed_fingerprint()
+        self.demand._encode_one(buf)
 
     @staticmethod
     def decode(data: bytes):
@@ -63,13 +72,14 @@ class get_state_vector_request_t(object):
         self = get_state_vector_request_t()
         self.header = mslcm.request_header_t._decode_one(buf)
         self.time = mslcm.time_query_t._decode_one(buf)
+        self.demand = mslcm.pose_demand_t._decode_one(buf)
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_state_vector_request_t in parents: return 0
         newparents = parents + [get_state_vector_request_t]
-        tmphash = (0xe10feebacbcf7663+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x3843bd08363077c6+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)+ mslcm.pose_demand_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

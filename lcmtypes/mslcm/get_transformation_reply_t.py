@@ -15,11 +15,20 @@ class get_transformation_reply_t(object):
     @value TransformReply tuple
     """
 
-    __slots__ = ["header", "transform"]
+    __slots__ = ["header", "transform", "unmet", "unmet_reason"]
 
-    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_transform_t"]
+    __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_transform_t", "int32_t", "string"]
 
-    __dimensions__ = [None, None]
+    __dimensions__ = [None, None, None, None]
+
+    HORIZONTAL = 1
+    """ The horizontal error may be beyond max_horizontal, or is not known. """
+    HEADING = 2
+    """ The heading error may be beyond max_heading, or is not known. """
+    AGE = 4
+    """ The data are older than max_age, or their age is not known. """
+    NOT_VALID = 8
+    """ min_integrity was stated, and the pose is not valid with it, or that is not known. """
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
@@ -35,6 +44,20 @@ class get_transformation_reply_t(object):
         LCM Type: mslcm.pose_transform_t
         """
 
+        self.unmet = 0
+        """
+        What is unmet of the request's demand, bit by bit: HORIZONTAL to NOT_VALID. 0 = all that was asked for is met.
+        @flags Unmet @default MET
+        LCM Type: int32_t
+        """
+
+        self.unmet_reason = ""
+        """
+        What is unmet, by how much, and what was asked for, for a person; empty when unmet is 0.
+        @default ""
+        LCM Type: string
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -47,6 +70,11 @@ class get_transformation_reply_t(object):
         self.header._encode_one(buf)
         assert self.transform._get_packed_fingerprint() == mslcm.pose_transform_t._get_packed_fingerprint()
         self.transform._encode_one(buf)
+        buf.write(struct.pack(">i", self.unmet))
+        __unmet_reason_encoded = self.unmet_reason.encode('utf-8')
+        buf.write(struct.pack('>I', len(__unmet_reason_encoded)+1))
+        buf.write(__unmet_reason_encoded)
+        buf.write(b"\0")
 
     @staticmethod
     def decode(data: bytes):
@@ -63,13 +91,16 @@ class get_transformation_reply_t(object):
         self = get_transformation_reply_t()
         self.header = mslcm.reply_header_t._decode_one(buf)
         self.transform = mslcm.pose_transform_t._decode_one(buf)
+        self.unmet = struct.unpack(">i", buf.read(4))[0]
+        __unmet_reason_len = struct.unpack('>I', buf.read(4))[0]
+        self.unmet_reason = buf.read(__unmet_reason_len)[:-1].decode('utf-8', 'replace')
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_transformation_reply_t in parents: return 0
         newparents = parents + [get_transformation_reply_t]
-        tmphash = (0x24802a27b145f77a+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x5f433f7e06149806+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -16,11 +16,11 @@ class get_transformation_request_t(object):
     @value GetTransformation tuple
     """
 
-    __slots__ = ["header", "frame_of_interest", "frame_of_reference", "time"]
+    __slots__ = ["header", "frame_of_interest", "frame_of_reference", "time", "demand"]
 
-    __typenames__ = ["mslcm.request_header_t", "string", "string", "mslcm.time_query_t"]
+    __typenames__ = ["mslcm.request_header_t", "string", "string", "mslcm.time_query_t", "mslcm.pose_demand_t"]
 
-    __dimensions__ = [None, None, None, None]
+    __dimensions__ = [None, None, None, None, None]
 
     def __init__(self):
         self.header = mslcm.request_header_t()
@@ -49,6 +49,13 @@ class get_transformation_request_t(object):
         LCM Type: mslcm.time_query_t
         """
 
+        self.demand = mslcm.pose_demand_t()
+        """
+        What the pose is needed for; all 0 = nothing is asked for.
+        @default PoseDemand()
+        LCM Type: mslcm.pose_demand_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -69,6 +76,8 @@ class get_transformation_request_t(object):
         buf.write(b"\0")
         assert self.time._get_packed_fingerprint() == mslcm.time_query_t._get_packed_fingerprint()
         self.time._encode_one(buf)
+        assert self.demand._get_packed_fingerprint() == mslcm.pose_demand_t._get_packed_fingerprint()
+        self.demand._encode_one(buf)
 
     @staticmethod
     def decode(data: bytes):
@@ -89,13 +98,14 @@ class get_transformation_request_t(object):
         __frame_of_reference_len = struct.unpack('>I', buf.read(4))[0]
         self.frame_of_reference = buf.read(__frame_of_reference_len)[:-1].decode('utf-8', 'replace')
         self.time = mslcm.time_query_t._decode_one(buf)
+        self.demand = mslcm.pose_demand_t._decode_one(buf)
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if get_transformation_request_t in parents: return 0
         newparents = parents + [get_transformation_request_t]
-        tmphash = (0x5c6405ff77c531f6+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x40d3906b8ef7ffed+ mslcm.request_header_t._get_hash_recursive(newparents)+ mslcm.time_query_t._get_hash_recursive(newparents)+ mslcm.pose_demand_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -15,11 +15,11 @@ class pose_transform_t(object):
     @codec poses value
     """
 
-    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "h_transform", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "horizontal_level", "heading_level", "limit_risk", "model_revision"]
+    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "h_transform", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "horizontal_level", "heading_level", "limit_risk", "horizontal_allowance", "model_revision"]
 
-    __typenames__ = ["int64_t", "string", "string", "double", "double", "double", "int8_t", "boolean", "int64_t", "int32_t", "boolean", "int32_t", "int32_t", "double", "double", "double", "double", "double", "double", "string"]
+    __typenames__ = ["int64_t", "string", "string", "double", "double", "double", "int8_t", "boolean", "int64_t", "int32_t", "boolean", "int32_t", "int32_t", "double", "double", "double", "double", "double", "double", "double", "string"]
 
-    __dimensions__ = [None, None, None, [4, 4], [36], [3], None, None, None, None, None, None, None, None, None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, [4, 4], [36], [3], None, None, None, None, None, None, None, None, None, None, None, None, None, None, None]
 
     NO_FIX = 1
     """ No usable fix yet. """
@@ -191,6 +191,13 @@ class pose_transform_t(object):
         LCM Type: double
         """
 
+        self.horizontal_allowance = 0.0
+        """
+        Part of the horizontal level that is an offset for suspected faults, meters; the rest is 4.2919 standard deviations.
+        nan = not known.
+        LCM Type: double
+        """
+
         self.model_revision = ""
         """
         Content hash of the geometry used.
@@ -218,7 +225,7 @@ class pose_transform_t(object):
             buf.write(struct.pack('>4d', *self.h_transform[i0][:4]))
         buf.write(struct.pack('>36d', *self.covariance[:36]))
         buf.write(struct.pack('>3d', *self.initial_utm[:3]))
-        buf.write(struct.pack(">bbqibiidddddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.horizontal_level, self.heading_level, self.limit_risk))
+        buf.write(struct.pack(">bbqibiiddddddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.horizontal_level, self.heading_level, self.limit_risk, self.horizontal_allowance))
         __model_revision_encoded = self.model_revision.encode('utf-8')
         buf.write(struct.pack('>I', len(__model_revision_encoded)+1))
         buf.write(__model_revision_encoded)
@@ -251,7 +258,7 @@ class pose_transform_t(object):
         self.utm_north = bool(struct.unpack('b', buf.read(1))[0])
         self.origin_id, self.pose_epoch = struct.unpack(">qi", buf.read(12))
         self.pose_valid = bool(struct.unpack('b', buf.read(1))[0])
-        self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.horizontal_level, self.heading_level, self.limit_risk = struct.unpack(">iidddddd", buf.read(56))
+        self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit, self.horizontal_level, self.heading_level, self.limit_risk, self.horizontal_allowance = struct.unpack(">iiddddddd", buf.read(64))
         __model_revision_len = struct.unpack('>I', buf.read(4))[0]
         self.model_revision = buf.read(__model_revision_len)[:-1].decode('utf-8', 'replace')
         return self
@@ -259,7 +266,7 @@ class pose_transform_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if pose_transform_t in parents: return 0
-        tmphash = (0xcd51650f607156c9) & 0xffffffffffffffff
+        tmphash = (0x5e102c0c8732e70e) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -112,6 +112,7 @@ class PublishedEstimate(NamedTuple):
             self.world.horizontal_level,
             self.world.heading_level,
             self.world.limit_risk,
+            self.world.horizontal_allowance,
         )
 
 
@@ -244,5 +245,6 @@ def _extrapolate(last: Estimate, utime: int, dt: float, is_stale: bool) -> Estim
         horizontal_level=NAN,
         heading_level=NAN,
         limit_risk=NAN,
+        horizontal_allowance=NAN,
         seconds_to_limit=max(left, 0.0) if left == left else NAN,
     )

@@ -6,16 +6,17 @@ A client defines only how a request is answered: `Platform` sends it to the serv
 
 from __future__ import annotations
 
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy.typing as npt
 
 from modelserver.client.batch_reply import BatchQuery, check_batch
 from modelserver.client.times import Time, to_utime
-from modelserver.errors import WireError
+from modelserver.errors import MalformedRequestError, WireError
 from modelserver.messages import (
     DynamicsAnswer,
     DynamicsReply,
@@ -36,15 +37,20 @@ from modelserver.messages import (
     Policy,
     PoseAnswer,
     PoseBatch,
+    PoseDemand,
     RequestHeader,
     StateVectorReply,
     TimeQuery,
     TransformReply,
 )
 from modelserver.transforms.transformation import Transformation
+from modelserver.wire.generated import pack_pose_demand, unpack_pose_demand
 
 R = TypeVar("R")
 A = TypeVar("A")
+
+NO_DEMAND: Final = PoseDemand()
+"""Nothing is asked for."""
 
 
 class FrameClient(ABC):
@@ -58,11 +64,35 @@ class FrameClient(ABC):
         at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
+        max_horizontal: float = 0.0,
+        max_heading: float = 0.0,
+        max_age: float = 0.0,
+        min_integrity: float = 0.0,
     ) -> PoseAnswer:
-        """Return the transformation with its origin, protection levels and quality flags."""
-        return self._query_pose(
-            frame_of_interest, frame_of_reference, at if type(at) is int else to_utime(at), policy, wait_ms
-        )
+        """Return the transformation with its origin, levels and quality flags, and what it lacks of a demand.
+
+        The result's `unmet` and `unmet_reason` are the verdict on what is asked for, each 0 for nothing.
+
+        Parameters
+        ----------
+        frame_of_interest, frame_of_reference, at, policy, wait_ms
+            As in `Platform.get_transformation`.
+        max_horizontal, max_heading
+            The errors, m and rad, may be beyond them with a probability of 1 - min_integrity at most.
+        max_age
+            Largest age of the newest data, s.
+        min_integrity
+            0 for 0.99. If it is stated the pose must be valid; without limits above the configured ones must hold with
+            it.
+
+        Raises
+        ------
+        QueryError
+            As `Platform.get_transformation`; MalformedRequestError for a demand that cannot be.
+        """
+        demand = make_demand(max_horizontal, max_heading, max_age, min_integrity)
+        utime = at if type(at) is int else to_utime(at)
+        return self._query_pose(frame_of_interest, frame_of_reference, utime, policy, wait_ms, demand)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -131,7 +161,9 @@ class FrameClient(ABC):
         return RequestHeader(0, "")
 
     @abstractmethod
-    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
+    ) -> PoseAnswer:
         """Answer `get_pose`."""
 
     @abstractmethod
@@ -254,6 +286,16 @@ class PlatformClient(FrameClient):
     @abstractmethod
     def _query_batch(self, query: BatchQuery) -> list[PoseBatch]:
         """Answer `get_transformations`."""
+
+
+def make_demand(*values: float) -> PoseDemand:
+    """Return a demand on a pose. Raises MalformedRequestError for one that the server would reject."""
+    if not any(values):
+        return NO_DEMAND
+    try:
+        return unpack_pose_demand(pack_pose_demand(PoseDemand(*values)), 0)[0]
+    except (WireError, struct.error) as error:
+        raise MalformedRequestError(str(error)) from None
 
 
 def require_answer(answer: A | None) -> A:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from modelserver.client.batch_reply import BatchQuery, concatenate
-from modelserver.client.interface import PlatformClient, R
+from modelserver.client.interface import NO_DEMAND, PlatformClient, R
 from modelserver.client.mirror_state import NEVER, MirrorState
 from modelserver.errors import MalformedRequestError, NoPoseError, OutOfDateError, WireError
 from modelserver.geometry import names
@@ -25,11 +25,13 @@ from modelserver.messages import (
     Policy,
     PoseAnswer,
     PoseBatch,
+    PoseDemand,
     TimeQuery,
 )
 from modelserver.query import WORLD_FRAMES, PlatformView
 from modelserver.query.answers import compute_answer
 from modelserver.query.batch import lookup_batch
+from modelserver.query.demand import check_demand
 from modelserver.query.steps import complete
 from modelserver.wire.fields import MAX_UTIME, check_not_negative, check_utime, read_enum
 
@@ -59,7 +61,9 @@ class LocalPlatform(PlatformClient):
 
     # --- queries
 
-    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
+    ) -> PoseAnswer:
         time = _make_time(at, policy, wait_ms)
         state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
@@ -67,7 +71,8 @@ class LocalPlatform(PlatformClient):
             # cached in the state of this geometry, so that a new geometry drops it
             state.static_answers[interest, reference] = answer
             state.static_transforms[interest, reference] = answer.transformation
-        return answer
+        unmet, reason = check_demand(view, answer, demand, time, now)
+        return answer._replace(unmet=unmet, unmet_reason=reason) if unmet else answer
 
     def _query(self, request: Any, reply_type: type[R]) -> R:
         time = IN_HISTORY

@@ -11,6 +11,7 @@ from typing import Final, Self
 
 import lcm
 
+from modelserver.client.interface import make_demand
 from modelserver.client.local import IN_HISTORY, LocalPlatform
 from modelserver.client.mirror_state import Ages, MirrorReceiver, MirrorState
 from modelserver.client.times import Time, to_utime
@@ -121,12 +122,18 @@ class PlatformMirror(LocalPlatform):
         at: Time = 0,
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
+        max_horizontal: float = 0.0,
+        max_heading: float = 0.0,
+        max_age: float = 0.0,
+        min_integrity: float = 0.0,
     ) -> PoseAnswer:
-        """Return the transformation with its origin, protection levels and quality flags."""
-        try:
-            return self._static_answers[frame_of_interest, frame_of_reference]
-        except KeyError:
-            return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms)
+        """Return the transformation with its origin, levels and quality flags, and what it lacks of a demand.
+
+        See `Platform.get_pose`. The age is that of the newest published pose.
+        """
+        demand = make_demand(max_horizontal, max_heading, max_age, min_integrity)
+        known = None if any(demand) else self._static_answers.get((frame_of_interest, frame_of_reference))
+        return known or self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms, demand)
 
     @property
     def age(self) -> Ages:

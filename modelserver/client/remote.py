@@ -24,7 +24,7 @@ import lcm
 import numpy as np
 
 from modelserver.client.batch_reply import BatchQuery, BatchReplyAssembler, concatenate
-from modelserver.client.interface import PlatformClient, R, require_answer
+from modelserver.client.interface import NO_DEMAND, PlatformClient, R, require_answer
 from modelserver.client.pose_stream import PoseStream
 from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
 from modelserver.messages import (
@@ -39,6 +39,7 @@ from modelserver.messages import (
     PoseAnswer,
     PoseBatch,
     PoseBatchReply,
+    PoseDemand,
     ReloadModel,
     ReloadReply,
     ReplyHeader,
@@ -174,11 +175,13 @@ class Platform(PlatformClient):
             self._lcm = None
             self._receiver.close()
 
-    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
+    ) -> PoseAnswer:
         # packed without `_query`: the hot path
         try:
             request = pack_get_transformation(
-                self._ids.getrandbits(63), self.reply_channel, interest, reference, at, policy, wait_ms
+                self._ids.getrandbits(63), self.reply_channel, interest, reference, at, policy, wait_ms, demand
             )
         except _ENCODE_ERRORS as error:
             raise _to_malformed_request(error, at) from error
@@ -333,7 +336,10 @@ def decode_pose_reply(data: bytes, frame_of_interest: str, frame_of_reference: s
         answer = read_answer(data, frame_of_interest, frame_of_reference)
     except struct.error:
         answer = None  # truncated: `decode` raises the error
-    return answer or require_answer(_decode_reply(data, TransformReply).answer)
+    if answer is not None:
+        return answer
+    reply = _decode_reply(data, TransformReply)
+    return require_answer(reply.answer)._replace(unmet=reply.unmet, unmet_reason=reply.unmet_reason)
 
 
 def _discard_unread(receiver: Receiver) -> None:

@@ -322,6 +322,7 @@ def interpolate(a: Estimate, b: Estimate, utime: int) -> Estimate:
         max(a.horizontal_level, b.horizontal_level),
         max(a.heading_level, b.heading_level),
         max(a.limit_risk, b.limit_risk),
+        max(a.horizontal_allowance, b.horizontal_allowance),
     )
 
 
@@ -377,4 +378,5 @@ def restamp(estimate: Estimate, utime: int, flag: Quality, invalid: Invalid = VA
         estimate.horizontal_level,
         estimate.heading_level,
         estimate.limit_risk,
+        estimate.horizontal_allowance,
     )

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth.origin import Origin
-from modelserver.messages.flags import NAN, NO_FLAGS, Quality
+from modelserver.messages.flags import MET, NAN, NO_FLAGS, Quality, Unmet
 from modelserver.transforms.so3 import Array
 from modelserver.transforms.transformation import Transformation
 
@@ -21,7 +21,8 @@ class PoseAnswer(NamedTuple):
 
     `origin` is None where no world frame is involved or the origin is not known. The levels, in m and rad, are those
     that an error exceeds with a probability of 1e-4 at an instant; `limit_risk` is that of an error beyond a configured
-    limit.
+    limit, `horizontal_allowance` the part of the horizontal level that is an offset for suspected faults.
+    `unmet` and `unmet_reason` are those of the reply to a query with a demand.
     """
 
     transformation: Transformation
@@ -33,6 +34,9 @@ class PoseAnswer(NamedTuple):
     horizontal_level: float = NAN
     heading_level: float = NAN
     limit_risk: float = NAN
+    horizontal_allowance: float = NAN
+    unmet: Unmet = MET
+    unmet_reason: str = ""
 
     @property
     def geodetic(self) -> GeodeticPose | None:

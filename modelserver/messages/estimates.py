@@ -67,3 +67,4 @@ class Estimate:
     horizontal_level: float = NAN
     heading_level: float = NAN
     limit_risk: float = NAN
+    horizontal_allowance: float = NAN

@@ -82,8 +82,18 @@ _QUALITY_TEXT = {
 }
 
 
+class Unmet(IntFlag):
+    """What an answer lacks of the demand in its request; 0 = all that was asked for is met."""
+
+    HORIZONTAL = 1
+    HEADING = 2
+    AGE = 4
+    NOT_VALID = 8
+
+
 STALE_SENSORS = Invalid.STALE_GPS | Invalid.STALE_IMU
 """Reasons that sensors which stopped sending have."""
 
 VALID = Invalid(0)
 NO_FLAGS = Quality(0)
+MET = Unmet(0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from modelserver.errors import Status
 from modelserver.messages.answers import PoseAnswer
-from modelserver.messages.flags import NAN, Invalid
+from modelserver.messages.flags import MET, NAN, Invalid, Unmet
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3
 
@@ -561,6 +561,30 @@ class GetExplanation(NamedTuple):
     time: TimeQuery = TimeQuery()
 
 
+class PoseDemand(NamedTuple):
+    """What a consumer needs of a pose; each 0 = not asked for. The answer is given in any case, with what is unmet.
+
+    Attributes
+    ----------
+    max_horizontal
+        The horizontal error may be beyond this with a probability of 1 - min_integrity at most, meters: that along x
+        and y of the frame of reference.
+    max_heading
+        The heading error may be beyond this with that probability at most, radians: that about z of the frame of
+        reference.
+    max_age
+        Largest age of the newest data that the pose is computed from, of the vehicle and of each joint, seconds.
+    min_integrity
+        Probability that a limit holds, below 1; 0 = 0.99 for the limits above. If it is stated, the pose must be valid,
+        and without limits above the configured ones must hold with it.
+    """
+
+    max_horizontal: float = 0.0
+    max_heading: float = 0.0
+    max_age: float = 0.0
+    min_integrity: float = 0.0
+
+
 class GetHTransform(NamedTuple):
     """Pose.getHTransform and Pose.getHTransformInv: the vehicle's base frame in World:UTM, or World:UTM in the base
     frame. Answered by get_transformation_reply_t.
@@ -573,11 +597,14 @@ class GetHTransform(NamedTuple):
         false: the base frame in World:UTM. true: World:UTM in the base frame.
     time
         Time of the query.
+    demand
+        What the pose is needed for; all 0 = nothing is asked for.
     """
 
     header: RequestHeader
     inverse: bool = False
     time: TimeQuery = TimeQuery()
+    demand: PoseDemand = PoseDemand()
 
 
 class HistoryReply(NamedTuple):
@@ -698,10 +725,16 @@ class StateVectorReply(NamedTuple):
         Status of the request.
     answer
         The base frame in World:UTM. Meaningful only when header.status is OK.
+    unmet
+        What is unmet of the request's demand, bit by bit as in get_transformation_reply_t; 0 = nothing.
+    unmet_reason
+        What is unmet, by how much, and what was asked for, for a person; empty when unmet is 0.
     """
 
     header: ReplyHeader
     answer: PoseAnswer | None = None
+    unmet: Unmet = MET
+    unmet_reason: str = ""
 
 
 class GetStateVector(NamedTuple):
@@ -713,10 +746,13 @@ class GetStateVector(NamedTuple):
         Id of the request, and the channel of the reply.
     time
         Time of the query.
+    demand
+        What the pose is needed for; all 0 = nothing is asked for.
     """
 
     header: RequestHeader
     time: TimeQuery = TimeQuery()
+    demand: PoseDemand = PoseDemand()
 
 
 class TransformReply(NamedTuple):
@@ -728,10 +764,16 @@ class TransformReply(NamedTuple):
         Status of the request.
     answer
         The pose asked for. Meaningful only when header.status is OK.
+    unmet
+        What is unmet of the request's demand, bit by bit: HORIZONTAL to NOT_VALID. 0 = all that was asked for is met.
+    unmet_reason
+        What is unmet, by how much, and what was asked for, for a person; empty when unmet is 0.
     """
 
     header: ReplyHeader
     answer: PoseAnswer | None = None
+    unmet: Unmet = MET
+    unmet_reason: str = ""
 
 
 class GetTransformation(NamedTuple):
@@ -749,12 +791,15 @@ class GetTransformation(NamedTuple):
         The frame it is to be expressed in: full name, as above.
     time
         Time of the query.
+    demand
+        What the pose is needed for; all 0 = nothing is asked for.
     """
 
     header: RequestHeader
     frame_of_interest: str
     frame_of_reference: str
     time: TimeQuery = TimeQuery()
+    demand: PoseDemand = PoseDemand()
 
 
 class GetTransformations(NamedTuple):

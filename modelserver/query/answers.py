@@ -48,6 +48,7 @@ from modelserver.messages import (
 )
 from modelserver.query import HISTORY_LIMIT, PlatformView
 from modelserver.query.batch import lookup_batch
+from modelserver.query.demand import check_demand
 from modelserver.query.dynamics import compute_dynamics
 from modelserver.query.explanation import explain
 from modelserver.query.motion import compute_motion
@@ -82,7 +83,9 @@ def effort_of(request: Request) -> float:
         return 1.0 + POSE_EFFORT * poses if 0.0 < poses <= HISTORY_LIMIT else 1.0
     if isinstance(request, GetDynamics):
         return DYNAMICS_EFFORT
-    return EXPLANATION_EFFORT if isinstance(request, GetExplanation) else 1.0
+    if isinstance(request, GetExplanation):
+        return EXPLANATION_EFFORT
+    return DEMAND_EFFORT if any(getattr(request, "demand", ())) else 1.0
 
 
 def is_deferred(request: Request) -> bool:
@@ -95,13 +98,16 @@ def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Rep
     header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
     match request:
         case GetTransformation():  # the hot path
-            interest, reference = request.frame_of_interest, request.frame_of_reference
-            return [TransformReply(header, view.transformation(interest, reference, request.time, utime))]
-        case GetStateVector(_, time):
-            return [StateVectorReply(header, view.transformation(view.base_frame, names.WORLD_UTM, time, utime))]
-        case GetHTransform(_, inverse, time):
+            interest, reference, time = request.frame_of_interest, request.frame_of_reference, request.time
+            answer = view.transformation(interest, reference, time, utime)
+            return [TransformReply(header, answer, *check_demand(view, answer, request.demand, time, utime))]
+        case GetStateVector(_, time, demand):
+            answer = view.transformation(view.base_frame, names.WORLD_UTM, time, utime)
+            return [StateVectorReply(header, answer, *check_demand(view, answer, demand, time, utime))]
+        case GetHTransform(_, inverse, time, demand):
             ends = (names.WORLD_UTM, view.base_frame) if inverse else (view.base_frame, names.WORLD_UTM)
-            return [TransformReply(header, view.transformation(*ends, time, utime))]
+            answer = view.transformation(*ends, time, utime)
+            return [TransformReply(header, answer, *check_demand(view, answer, demand, time, utime))]
         case GetMotion(_, interest, reference, expressed_in, time):
             return [MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, utime))]
         case GetExplanation(_, interest, reference, time):
@@ -190,8 +196,10 @@ PAIR_EFFORT: Final = 10.0
 INSTANT_EFFORT: Final = 0.06
 POSE_EFFORT: Final = 0.33
 EXPLANATION_EFFORT: Final = 4.0
+DEMAND_EFFORT: Final = 3.0
 DYNAMICS_EFFORT: Final = 20.0
-"""Effort of a pair of a batch and of each of its instants, of a pose of a history, of an explanation, of dynamics."""
+"""Effort of a pair of a batch and of each of its instants, of a pose of a history, of an explanation, of a pose with a
+demand, of dynamics."""
 
 DEFERRED_EFFORT: Final = 11.0
 """Effort beyond which an answer is deferred: about a millisecond."""

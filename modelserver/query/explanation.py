@@ -7,17 +7,12 @@ import numpy as np
 from modelserver.geometry.topology import EdgeKind
 from modelserver.joints.history import MAX_CLOCK_LEAD_S
 from modelserver.joints.track import MAX_GAP_S, Provenance
-from modelserver.messages import NAN, EdgeReport, Estimate, Explanation, Policy, Quality, TimeQuery
-from modelserver.query.path import PathStep, lookup_path
+from modelserver.messages import NAN, EdgeReport, Explanation, Policy, TimeQuery
+from modelserver.query.path import PathStep, find_provenance, lookup_path
 from modelserver.query.view import PlatformView
 from modelserver.transforms import chain
 
 _ZERO = np.zeros((6, 1))
-_PROVENANCE_OF_FLAG = (
-    (Quality.PREDICTED, Provenance.PREDICTED),
-    (Quality.HELD, Provenance.HELD),
-    (Quality.INTERPOLATED, Provenance.INTERPOLATED),
-)
 
 
 def explain(view: PlatformView, interest: str, reference: str, time: TimeQuery, now: int) -> Explanation:
@@ -56,12 +51,6 @@ def _share(own: float, whole: float, step: PathStep) -> float:
     return own / whole if whole > 0.0 else 0.0
 
 
-def _stamp(view: PlatformView, estimate: Estimate, how: Provenance) -> int:
-    """Return the stamp of the newest stored estimate that an estimate was computed from."""
-    following = view.history.next_after(estimate.utime) if how is Provenance.INTERPOLATED else None
-    return (following or view.history.hold(estimate.utime)).utime
-
-
 def _describe_warning(view: PlatformView, step: PathStep, time: TimeQuery, now: int) -> str:
     """Return the warnings of a joint's position as text; see `lookup_joints` for the flags."""
     edge = step.edge
@@ -98,12 +87,11 @@ def _build_edge_report(
     edge = step.edge
     X = step.X_FT if edge.forward else step.X_FT.inverse()
     provenance, stamp, source, warning = "fixed", 0, "", ""
+    if (found := find_provenance(view, step)) is not None:
+        provenance, stamp = found[0].name.lower(), found[1]
     if step.estimate is not None:
-        found = next((each for flag, each in _PROVENANCE_OF_FLAG if flag in step.estimate.quality), Provenance.MEASURED)
-        provenance, stamp, source = found.name.lower(), _stamp(view, step.estimate, found), "localization"
+        source = "localization"
     elif step.readings:
-        worst = max(step.readings, key=lambda each: each.provenance)
-        provenance, stamp = worst.provenance.name.lower(), min(each.stamp for each in step.readings)
         source = _describe_source(view, view.model.drives[edge.name].leader, step)
         warning = _describe_warning(view, step, time, now)
     constraint = None

@@ -10,7 +10,7 @@ import numpy as np
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.topology import Edge, EdgeKind
-from modelserver.joints.track import Reading
+from modelserver.joints.track import Provenance, Reading
 from modelserver.messages import NO_FLAGS, VALID, Estimate, Invalid, Quality, TimeQuery
 from modelserver.query.joint_lookup import JointReadings
 from modelserver.query.view import (
@@ -59,6 +59,24 @@ class PathState(NamedTuple):
     def links(self) -> list[ChainLink]:
         """The steps as links of a chain."""
         return [step.link for step in self.steps]
+
+
+_PROVENANCE_OF_FLAG = (
+    (Quality.PREDICTED, Provenance.PREDICTED),
+    (Quality.HELD, Provenance.HELD),
+    (Quality.INTERPOLATED, Provenance.INTERPOLATED),
+)
+
+
+def find_provenance(view: PlatformView, step: PathStep) -> tuple[Provenance, int] | None:
+    """Return the provenance of a step's data and the stamp of the newest of them, 0 for none; None for a fixed edge."""
+    if (estimate := step.estimate) is not None:
+        how = next((each for flag, each in _PROVENANCE_OF_FLAG if flag in estimate.quality), Provenance.MEASURED)
+        following = view.history.next_after(estimate.utime) if how is Provenance.INTERPOLATED else None
+        return how, (following or view.history.hold(estimate.utime)).utime
+    if not step.readings:
+        return None
+    return max(each.provenance for each in step.readings), min(each.stamp for each in step.readings)
 
 
 def lookup_path(view: PlatformView, interest: str, reference: str, time: TimeQuery, now: int) -> PathState:

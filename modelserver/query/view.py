@@ -392,6 +392,7 @@ class PlatformView(NamedTuple):
             levels[2],
             levels[3],
             estimate.limit_risk if of_vehicle else NAN,
+            estimate.horizontal_allowance if of_vehicle else NAN,
         )
 
     def _get_levels(self, estimate: Estimate) -> tuple[float, float, float, float]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from modelserver.errors import Status, WireError
-from modelserver.messages import Policy, PoseAnswer, Reply, RequestHeader, TransformReply
+from modelserver.messages import Policy, PoseAnswer, PoseDemand, Reply, RequestHeader, TransformReply
 from modelserver.wire.fields import LENGTH, MAX_UTIME, Codec, check_end, pack_text, read_text
 from modelserver.wire.generated import CODECS, FINGERPRINTS
 from modelserver.wire.poses import PLAIN, UTIME, read_transform_numbers
@@ -61,6 +61,14 @@ def encode(value: Any, type_name: str = "") -> bytes:
 # reply that was read before is recognized by its bytes.
 
 _TIME = struct.Struct(">qbi")
+_DEMAND = struct.Struct(">4d")
+_END: Final = _TIME.size + _DEMAND.size
+"""Bytes of a request behind the names: time and demand."""
+
+_NO_DEMAND: Final = bytes(_DEMAND.size)
+_MET: Final = bytes(4) + pack_text("")
+"""End of a reply in which nothing is unmet."""
+
 _AFTER_UTIME: Final = 24
 """Offset in a reply behind fingerprint, request id and utime."""
 
@@ -86,8 +94,8 @@ _CHANNEL: Final = 20
 """Offset of the reply channel in a request: behind fingerprint, id and the channel's length."""
 
 _LAST_POLICY: Final = max(Policy)
-_NOW: Final = bytes(_TIME.size)
-"""End of a request at the present time with the default policy, without waiting."""
+_NOW: Final = bytes(_END)
+"""End of a request at the present time with the default policy, without waiting and without a demand."""
 _REQUEST: Final = FINGERPRINTS[CACHED_TYPE]
 _REPLY: Final = FINGERPRINTS["get_transformation_reply_t"]
 
@@ -102,18 +110,26 @@ def read_request_header(data: bytes) -> RequestHeader | None:
 
 
 def pack_get_transformation(
-    request_id: int, channel: str, interest: str, reference: str, at: int, policy: int, wait_ms: int
+    request_id: int,
+    channel: str,
+    interest: str,
+    reference: str,
+    at: int,
+    policy: int,
+    wait_ms: int,
+    demand: PoseDemand | None = None,
 ) -> bytes:
     """Return the bytes of a get_transformation_request_t, without the values that it is made of."""
     head = (_REQUEST, UTIME.pack(request_id), pack_text(channel), pack_text(interest), pack_text(reference))
-    return b"%b%b%b%b%b%b" % (*head, _TIME.pack(at, policy, wait_ms))
+    end = _NO_DEMAND if demand is None else _DEMAND.pack(*demand)
+    return b"%b%b%b%b%b%b%b" % (*head, _TIME.pack(at, policy, wait_ms), end)
 
 
 def read_answer(data: bytes, interest: str, reference: str) -> PoseAnswer | None:
     """Return the answer of a get_transformation_reply_t to a question for these two frames; None: see the whole reply.
 
-    What was asked need not be read again, only compared. A reply with a message or an error, or with other frames, is
-    for `decode`. Raises WireError, struct.error.
+    What was asked need not be read again, only compared. A reply with a message or an error, with other frames, or with
+    anything unmet is for `decode`. Raises WireError, struct.error.
     """
     if data[:8] != _REPLY or data[_AFTER_UTIME : _AFTER_UTIME + len(_PLAIN_OK)] != _PLAIN_OK:
         return None
@@ -128,7 +144,8 @@ def read_answer(data: bytes, interest: str, reference: str) -> PoseAnswer | None
         return None
     (utime,) = UTIME.unpack_from(data, at)
     answer, end = read_transform_numbers(data, at + 8 + len(names), utime, interest, reference)
-    check_end(data, end)
+    if data[end:] != _MET:
+        return None
     if not utime and answer.origin is None:
         if len(_ANSWER_CACHE) >= _MAX_CACHED_ANSWERS:
             _ANSWER_CACHE.popitem(last=False)
@@ -168,14 +185,16 @@ class StaticReplyCache:
 
         `client` is the reply channel in the bytes of the request.
         """
-        pair = request[_CHANNEL + len(client) : -_TIME.size]
+        pair = request[_CHANNEL + len(client) : -_END]
         rest = self._entries.get(pair)
         if rest is None or request[:8] != _REQUEST:
             return None
         self._entries.move_to_end(pair)
         if not request.endswith(_NOW):
-            at, policy, wait_ms = _TIME.unpack_from(request, len(request) - _TIME.size)
+            at, policy, wait_ms = _TIME.unpack_from(request, len(request) - _END)
             if not (0 <= at < MAX_UTIME and 0 <= policy <= _LAST_POLICY and wait_ms >= 0):
+                return None
+            if not request.endswith(_NO_DEMAND):
                 return None
         return b"%b%b%b%b" % (_REPLY, request[8:16], UTIME.pack(utime), rest)
 
@@ -183,8 +202,8 @@ class StaticReplyCache:
         """Cache a reply to a request, if it does not depend on time; `encoded` are its bytes."""
         if not isinstance(reply, TransformReply) or reply.header.status is not Status.OK or reply.answer is None:
             return
-        pair = request[_CHANNEL + len(client) : -_TIME.size]
-        if reply.answer.transformation.utime or len(pair) > MAX_PAIR_BYTES:
+        pair = request[_CHANNEL + len(client) : -_END]
+        if reply.answer.transformation.utime or len(pair) > MAX_PAIR_BYTES or not request.endswith(_NO_DEMAND):
             return
         if len(self._entries) >= self._capacity:
             self._entries.popitem(last=False)

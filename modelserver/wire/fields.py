@@ -57,6 +57,9 @@ MAX_SNAPSHOT_PARTS: Final = 100_000
 MAX_DISTANCE = 1e12
 """Meters; nothing on a vehicle or on earth is farther."""
 
+MAX_ANGLE = math.pi
+"""Radians; no rotation is by more, and a number of degrees mostly is."""
+
 ROTATION_TOLERANCE = 1e-6
 """How far a rotation on the wire may be from one: it comes from computers, so more is damage."""
 
@@ -319,6 +322,13 @@ def check_distance(value: float, what: str) -> float:
     """Return a distance, meters. Raises WireError for one that cannot be."""
     if not 0.0 <= value < MAX_DISTANCE:
         raise WireError("malformed", f"{what} {value} is no distance")
+    return value
+
+
+def check_demand(value: float, what: str, most: float = math.inf) -> float:
+    """Return a number that a request asks for, 0 for nothing. Raises WireError where it is not in [0, most)."""
+    if not 0.0 <= value < most:
+        raise WireError("malformed", f"{what} {value:g} is not from 0 (not asked for) to less than {most:g}")
     return value
 
 

@@ -51,6 +51,7 @@ from modelserver.messages import (
     Policy,
     PoseAnswer,
     PoseBatchReply,
+    PoseDemand,
     PublishDecisions,
     RangeSample,
     RejectedCount,
@@ -67,6 +68,7 @@ from modelserver.messages import (
     SwitchMode,
     TimeQuery,
     TransformReply,
+    Unmet,
     VehicleCommand,
     VehicleMode,
     VehicleStatusSample,
@@ -78,9 +80,11 @@ from modelserver.messages import (
 from modelserver.transforms.pose import Pose
 from modelserver.wire.batch import pack_get_transformations_reply, unpack_get_transformations_reply
 from modelserver.wire.fields import (
+    MAX_ANGLE,
     MAX_CONTACTS,
     MAX_COORDINATES,
     MAX_DECISIONS,
+    MAX_DISTANCE,
     MAX_FRAME_NAME,
     MAX_MESSAGE_INSTANTS,
     MAX_PAIRS,
@@ -92,6 +96,7 @@ from modelserver.wire.fields import (
     NAN36,
     Codec,
     check_count,
+    check_demand,
     check_distance,
     check_finite,
     check_instants,
@@ -147,17 +152,17 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "get_body_list_request_t": bytes.fromhex("02ff54e76e2dd188"),
     "get_dynamics_reply_t": bytes.fromhex("00861eac3d9f9d3e"),
     "get_dynamics_request_t": bytes.fromhex("17b1653b9c6c7292"),
-    "get_explanation_reply_t": bytes.fromhex("9af0edbfc9a8d42f"),
+    "get_explanation_reply_t": bytes.fromhex("ddec09b464af1541"),
     "get_explanation_request_t": bytes.fromhex("349d6de2b7954177"),
-    "get_h_transform_request_t": bytes.fromhex("7e7a9479fd1d6d9b"),
-    "get_history_reply_t": bytes.fromhex("64ebfff9b07a20b7"),
+    "get_h_transform_request_t": bytes.fromhex("eaa07547a5aa8674"),
+    "get_history_reply_t": bytes.fromhex("efbd31ec8c327a94"),
     "get_history_request_t": bytes.fromhex("6e2a16f04ed99393"),
-    "get_motion_reply_t": bytes.fromhex("541f4056ce18a089"),
+    "get_motion_reply_t": bytes.fromhex("971a5c4b691ee19b"),
     "get_motion_request_t": bytes.fromhex("cfb4f4d1e8b42938"),
-    "get_state_vector_reply_t": bytes.fromhex("c6568dcad99f9d1a"),
-    "get_state_vector_request_t": bytes.fromhex("7a15c48e4bece939"),
-    "get_transformation_reply_t": bytes.fromhex("c8505ee39b59a2b5"),
-    "get_transformation_request_t": bytes.fromhex("70bdf317a3d8605e"),
+    "get_state_vector_reply_t": bytes.fromhex("5418e07322bf542b"),
+    "get_state_vector_request_t": bytes.fromhex("c2e813b9e147ca53"),
+    "get_transformation_reply_t": bytes.fromhex("80d1a584dffd24de"),
+    "get_transformation_request_t": bytes.fromhex("d407ba8092d6daa1"),
     "get_transformations_reply_t": bytes.fromhex("5c17dce904d61a93"),
     "get_transformations_request_t": bytes.fromhex("d71f006e179d5a75"),
     "gps_t": bytes.fromhex("661a4b5c1827f64c"),
@@ -171,8 +176,9 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "name_list_reply_t": bytes.fromhex("c14f1581c7c4db7b"),
     "navigation_state_t": bytes.fromhex("d8c235934651b218"),
     "path_edge_t": bytes.fromhex("3b32c8e843fbfdb3"),
-    "pose_transform_t": bytes.fromhex("9aa2ca1ec0e2ad93"),
-    "pose_vector_t": bytes.fromhex("5d161cfb4b822bdd"),
+    "pose_demand_t": bytes.fromhex("cd355948604c6f2a"),
+    "pose_transform_t": bytes.fromhex("bc2058190e65ce1c"),
+    "pose_vector_t": bytes.fromhex("227eb5f4b95e58cc"),
     "range_t": bytes.fromhex("39acec7e5e030304"),
     "rejected_count_t": bytes.fromhex("cc9becbf2c78c790"),
     "relative_pose_t": bytes.fromhex("d75db953643bc60a"),
@@ -181,8 +187,8 @@ FINGERPRINTS: Final[Mapping[str, bytes]] = {
     "reply_header_t": bytes.fromhex("25053b2b5b842c4d"),
     "request_header_t": bytes.fromhex("fb1745122e48c9d4"),
     "sensor_header_t": bytes.fromhex("c35bf2781d281ef1"),
-    "set_h_transform_request_t": bytes.fromhex("ed93fbdf69e9db94"),
-    "set_state_vector_request_t": bytes.fromhex("727aa1987f28d828"),
+    "set_h_transform_request_t": bytes.fromhex("308f17d404f01ca7"),
+    "set_state_vector_request_t": bytes.fromhex("fd4bd38b5ae13207"),
     "signed_t": bytes.fromhex("9e853d013a985096"),
     "stability_health_t": bytes.fromhex("52cc5abffcacc888"),
     "time_query_t": bytes.fromhex("e0e3ae7a2bde3465"),
@@ -206,28 +212,30 @@ _S10 = struct.Struct(">9d")
 _S11 = struct.Struct(">d3d36d")
 _S12 = struct.Struct(">bbqbi")
 _S13 = struct.Struct(">qbi")
-_S14 = struct.Struct(">bqbi")
+_S14 = struct.Struct(">bqbidddd")
 _S15 = struct.Struct(">qqd")
 _S16 = struct.Struct(">3d3d3d3d36d36d")
 _S17 = struct.Struct(">3d3d3d3d36d")
 _S18 = struct.Struct(">36d")
-_S19 = struct.Struct(">qb")
-_S20 = struct.Struct(">bhdddddddd9d3d9dddddddd")
-_S21 = struct.Struct(">qd")
-_S22 = struct.Struct(">biiqqqiqqdddd")
-_S23 = struct.Struct(">iiqdbbbddddddddddddddddddddi")
-_S24 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S25 = struct.Struct(">bbbddddddddddddddd")
-_S26 = struct.Struct(">iii")
-_S27 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
-_S28 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
-_S29 = struct.Struct(">b7dbqd")
-_S30 = struct.Struct(">3d")
-_S31 = struct.Struct(">qq")
-_S32 = struct.Struct(">32s")
-_S33 = struct.Struct(">dddddi")
-_S34 = struct.Struct(">qdq")
-_S35 = struct.Struct(">bddddiq")
+_S19 = struct.Struct(">qbidddd")
+_S20 = struct.Struct(">qb")
+_S21 = struct.Struct(">bhdddddddd9d3d9dddddddd")
+_S22 = struct.Struct(">qd")
+_S23 = struct.Struct(">biiqqqiqqdddd")
+_S24 = struct.Struct(">iiqdbbbddddddddddddddddddddi")
+_S25 = struct.Struct(">3d9d3d9d3dbb4d9dd")
+_S26 = struct.Struct(">bbbddddddddddddddd")
+_S27 = struct.Struct(">iii")
+_S28 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
+_S29 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
+_S30 = struct.Struct(">b7dbqd")
+_S31 = struct.Struct(">dddd")
+_S32 = struct.Struct(">3d")
+_S33 = struct.Struct(">qq")
+_S34 = struct.Struct(">32s")
+_S35 = struct.Struct(">dddddi")
+_S36 = struct.Struct(">qdq")
+_S37 = struct.Struct(">bddddiq")
 
 
 NO_GET_DYNAMICS_REPLY = (
@@ -635,7 +643,16 @@ def pack_get_h_transform_request(value: GetHTransform) -> bytes:
     return b"%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S14.pack(value.inverse, value.time.at, value.time.policy, value.time.wait_ms),
+        _S14.pack(
+            value.inverse,
+            value.time.at,
+            value.time.policy,
+            value.time.wait_ms,
+            value.demand.max_horizontal,
+            value.demand.max_heading,
+            value.demand.max_age,
+            value.demand.min_integrity,
+        ),
     )
 
 
@@ -643,7 +660,16 @@ def unpack_get_h_transform_request(data: bytes, at: int) -> tuple[GetHTransform,
     """Return the get_h_transform_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    inverse, time_at_, time_policy, time_wait_ms = _S14.unpack_from(data, at)
+    (
+        inverse,
+        time_at_,
+        time_policy,
+        time_wait_ms,
+        demand_max_horizontal,
+        demand_max_heading,
+        demand_max_age,
+        demand_min_integrity,
+    ) = _S14.unpack_from(data, at)
     return GetHTransform(
         RequestHeader(header_request_id, header_reply_channel),
         bool(inverse),
@@ -652,7 +678,13 @@ def unpack_get_h_transform_request(data: bytes, at: int) -> tuple[GetHTransform,
             read_enum(Policy, time_policy, "policy"),
             check_not_negative(time_wait_ms, "wait_ms"),
         ),
-    ), at + 14
+        PoseDemand(
+            check_demand(demand_max_horizontal, "max_horizontal", MAX_DISTANCE),
+            check_demand(demand_max_heading, "max_heading", MAX_ANGLE),
+            check_demand(demand_max_age, "max_age"),
+            check_demand(demand_min_integrity, "min_integrity", 1.0),
+        ),
+    ), at + 46
 
 
 def pack_get_history_reply(value: HistoryReply) -> bytes:
@@ -785,9 +817,11 @@ def unpack_get_motion_request(data: bytes, at: int) -> tuple[GetMotion, int]:
 
 def pack_get_state_vector_reply(value: StateVectorReply) -> bytes:
     """Return the bytes of a get_state_vector_reply_t without the fingerprint."""
-    return b"%b%b" % (
+    return b"%b%b%b%b" % (
         pack_reply_header(value.header),
         NO_POSE_VECTOR if value.answer is None else pack_pose_vector(value.answer),
+        _S5.pack(value.unmet),
+        pack_text(value.unmet_reason),
     )
 
 
@@ -798,7 +832,9 @@ def unpack_get_state_vector_reply(data: bytes, at: int) -> tuple[StateVectorRepl
         pose, at = unpack_pose_vector(data, at)
     else:
         pose, at = None, skip_pose_vector(data, at)
-    return StateVectorReply(header, pose), at
+    (unmet,) = _S5.unpack_from(data, at)
+    unmet_reason, at = read_text(data, at + 4)
+    return StateVectorReply(header, pose, Unmet(unmet), unmet_reason), at
 
 
 def pack_get_state_vector_request(value: GetStateVector) -> bytes:
@@ -806,7 +842,15 @@ def pack_get_state_vector_request(value: GetStateVector) -> bytes:
     return b"%b%b%b" % (
         _S3.pack(value.header.request_id),
         pack_text(value.header.reply_channel),
-        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S19.pack(
+            value.time.at,
+            value.time.policy,
+            value.time.wait_ms,
+            value.demand.max_horizontal,
+            value.demand.max_heading,
+            value.demand.max_age,
+            value.demand.min_integrity,
+        ),
     )
 
 
@@ -814,7 +858,15 @@ def unpack_get_state_vector_request(data: bytes, at: int) -> tuple[GetStateVecto
     """Return the get_state_vector_request_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
-    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
+    (
+        time_at_,
+        time_policy,
+        time_wait_ms,
+        demand_max_horizontal,
+        demand_max_heading,
+        demand_max_age,
+        demand_min_integrity,
+    ) = _S19.unpack_from(data, at)
     return GetStateVector(
         RequestHeader(header_request_id, header_reply_channel),
         TimeQuery(
@@ -822,14 +874,22 @@ def unpack_get_state_vector_request(data: bytes, at: int) -> tuple[GetStateVecto
             read_enum(Policy, time_policy, "policy"),
             check_not_negative(time_wait_ms, "wait_ms"),
         ),
-    ), at + 13
+        PoseDemand(
+            check_demand(demand_max_horizontal, "max_horizontal", MAX_DISTANCE),
+            check_demand(demand_max_heading, "max_heading", MAX_ANGLE),
+            check_demand(demand_max_age, "max_age"),
+            check_demand(demand_min_integrity, "min_integrity", 1.0),
+        ),
+    ), at + 45
 
 
 def pack_get_transformation_reply(value: TransformReply) -> bytes:
     """Return the bytes of a get_transformation_reply_t without the fingerprint."""
-    return b"%b%b" % (
+    return b"%b%b%b%b" % (
         pack_reply_header(value.header),
         NO_POSE_TRANSFORM if value.answer is None else pack_pose_transform(value.answer),
+        _S5.pack(value.unmet),
+        pack_text(value.unmet_reason),
     )
 
 
@@ -840,7 +900,9 @@ def unpack_get_transformation_reply(data: bytes, at: int) -> tuple[TransformRepl
         transform, at = unpack_pose_transform(data, at)
     else:
         transform, at = None, skip_pose_transform(data, at)
-    return TransformReply(header, transform), at
+    (unmet,) = _S5.unpack_from(data, at)
+    unmet_reason, at = read_text(data, at + 4)
+    return TransformReply(header, transform, Unmet(unmet), unmet_reason), at
 
 
 def pack_get_transformation_request(value: GetTransformation) -> bytes:
@@ -850,7 +912,15 @@ def pack_get_transformation_request(value: GetTransformation) -> bytes:
         pack_text(value.header.reply_channel),
         pack_text(value.frame_of_interest),
         pack_text(value.frame_of_reference),
-        _S13.pack(value.time.at, value.time.policy, value.time.wait_ms),
+        _S19.pack(
+            value.time.at,
+            value.time.policy,
+            value.time.wait_ms,
+            value.demand.max_horizontal,
+            value.demand.max_heading,
+            value.demand.max_age,
+            value.demand.min_integrity,
+        ),
     )
 
 
@@ -860,7 +930,15 @@ def unpack_get_transformation_request(data: bytes, at: int) -> tuple[GetTransfor
     header_reply_channel, at = read_text(data, at + 8)
     frame_of_interest, at = read_text(data, at)
     frame_of_reference, at = read_text(data, at)
-    time_at_, time_policy, time_wait_ms = _S13.unpack_from(data, at)
+    (
+        time_at_,
+        time_policy,
+        time_wait_ms,
+        demand_max_horizontal,
+        demand_max_heading,
+        demand_max_age,
+        demand_min_integrity,
+    ) = _S19.unpack_from(data, at)
     return GetTransformation(
         RequestHeader(header_request_id, header_reply_channel),
         frame_of_interest,
@@ -870,7 +948,13 @@ def unpack_get_transformation_request(data: bytes, at: int) -> tuple[GetTransfor
             read_enum(Policy, time_policy, "policy"),
             check_not_negative(time_wait_ms, "wait_ms"),
         ),
-    ), at + 13
+        PoseDemand(
+            check_demand(demand_max_horizontal, "max_horizontal", MAX_DISTANCE),
+            check_demand(demand_max_heading, "max_heading", MAX_ANGLE),
+            check_demand(demand_max_age, "max_age"),
+            check_demand(demand_min_integrity, "min_integrity", 1.0),
+        ),
+    ), at + 45
 
 
 def pack_get_transformations_request(value: GetTransformations) -> bytes:
@@ -885,7 +969,7 @@ def pack_get_transformations_request(value: GetTransformations) -> bytes:
             _S5.pack(len(value.at)),
             pack_numbers("q", value.at),
             pack_text(value.fixed_frame),
-            _S19.pack(value.reference_at, value.with_covariance),
+            _S20.pack(value.reference_at, value.with_covariance),
         )
     )
 
@@ -902,7 +986,7 @@ def unpack_get_transformations_request(data: bytes, at: int) -> tuple[GetTransfo
     check_count(num_instants, "num_instants", MAX_MESSAGE_INSTANTS)
     at_, at = read_numbers("q", data, at + 4, num_instants)
     fixed_frame, at = read_text(data, at)
-    reference_at, with_covariance = _S19.unpack_from(data, at)
+    reference_at, with_covariance = _S20.unpack_from(data, at)
     return GetTransformations(
         RequestHeader(header_request_id, header_reply_channel),
         tuple(
@@ -930,7 +1014,7 @@ def pack_gps(value: GpsSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S20.pack(
+        _S21.pack(
             value.fix_type,
             value.satellites,
             value.hdop,
@@ -998,7 +1082,7 @@ def unpack_gps(data: bytes, at: int) -> tuple[GpsSample, int]:
         course_sigma,
         baseline_yaw,
         baseline_yaw_sigma,
-    ) = _S20.unpack_from(data, at)
+    ) = _S21.unpack_from(data, at)
     return GpsSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -1059,11 +1143,11 @@ def pack_health(value: Health) -> bytes:
     """Return the bytes of a health_t without the fingerprint."""
     return b"".join(
         (
-            _S21.pack(value.utime, value.uptime),
+            _S22.pack(value.utime, value.uptime),
             pack_text(value.version),
             pack_text(value.vehicle),
             pack_text(value.model_revision),
-            _S22.pack(
+            _S23.pack(
                 value.state,
                 value.invalid_reasons,
                 value.pose_epoch,
@@ -1080,7 +1164,7 @@ def pack_health(value: Health) -> bytes:
             ),
             pack_text(value.invalid_text),
             pack_text(value.host),
-            _S23.pack(
+            _S24.pack(
                 value.pid,
                 value.requests_queued,
                 value.memory,
@@ -1125,7 +1209,7 @@ def pack_health(value: Health) -> bytes:
 
 def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
     """Return the health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, uptime = _S21.unpack_from(data, at)
+    utime, uptime = _S22.unpack_from(data, at)
     version, at = read_text(data, at + 16)
     vehicle, at = read_text(data, at)
     model_revision, at = read_text(data, at)
@@ -1143,7 +1227,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         tick_latency_p90,
         tick_latency_p99,
         tick_latency_max,
-    ) = _S22.unpack_from(data, at)
+    ) = _S23.unpack_from(data, at)
     invalid_text, at = read_text(data, at + 85)
     host, at = read_text(data, at)
     (
@@ -1175,7 +1259,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         stability_dynamic_margin_sigma,
         stability_limit,
         stability_num_contacts,
-    ) = _S23.unpack_from(data, at)
+    ) = _S24.unpack_from(data, at)
     check_count(stability_num_contacts, "num_contacts", MAX_CONTACTS)
     stability_contacts, at = read_each(read_text, data, at + 191, stability_num_contacts)
     stability_loads, at = read_numbers("d", data, at, stability_num_contacts)
@@ -1260,7 +1344,7 @@ def pack_imu(value: ImuSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S24.pack(
+        _S25.pack(
             *(value.angular_velocity or NAN3),
             *(value.angular_velocity_covariance or NAN9),
             *(value.specific_force or NAN3),
@@ -1323,7 +1407,7 @@ def unpack_imu(data: bytes, at: int) -> tuple[ImuSample, int]:
         orientation_covariance_7,
         orientation_covariance_8,
         temperature_celsius,
-    ) = _S24.unpack_from(data, at)
+    ) = _S25.unpack_from(data, at)
     return ImuSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -1430,7 +1514,7 @@ def unpack_joints(data: bytes, at: int) -> tuple[JointsSample, int]:
 
 def pack_localization_health(value: LocalizationHealth) -> bytes:
     """Return the bytes of a localization_health_t without the fingerprint."""
-    return _S25.pack(
+    return _S26.pack(
         -1 if value.mode is None else value.mode,
         -1 if value.phase is None else value.phase,
         value.stationary,
@@ -1473,7 +1557,7 @@ def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth
         limit_risk,
         horizontal_limit,
         heading_limit,
-    ) = _S25.unpack_from(data, at)
+    ) = _S26.unpack_from(data, at)
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
         None if phase == -1 else read_enum(Phase, phase, "phase"),
@@ -1576,7 +1660,7 @@ def pack_model_snapshot(value: SnapshotPart) -> bytes:
     return b"%b%b%b%b" % (
         _S3.pack(value.utime),
         pack_text(value.model_revision),
-        _S26.pack(value.part, value.parts, len(value.data)),
+        _S27.pack(value.part, value.parts, len(value.data)),
         value.data,
     )
 
@@ -1585,7 +1669,7 @@ def unpack_model_snapshot(data: bytes, at: int) -> tuple[SnapshotPart, int]:
     """Return the model_snapshot_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (utime,) = _S3.unpack_from(data, at)
     model_revision, at = read_text(data, at + 8)
-    part, num_parts, size = _S26.unpack_from(data, at)
+    part, num_parts, size = _S27.unpack_from(data, at)
     check_count(size, "size")
     data_, at = read_bytes(data, at + 12, size)
     return verify_model_snapshot(
@@ -1620,7 +1704,7 @@ def pack_navigation_state(value: NavigationState) -> bytes:
     check_outgoing(len(value.names), MAX_STATES, "n")
     return b"".join(
         (
-            _S27.pack(
+            _S28.pack(
                 value.utime,
                 value.mode,
                 value.phase,
@@ -1671,7 +1755,7 @@ def unpack_navigation_state(data: bytes, at: int) -> tuple[NavigationState, int]
         angular_velocity_1,
         angular_velocity_2,
         *twist_covariance,
-    ) = _S28.unpack_from(data, at)
+    ) = _S29.unpack_from(data, at)
     (n,) = _S5.unpack_from(data, at + 435)
     check_count(n, "n", MAX_STATES)
     names, at = read_each(read_text, data, at + 439, n)
@@ -1709,7 +1793,7 @@ def pack_path_edge(value: EdgeReport) -> bytes:
         pack_text(value.name),
         pack_text(value.ends[0]),
         pack_text(value.ends[1]),
-        _S29.pack(
+        _S30.pack(
             value.forward,
             *value.pose.xyz,
             *value.pose.wxyz,
@@ -1732,7 +1816,7 @@ def unpack_path_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
     from_end, at = read_text(data, at)
     to_end, at = read_text(data, at)
     forward, vector_0, vector_1, vector_2, vector_3, vector_4, vector_5, vector_6, provenance, stamp, age = (
-        _S29.unpack_from(data, at)
+        _S30.unpack_from(data, at)
     )
     source, at = read_text(data, at + 74)
     (num_coordinates,) = _S5.unpack_from(data, at)
@@ -1757,6 +1841,22 @@ def unpack_path_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
     ), at
 
 
+def pack_pose_demand(value: PoseDemand) -> bytes:
+    """Return the bytes of a pose_demand_t without the fingerprint."""
+    return _S31.pack(value.max_horizontal, value.max_heading, value.max_age, value.min_integrity)
+
+
+def unpack_pose_demand(data: bytes, at: int) -> tuple[PoseDemand, int]:
+    """Return the pose_demand_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    max_horizontal, max_heading, max_age, min_integrity = _S31.unpack_from(data, at)
+    return PoseDemand(
+        check_demand(max_horizontal, "max_horizontal", MAX_DISTANCE),
+        check_demand(max_heading, "max_heading", MAX_ANGLE),
+        check_demand(max_age, "max_age"),
+        check_demand(min_integrity, "min_integrity", 1.0),
+    ), at + 32
+
+
 def pack_range(value: RangeSample) -> bytes:
     """Return the bytes of a range_t without the fingerprint."""
     return b"%b%b%b%b%b%b%b" % (
@@ -1770,7 +1870,7 @@ def pack_range(value: RangeSample) -> bytes:
         pack_text(value.header.source),
         pack_text(value.frame),
         pack_text(value.beacon),
-        _S30.pack(*value.beacon_position),
+        _S32.pack(*value.beacon_position),
         pack_text(value.frame_of_reference),
         _S6.pack(value.distance, value.sigma),
     )
@@ -1782,7 +1882,7 @@ def unpack_range(data: bytes, at: int) -> tuple[RangeSample, int]:
     header_source, at = read_text(data, at + 40)
     frame, at = read_text(data, at)
     beacon, at = read_text(data, at)
-    beacon_position_0, beacon_position_1, beacon_position_2 = _S30.unpack_from(data, at)
+    beacon_position_0, beacon_position_1, beacon_position_2 = _S32.unpack_from(data, at)
     frame_of_reference, at = read_text(data, at + 24)
     distance, sigma = _S6.unpack_from(data, at)
     return RangeSample(
@@ -1973,11 +2073,11 @@ def pack_signed(value: Envelope) -> bytes:
     return b"%b%b%b%b%b%b%b" % (
         pack_text(value.key_name),
         pack_text(value.sender),
-        _S31.pack(value.utime, value.counter),
+        _S33.pack(value.utime, value.counter),
         pack_text(value.channel),
         _S5.pack(len(value.payload)),
         value.payload,
-        _S32.pack(value.mac),
+        _S34.pack(value.mac),
     )
 
 
@@ -1985,12 +2085,12 @@ def unpack_signed(data: bytes, at: int) -> tuple[Envelope, int]:
     """Return the signed_t that begins at `at`, and its end. Raises WireError, struct.error."""
     key_name, at = read_text(data, at)
     sender, at = read_text(data, at)
-    utime, counter = _S31.unpack_from(data, at)
+    utime, counter = _S33.unpack_from(data, at)
     channel, at = read_text(data, at + 16)
     (size,) = _S5.unpack_from(data, at)
     check_count(size, "size", 4096)
     payload, at = read_bytes(data, at + 4, size)
-    (mac,) = _S32.unpack_from(data, at)
+    (mac,) = _S34.unpack_from(data, at)
     return Envelope(
         check_name(key_name, "key_name"),
         check_name(sender, "sender"),
@@ -2006,7 +2106,7 @@ def pack_stability_health(value: StabilityHealth) -> bytes:
     """Return the bytes of a stability_health_t without the fingerprint."""
     return b"".join(
         (
-            _S33.pack(
+            _S35.pack(
                 value.margin,
                 value.margin_sigma,
                 value.dynamic_margin,
@@ -2022,7 +2122,7 @@ def pack_stability_health(value: StabilityHealth) -> bytes:
 
 def unpack_stability_health(data: bytes, at: int) -> tuple[StabilityHealth, int]:
     """Return the stability_health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    margin, margin_sigma, dynamic_margin, dynamic_margin_sigma, limit, num_contacts = _S33.unpack_from(data, at)
+    margin, margin_sigma, dynamic_margin, dynamic_margin_sigma, limit, num_contacts = _S35.unpack_from(data, at)
     check_count(num_contacts, "num_contacts", MAX_CONTACTS)
     contacts, at = read_each(read_text, data, at + 44, num_contacts)
     loads, at = read_numbers("d", data, at, num_contacts)
@@ -2053,7 +2153,7 @@ def unpack_time_query(data: bytes, at: int) -> tuple[TimeQuery, int]:
 def pack_vehicle_command(value: VehicleCommand) -> bytes:
     """Return the bytes of a vehicle_command_t without the fingerprint."""
     return b"%b%b%b" % (
-        _S34.pack(value.utime, value.valid_for, value.seq),
+        _S36.pack(value.utime, value.valid_for, value.seq),
         pack_text(value.source),
         _S6.pack(value.forward_speed, value.steering_angle),
     )
@@ -2061,7 +2161,7 @@ def pack_vehicle_command(value: VehicleCommand) -> bytes:
 
 def unpack_vehicle_command(data: bytes, at: int) -> tuple[VehicleCommand, int]:
     """Return the vehicle_command_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, valid_for, seq = _S34.unpack_from(data, at)
+    utime, valid_for, seq = _S36.unpack_from(data, at)
     source, at = read_text(data, at + 24)
     forward_speed, steering_angle = _S6.unpack_from(data, at)
     return VehicleCommand(
@@ -2085,7 +2185,7 @@ def pack_vehicle_status(value: VehicleStatusSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S35.pack(
+        _S37.pack(
             value.mode,
             value.forward_speed,
             value.steering_angle,
@@ -2101,7 +2201,7 @@ def unpack_vehicle_status(data: bytes, at: int) -> tuple[VehicleStatusSample, in
     """Return the vehicle_status_t that begins at `at`, and its end. Raises WireError, struct.error."""
     header_utime, header_utime_sigma, header_host_utime, header_device_utime, header_seq = _S0.unpack_from(data, at)
     header_source, at = read_text(data, at + 40)
-    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S35.unpack_from(
+    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S37.unpack_from(
         data, at
     )
     return VehicleStatusSample(

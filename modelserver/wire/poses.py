@@ -33,10 +33,11 @@ _MATRIX = struct.Struct(">16d")
 _STATE_VECTOR = struct.Struct(">7d")
 _NUMBERS = struct.Struct(">36d")
 # initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
-_REST = struct.Struct(">3dbbqibii6d")
+_REST_FORMAT: Final = "3dbbqibii7d"
+_REST = struct.Struct(f">{_REST_FORMAT}")
 # all of these in one: of the covariance only the first number, nan where there is none
-_TRANSFORM = struct.Struct(">16dd280x3dbbqibiiddd")
-_VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
+_TRANSFORM = struct.Struct(f">16dd280x{_REST_FORMAT}")
+_VECTOR = struct.Struct(f">7dd280x{_REST_FORMAT}")
 PLAIN: Final = pack_text("") + LENGTH.pack(0)
 """The part of a reply's header that is the same in each reply with an answer: no message, no nearest names."""
 
@@ -121,7 +122,7 @@ def skip_pose_vector(data: bytes, at: int) -> int:
 
 
 def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
-    transformation, origin, quality, *bounds = answer
+    transformation, origin, quality, *bounds = answer[:-2]
     covariance = transformation.covariance_numbers
     invalid = transformation.invalid_reasons
     place = NO_PLACE if origin is None else (origin.easting, origin.northing, origin.height, origin.zone, origin.north)

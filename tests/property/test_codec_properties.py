@@ -47,6 +47,14 @@ sensor_headers = st.builds(
     numbers,
 )
 request_headers = st.builds(messages.RequestHeader, int64, texts)
+demands = st.builds(
+    messages.PoseDemand,
+    st.floats(0.0, 1e12, exclude_max=True),
+    st.floats(0.0, math.pi, exclude_max=True),
+    st.floats(0.0, allow_infinity=False),
+    st.floats(0.0, 1.0, exclude_max=True),
+)
+unmets = st.integers(0, 15).map(messages.Unmet)
 times = st.builds(messages.TimeQuery, utimes, st.sampled_from(messages.Policy), st.integers(0, (1 << 31) - 1))
 
 
@@ -75,7 +83,7 @@ def answers(draw: st.DrawFn) -> messages.PoseAnswer:
         ),
         origin,
         messages.Quality(draw(st.integers(0, 63))),
-        *draw(st.tuples(numbers, numbers, numbers)),
+        *draw(st.tuples(*[numbers] * 7)),
     )
 
 
@@ -227,16 +235,18 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "localization_mode_t": st.builds(messages.SwitchMode, sensor_headers, st.sampled_from(messages.Mode)),
     "decisions_t": st.builds(messages.PublishDecisions, utimes, st.lists(decisions(), max_size=4).map(tuple)),
     "navigation_state_t": states(),
-    "get_transformation_request_t": st.builds(messages.GetTransformation, request_headers, texts, texts, times),
+    "get_transformation_request_t": st.builds(
+        messages.GetTransformation, request_headers, texts, texts, times, demands
+    ),
     "get_body_list_request_t": st.builds(messages.GetBodyList, request_headers),
     "get_body_frame_list_request_t": st.builds(messages.GetBodyFrameList, request_headers, texts),
-    "get_state_vector_request_t": st.builds(messages.GetStateVector, request_headers, times),
-    "get_h_transform_request_t": st.builds(messages.GetHTransform, request_headers, st.booleans(), times),
+    "get_state_vector_request_t": st.builds(messages.GetStateVector, request_headers, times, demands),
+    "get_h_transform_request_t": st.builds(messages.GetHTransform, request_headers, st.booleans(), times, demands),
     "get_history_request_t": st.builds(messages.GetHistory, request_headers, utimes, utimes, numbers),
     "get_transformation_reply_t": failed.map(messages.TransformReply)
-    | st.builds(messages.TransformReply, fine, answers()),
+    | st.builds(messages.TransformReply, fine, answers(), unmets, texts),
     "get_state_vector_reply_t": failed.map(messages.StateVectorReply)
-    | st.builds(messages.StateVectorReply, fine, answers()),
+    | st.builds(messages.StateVectorReply, fine, answers(), unmets, texts),
     "name_list_reply_t": st.builds(
         lambda header, found: messages.NameListReply(
             header, tuple(name for name, _ in found), tuple(about for _, about in found)

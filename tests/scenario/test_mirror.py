@@ -129,6 +129,24 @@ def test_given_held_times_then_platform_and_mirror_agree(drive: Drive, interest:
     assert there.is_valid, ms.Invalid(there.invalid_reasons).explain()
 
 
+def test_given_a_demand_then_platform_and_mirror_agree(drive: Drive) -> None:
+    at = drive.instants[-1]
+    for pair, horizontal, expected in (
+        ((BASE, UTM), 1e-3, ms.Unmet.HORIZONTAL),
+        ((CAMERA, UTM), 0.1, ms.Unmet.HORIZONTAL),
+        ((CAMERA, UTM), 50.0, ms.Unmet(0)),
+        (("Cart:Imu", BASE), 1e-6, ms.Unmet.HORIZONTAL),
+    ):
+        for client in (drive.platform, drive.mirror):
+            assert client.get_pose(*pair, at=at).unmet == 0
+            answer = client.get_pose(*pair, at=at, max_horizontal=horizontal)
+            assert answer.unmet is expected
+            assert bool(answer.unmet_reason) is bool(expected)
+    levels = [client.get_pose(BASE, UTM, at=at) for client in (drive.platform, drive.mirror)]
+    assert levels[0].horizontal_level > levels[0].horizontal_allowance >= 0.0
+    assert levels[1].horizontal_level == pytest.approx(levels[0].horizontal_level)
+
+
 def test_given_other_questions_then_platform_and_mirror_agree(drive: Drive) -> None:
     platform, mirror, at = drive.platform, drive.mirror, drive.instants[-1]
     assert mirror.get_body_list() == platform.get_body_list()

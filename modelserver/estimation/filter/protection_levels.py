@@ -39,7 +39,8 @@ def get_factors(risk_per_hour: float, correlation_time: float) -> tuple[float, f
 @lru_cache(maxsize=16)
 def compute_factors(risk: float) -> tuple[float, float]:
     """Return the standard deviations to the levels that an error exceeds with a probability of `risk`."""
-    return math.sqrt(-2.0 * math.log(risk)), NormalDist().inv_cdf(1.0 - 0.5 * risk)
+    # by the lower tail: 1 less a small risk is 1
+    return math.sqrt(-2.0 * math.log(risk)), -NormalDist().inv_cdf(0.5 * risk)
 
 
 def compute_longest_variance(P: Array) -> float:

@@ -102,6 +102,7 @@ def estimate(state: RawState, utime: int) -> Estimate:
         horizontal_level=levels[0],
         heading_level=levels[1],
         limit_risk=min(sum(risks), 1.0),
+        horizontal_allowance=0.0,
     )
 
 

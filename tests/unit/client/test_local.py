@@ -18,7 +18,8 @@ from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror import PlatformMirror
 from modelserver.client.mirror_state import MirrorReceiver
 from modelserver.client.remote import Platform
-from modelserver.messages import MAX_REQUEST_INSTANTS, Policy
+from modelserver.messages import MAX_REQUEST_INSTANTS, Policy, PoseDemand, TimeQuery, Unmet
+from modelserver.query.demand import check_demand
 
 NOW = T0 + 2 * S + 5_000
 QUESTIONS = [*sorted(name for name in dir(PlatformClient) if name.startswith("get_")), "explain", "close"]
@@ -163,6 +164,24 @@ def test_given_a_moving_pair_then_it_is_never_retained_with_those_that_are_stati
     before = answer.get_transformation(SCAN, BASE)
     receiver.feed(*joints(1.02), T0 + S + 25_000)
     assert answer.get_transformation(SCAN, BASE).pose != before.pose
+
+
+def test_given_a_demand_then_the_replica_gives_the_verdict_of_the_service(receiver: MirrorReceiver) -> None:
+    answer, now = FedPlatform(receiver, NOW), NOW
+    for ends, demand in (((SCAN, BASE), (1e-3, 0.1, 0.001, 0.0)), ((BASE, UTM), (0.0, 0.0, 0.001, 0.9))):
+        view = answer.read_state()[0].view
+        assert view is not None
+        asked = PoseDemand(*demand)
+        found = answer.get_pose(*ends, **asked._asdict())
+        assert Unmet.AGE in found.unmet
+        expected = check_demand(view, view.transformation(*ends, TimeQuery(), now), asked, TimeQuery(), now)
+        assert (found.unmet, found.unmet_reason) == expected
+    # a static pair that was asked for before too
+    plain = answer.get_pose("Rover:Mast", BASE)
+    assert answer.get_pose("Rover:Mast", BASE, max_horizontal=1e-3).unmet is Unmet.HORIZONTAL
+    assert answer.get_pose("Rover:Mast", BASE) == plain
+    with pytest.raises(ms.MalformedRequestError, match="max_age"):
+        answer.get_pose("Rover:Mast", BASE, max_age=math.inf)
 
 
 def test_given_a_wait_then_what_comes_meanwhile_answers() -> None:

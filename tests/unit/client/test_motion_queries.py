@@ -19,13 +19,16 @@ from modelserver.errors import LimitError, MalformedRequestError, Status, TooNew
 from modelserver.messages import (
     CHANNEL_OF,
     MAX_REQUEST_INSTANTS,
+    MET,
     GetExplanation,
     GetMotion,
+    GetTransformation,
     GetTransformations,
     PoseBatchReply,
     RequestHeader,
     SendReply,
     TimeQuery,
+    Unmet,
 )
 from modelserver.query.answers import DeferredAnswer
 from modelserver.query.batch import lookup_batch
@@ -40,6 +43,7 @@ TYPES = {
     CHANNEL_OF[GetTransformations]: "get_transformations_request_t",
     CHANNEL_OF[GetMotion]: "get_motion_request_t",
     CHANNEL_OF[GetExplanation]: "get_explanation_request_t",
+    CHANNEL_OF[GetTransformation]: "get_transformation_request_t",
 }
 
 
@@ -124,6 +128,26 @@ def test_given_a_fixed_frame_then_many_instants_need_a_reference_time(platform: 
 def test_given_no_instants_then_the_answer_is_empty(platform: Platform) -> None:
     (found,) = platform.get_transformations([(SCAN, UTM)], [])
     assert found.vectors.shape == (0, 7)
+
+
+def test_given_a_demand_then_the_answer_has_what_is_unmet(platform: Platform) -> None:
+    plain = platform.get_pose(SCAN, BASE)
+    loose = platform.get_pose(SCAN, BASE, max_horizontal=0.1, max_heading=0.1, max_age=0.1, min_integrity=0.9)
+    strict = platform.get_pose(SCAN, BASE, max_horizontal=1e-3, max_heading=0.1, min_integrity=0.9)
+    assert (plain.unmet, plain.unmet_reason) == (loose.unmet, loose.unmet_reason) == (MET, "")
+    assert strict.unmet is Unmet.HORIZONTAL
+    assert strict.unmet_reason.startswith("the horizontal error is up to ")
+    assert repr(strict._replace(unmet=MET, unmet_reason="")) == repr(plain)
+    old = platform.get_pose(BASE, UTM, at=NOW - S, max_age=0.5)
+    assert (old.unmet, old.unmet_reason) == (Unmet.AGE, "the newest data are 1 s old, asked for: at most 0.5 s")
+
+
+@pytest.mark.parametrize("demand", [{"max_age": -1.0}, {"min_integrity": 1.0}, {"max_heading": math.nan}])
+def test_given_a_demand_that_cannot_be_then_nothing_is_asked(platform: Platform, demand: dict[str, Any]) -> None:
+    with pytest.raises(MalformedRequestError, match=f"{next(iter(demand))} .* is not from 0"):
+        platform.get_pose(SCAN, BASE, **demand)
+    with pytest.raises(MalformedRequestError):
+        platform.get_pose(SCAN, BASE, max_age="soon")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("at", [[1.5], [[T0]], ["now"], [None], [2**70], T0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import random
 from typing import Any
 
@@ -15,6 +16,7 @@ from modelserver.core import Instant
 from modelserver.errors import Status
 from modelserver.messages import (
     CHANNEL_OF,
+    MET,
     Estimate,
     GetBodyFrameList,
     GetBodyList,
@@ -31,6 +33,7 @@ from modelserver.messages import (
     NavigationState,
     Policy,
     PoseAnswer,
+    PoseDemand,
     PublishDecisions,
     ReloadModel,
     Reply,
@@ -38,8 +41,11 @@ from modelserver.messages import (
     SensorHeader,
     SetHTransform,
     SetStateVector,
+    StateVectorReply,
     SwitchMode,
     TimeQuery,
+    TransformReply,
+    Unmet,
 )
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
@@ -398,6 +404,13 @@ def test_given_random_bytes_on_any_channel_then_they_are_counted_and_the_next_go
         (GetTransformation(ME, "Camera:Origin", "World:UTM", TimeQuery(1, wait_ms=-5)), "wait_ms -5"),
         (GetTransformation(ME, "Camera:Origin", "World:UTM", TimeQuery(1, 99)), "policy 99"),  # type: ignore[arg-type]
         (GetStateVector(ME, TimeQuery(-1)), "at -1"),
+        (
+            GetTransformation(ME, "Camera:Origin", "Cart:Base", demand=PoseDemand(-0.5)),
+            "max_horizontal -0.5 is not from 0 (not asked for) to less than 1e+12",
+        ),
+        (GetStateVector(ME, demand=PoseDemand(max_heading=45.0)), "max_heading 45 is not from 0"),
+        (GetHTransform(ME, demand=PoseDemand(max_age=math.nan)), "max_age nan is not from 0"),
+        (GetStateVector(ME, demand=PoseDemand(min_integrity=1.0)), "min_integrity 1 is not from 0"),
         (GetHTransform(ME, True, TimeQuery(1, wait_ms=-5)), "wait_ms -5"),
         (GetHistory(ME, -1, START, 1.0), "start_utime"),
     ],
@@ -413,6 +426,22 @@ def test_given_a_malformed_request_then_the_reply_has_the_reason(request_: Any, 
     rig.send(type(request_)(RequestHeader(1, "POSE"), *list(request_)[1:]))
     rig.turns(3)
     assert all(decode("pose_transform_t", data) for data in rig.bus.get_published("POSE"))
+
+
+def test_given_a_demand_then_the_reply_has_the_answer_and_what_is_unmet() -> None:
+    rig = Rig()
+    rig.send(imu(START))
+    rig.turns(10)
+    for request in (GetTransformation(ME, "Cart:Base", "World:UTM"), GetStateVector(ME), GetHTransform(ME)):
+        fresh, old = (rig.ask(request._replace(demand=PoseDemand(max_age=age))) for age in (9.0, 0.1))
+        for reply in (fresh, old):
+            assert isinstance(reply, TransformReply | StateVectorReply)
+            assert reply.header.status is Status.OK
+            assert reply.answer is not None
+            assert reply.answer.transformation.utime == START
+        assert (fresh.unmet, fresh.unmet_reason) == (MET, "")
+        assert old.unmet is Unmet.AGE
+        assert old.unmet_reason.endswith("s old, asked for: at most 0.1 s")
 
 
 class Breaking(ScriptedLocalizer):

@@ -35,6 +35,7 @@ from modelserver.messages import (
     ReloadReply,
     ReplyHeader,
     TransformReply,
+    Unmet,
 )
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.channels import BY_NAME
@@ -48,7 +49,7 @@ EDGE = EdgeReport("joint", EVIL, True, (EVIL, EVIL), Pose(), "predicted", source
 GOOD: dict[type, Any] = {
     GetBodyList: lambda header: NameListReply(header, (EVIL, EVIL), (EVIL, EVIL)),
     GetBodyFrameList: lambda header: NameListReply(header, (EVIL,), (EVIL,)),
-    GetTransformation: lambda header: TransformReply(header, ANSWER),
+    GetTransformation: lambda header: TransformReply(header, ANSWER, Unmet.AGE, EVIL),
     GetExplanation: lambda header: ExplanationReply(header, Explanation(ANSWER, (EDGE, EDGE))),
     GetMotion: lambda header: MotionReply(header, MotionAnswer(ANSWER, EVIL, THREE, THREE, THREE, THREE)),
     GetDynamics: lambda header: DynamicsReply(
@@ -112,6 +113,7 @@ def false_daemon(status: Status) -> Iterator[str]:
     ["query", "A:A", "B:B", "--motion"], ["reload"], ["tree", "--live"],
     ["dynamics", "--equations"], ["dynamics", "--json"],
     ["bodies", "--json"], ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
+    ["query", "A:A", "B:B", "--max-age", "1"],
 ])  # fmt: skip
 def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(
     status: Status, arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

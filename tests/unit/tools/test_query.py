@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
+from support_samples import GEOMETRY
 
 from modelserver import __version__
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality
@@ -134,7 +135,7 @@ def test_given_json_then_every_field_is_there_and_what_is_not_known_is_null(run:
         "frame_of_interest", "frame_of_reference", "utime", "position", "quaternion", "rpy", "matrix", "covariance",
         "valid", "invalid_reasons", "flags", "initial_utm", "utm_zone", "origin_id", "pose_epoch",
         "horizontal_protection_level", "heading_protection_level", "model_revision", "geodetic",
-        "horizontal_level", "heading_level", "limit_risk",
+        "horizontal_level", "heading_level", "limit_risk", "horizontal_allowance", "unmet", "unmet_reason",
     }  # fmt: skip
     assert found["covariance"] is found["initial_utm"] is found["horizontal_protection_level"] is None
     assert (found["valid"], found["invalid_reasons"], found["flags"], found["utime"]) == (True, [], [], 0)
@@ -294,6 +295,63 @@ def test_given_help_of_a_command_then_it_contains_an_example(run: Command, name:
     assert (code, err) == (0, "")
     assert re.search(f"Examples?: modelserver {name}", " ".join(out.split()))
     assert f"modelserver {name}" in out.splitlines()[0] + out.splitlines()[1]
+
+
+# --- demands ------------------------------------------------------------------------------------------------
+
+
+def write_mast(tmp_path: Path) -> Path:
+    path, sigma = tmp_path / "cart.yaml", "sigma: {xyz: [0, 0.01, 0.01], rpy_deg: [0.1, 0.1, 1]}"
+    path.write_text(GEOMETRY.replace("Mast: {xyz: [0.5, 0.1, 1.0]}", f"Mast: {{xyz: [0.5, 0.1, 1.0], {sigma}}}"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("demand", "unmet", "reason"),
+    [
+        (("--max-horizontal", 0.04, "--max-heading", 2.6, "--max-age", 0.1, "--min-integrity", 0.99), [], ""),
+        (
+            ("--max-horizontal", 0.03),
+            ["HORIZONTAL"],
+            "the horizontal error is up to 0.03035 m at integrity 0.99, asked for: 0.03 m",
+        ),
+        (
+            ("--max-heading", 2.5),
+            ["HEADING"],
+            "the heading error is up to 2.576 deg at integrity 0.99, asked for: 2.5 deg",
+        ),
+    ],
+)
+def test_given_a_demand_then_the_verdict_is_printed_and_the_exit_code_is_3_where_it_is_unmet(
+    run: Command, tmp_path: Path, demand: tuple[object, ...], unmet: list[str], reason: str
+) -> None:
+    arguments = ("query", "Cart:Mast", "Cart:Base", "--model", write_mast(tmp_path), *demand)
+    code, out, err = run(*arguments)
+    assert (code, err) == (3 if unmet else 0, "")
+    assert out.splitlines()[1] == "  position        0.5000  0.1000  1.0000  m"
+    assert out.splitlines()[-1] == (f"  UNMET           {reason}" if unmet else "  demand          met")
+    code, out, _ = run(*arguments, "--json")
+    assert code == (3 if unmet else 0)
+    assert (json.loads(out)["unmet"], json.loads(out)["unmet_reason"]) == (unmet, reason)
+
+
+@pytest.mark.parametrize(
+    ("demand", "code", "message"),
+    [
+        (("--max-age", -1), 1, "max_age -1 is not from 0 (not asked for)"),
+        (("--max-horizontal", "nan"), 1, "max_horizontal nan is not from 0"),
+        (("--max-heading", 200), 1, "max_heading 3.49066 is not from 0 (not asked for) to less than 3.14159"),
+        (("--min-integrity", 99), 1, "min_integrity 99 is not from 0 (not asked for) to less than 1"),
+        (("--max-age", 1, "--explain"), 2, "--explain and --motion go without a demand"),
+        (("--max-age", 1, "--motion"), 2, "--explain and --motion go without a demand"),
+    ],
+)
+def test_given_a_demand_that_cannot_be_then_the_error_names_it(
+    run: Command, tmp_path: Path, demand: tuple[object, ...], code: int, message: str
+) -> None:
+    found, out, err = run("query", "Cart:Mast", "Cart:Base", "--model", write_mast(tmp_path), *demand)
+    assert (found, out) == (code, "")
+    assert message in " ".join(err.replace("│", " ").split())
 
 
 # --- what the daemon's answers look like --------------------------------------------------------------------

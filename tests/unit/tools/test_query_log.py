@@ -79,6 +79,16 @@ def test_given_a_log_then_it_is_reported_as_the_daemon_would_report_it(run: Comm
     np.testing.assert_allclose(list(map(float, lines[1].split()[1:4])), truth(SCAN, UTM, 1.0).position, atol=1e-3)
 
 
+def test_given_a_demand_then_it_is_judged_at_the_end_of_what_was_read(run: Command, log: Path) -> None:
+    code, out, _ = run("query", BASE, UTM, "--log", log, "--max-age", 0.5)
+    assert (code, out.splitlines()[-1]) == (0, "  demand          met")
+    code, out, _ = run("query", BASE, UTM, "--log", log, "--at", "+1", "--policy", "latest", "--max-age", 0.5)
+    assert (code, out.splitlines()[-1]) == (0, "  demand          met")
+    code, out, _ = run("query", BASE, UTM, "--log", log, "--at", "+1", "--max-age", 0.5)
+    assert code == 3
+    assert "s old, asked for: at most 0.5 s" in out.splitlines()[-1]
+
+
 def test_given_policies_then_each_is_as_of_then(run: Command, log: Path) -> None:
     at = T0 + 2_004_000
     for policy, expected in (("latest", 2_000_000), ("held", 2_004_000), ("predicted", 2_004_000)):

@@ -8,8 +8,9 @@ from collections import OrderedDict
 
 import pytest
 
+from modelserver.client.remote import decode_pose_reply
 from modelserver.errors import Status, WireError
-from modelserver.messages import Invalid, Origin, PoseAnswer, Quality, ReplyHeader, TransformReply
+from modelserver.messages import Invalid, Origin, PoseAnswer, Quality, ReplyHeader, TransformReply, Unmet
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode, read_answer
 
@@ -70,6 +71,9 @@ def test_given_other_frames_or_an_error_then_the_whole_reply_is_to_be_read():
     assert read_answer(data, INTEREST, "Base:O") is None
     header = ReplyHeader(5, 6, Status.UNKNOWN_FRAME, "no such frame", ("Base:O",), "abc")
     assert read_answer(encode(TransformReply(header)), INTEREST, REFERENCE) is None
+    unmet = TransformReply(ReplyHeader(5, 6, model_revision="abc"), answers()[0], Unmet.AGE, "old")
+    assert read_answer(encode(unmet), INTEREST, REFERENCE) is None
+    assert decode_pose_reply(encode(unmet), INTEREST, REFERENCE)[-2:] == (Unmet.AGE, "old")
     assert read_answer(b"", INTEREST, REFERENCE) is None
     assert read_answer(b"\1" + data[1:], INTEREST, REFERENCE) is None
 
@@ -82,8 +86,9 @@ def test_given_bytes_that_are_cut_or_damaged_then_no_answer_comes_of_them():
             assert read_answer(data[:end], INTEREST, REFERENCE) is None
         with pytest.raises(WireError):
             decode(KIND, data[:end])
+    assert read_answer(data + b"\0", INTEREST, REFERENCE) is None
     with pytest.raises(WireError, match="too many"):
-        read_answer(data + b"\0", INTEREST, REFERENCE)
+        decode(KIND, data + b"\0")
     names = data.index(REFERENCE.encode()) + len(REFERENCE.encode()) + 1
     with pytest.raises(WireError, match="rigid"):
         read_answer(data[:names] + b"\0" * 8 + data[names + 8 :], INTEREST, REFERENCE)

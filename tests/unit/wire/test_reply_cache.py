@@ -8,7 +8,7 @@ from modelserver import core
 from modelserver.core import CoreSettings, Instant
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
-from modelserver.messages import GetTransformation, Policy, RequestHeader, SendReply, TimeQuery
+from modelserver.messages import GetTransformation, Policy, PoseDemand, RequestHeader, SendReply, TimeQuery
 from modelserver.transforms.pose import Pose
 from modelserver.wire import codec
 from modelserver.wire.codec import StaticReplyCache, encode
@@ -92,8 +92,17 @@ def test_given_a_time_that_cannot_be_then_it_goes_to_the_core(time: TimeQuery) -
 
 def test_given_a_policy_that_is_none_then_it_goes_to_the_core() -> None:
     data = bytearray(encode(make_request()))
-    data[-5] = 9
+    data[-37] = 9
     assert make_cache(cart()).find(bytes(data), CLIENT, 5) is None
+
+
+def test_given_a_demand_then_it_goes_to_the_core_and_its_reply_is_not_cached() -> None:
+    model = cart()
+    demanding = make_request()._replace(demand=PoseDemand(max_age=1.0))
+    assert make_cache(model).find(encode(demanding), CLIENT, 5) is None
+    cache, reply = cache_of(model), reply_of(model, demanding)
+    cache.add(encode(demanding), CLIENT, reply.reply, encode(reply.reply))
+    assert len(cache) == 0
 
 
 def test_given_other_bytes_then_they_go_to_the_core() -> None:

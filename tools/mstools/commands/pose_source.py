@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from modelserver.client.interface import FrameClient, R
+from modelserver.client.interface import NO_DEMAND, FrameClient, R
 from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest_names, quote
 from modelserver.geometry import names
-from modelserver.messages import NO_FLAGS, ExplanationReply, GetExplanation, GetMotion, Policy, PoseAnswer, Quality
+from modelserver.messages import (
+    NO_FLAGS,
+    ExplanationReply,
+    GetExplanation,
+    GetMotion,
+    Policy,
+    PoseAnswer,
+    PoseDemand,
+    Quality,
+)
 from mstools.terminal.options import parse_variables
 from mstools.terminal.output import print_problems
 
@@ -26,7 +36,9 @@ class FileAnswers(FrameClient):
     def __init__(self, path: Path, settings: list[str] | None):
         self._model = load_given_model(path, parse_variables(settings))
 
-    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
+    ) -> PoseAnswer:
         known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
         reserved = [each for each in (interest, reference) if each.partition(":")[0] in names.RESERVED_BODIES]
         for frame in reserved:
@@ -36,9 +48,15 @@ class FileAnswers(FrameClient):
         if reserved:
             raise ModelServerError("a geometry file has no pose of the vehicle in the world; query the daemon")
         rests = bool(self._model.get_kinematic_path(interest, reference).joints)
-        return PoseAnswer(
+        answer = PoseAnswer(
             self._model.get_transformation(interest, reference), quality=Quality.JOINT_DEFAULT if rests else NO_FLAGS
         )
+        if not any(demand):
+            return answer
+        from modelserver.query.demand import find_unmet
+
+        unmet, reason = find_unmet(answer, demand, age=math.inf if rests else 0.0)
+        return answer._replace(unmet=unmet, unmet_reason=reason)
 
     def _query(self, request: Any, reply_type: type[R]) -> R:
         from modelserver.estimation.history import History

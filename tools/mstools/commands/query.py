@@ -13,7 +13,16 @@ import numpy as np
 import typer
 
 from modelserver.client.interface import FrameClient
-from modelserver.messages import EdgeReport, Explanation, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
+from modelserver.messages import (
+    EdgeReport,
+    Explanation,
+    Invalid,
+    MotionAnswer,
+    Policy,
+    PoseAnswer,
+    Quality,
+    Unmet,
+)
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from mstools.commands.pose_source import open_answer_source, open_log_answers
@@ -162,6 +171,9 @@ def _format_vector(values: Iterable[float], scale: float, unit: str) -> str:
     return "  ".join(f"{scale * value + 0.0:.4f}" for value in known) + f"  {unit}".rstrip()
 
 
+EXIT_UNMET = 3
+"""Exit code of an answer that does not meet the demand."""
+
 POLICIES = {policy.name.lower(): policy for policy in Policy}
 
 
@@ -190,6 +202,14 @@ def command(
     explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
     motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
     expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
+    max_horizontal: Annotated[
+        float, option("--max-horizontal M", "Demand that the horizontal error is within this, meters.")
+    ] = 0.0,
+    max_heading: Annotated[float, option("--max-heading DEG", "The same of the heading error, degrees.")] = 0.0,
+    max_age: Annotated[float, option("--max-age S", "Demand that the newest data are not older, seconds.")] = 0.0,
+    min_integrity: Annotated[
+        float, option("--min-integrity P", "Demand a valid pose, and its limits with this probability. Default: 0.99.")
+    ] = 0.0,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
@@ -198,8 +218,9 @@ def command(
     """Print the pose of one frame in another. Frames are named Body:Frame.
 
     Queries the running daemon, with --model a geometry file, or with --log the geometry, poses and joints of a log.
-    World:UTM, World:ENU and Odom:Origin exist beside the frames of the geometry. Exit code 1 if there is no answer; a
-    pose that is not valid is printed with the reason, and exits 0.
+    World:UTM, World:ENU and Odom:Origin exist beside the frames of the geometry. Exit code 1 if there is no answer, 3
+    if a demand (--max-..., --min-integrity) is unmet, which is printed with the reason; a pose that is not valid is
+    printed with the reason, and exits 0.
 
     --explain prints each frame, constraint and joint on the path with its provenance, age, source, and share of the
     variance. --motion prints velocity and acceleration, linear and angular.
@@ -213,6 +234,9 @@ def command(
         raise typer.BadParameter("needs --motion, whose axes it sets", param_hint="--expressed-in")
     if explain and motion:
         raise typer.BadParameter("--explain and --motion exclude each other; run one after the other")
+    is_demanding = any((max_horizontal, max_heading, max_age, min_integrity))
+    if is_demanding and (explain or motion):
+        raise typer.BadParameter("--explain and --motion go without a demand; run one after the other")
     if inverse:
         frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
     source: FrameClient
@@ -237,8 +261,20 @@ def command(
         moving = source.get_motion(*ends, expressed_in=expressed_in, at=utime, policy=when, wait_ms=wait_ms)
         answer, text, data = moving.pose, f"{describe_motion(moving)}\n\n", motion_as_data(moving)
     else:
-        answer = source.get_pose(*ends, at=utime, policy=when, wait_ms=wait_ms)
-    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix))
+        answer = source.get_pose(
+            *ends,
+            at=utime,
+            policy=when,
+            wait_ms=wait_ms,
+            max_horizontal=max_horizontal,
+            max_heading=math.radians(max_heading),
+            max_age=max_age,
+            min_integrity=min_integrity,
+        )
+    met = "\n  demand          met" if is_demanding and not answer.unmet else ""
+    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix) + met)
+    if answer.unmet:
+        raise typer.Exit(EXIT_UNMET)
 
 
 def _parse_time(text: str) -> int:
@@ -307,6 +343,8 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
         lines.append(f"  flags           {flags}: {answer.quality.explain()}")
     if not transformation.is_valid:
         lines.append(f"  NOT VALID       {Invalid(transformation.invalid_reasons).explain()}")
+    if answer.unmet:
+        lines.append(f"  UNMET           {escape(answer.unmet_reason)}")
     return "\n".join(lines)
 
 
@@ -337,5 +375,8 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "horizontal_level": to_json(answer.horizontal_level),
         "heading_level": to_json(answer.heading_level),
         "limit_risk": to_json(answer.limit_risk),
+        "horizontal_allowance": to_json(answer.horizontal_allowance),
+        "unmet": [flag.name for flag in Unmet if flag in answer.unmet],
+        "unmet_reason": answer.unmet_reason,
         "model_revision": transformation.model_revision,
     }
