@@ -111,7 +111,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         horizontal_level=levels.horizontal_level,
         heading_level=levels.heading_level,
         limit_risk=min(sum(risks), 1.0),
-        horizontal_allowance=allowance,
+        horizontal_allowance=_get_allowance(setup, state),
     )
 
 

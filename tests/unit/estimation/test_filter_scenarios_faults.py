@@ -200,7 +200,7 @@ def test_given_wheels_that_fail_with_fixes_then_the_pose_stays_right(encoder):
     assert all(row.off < min(1.5, row.estimate.horizontal_level) for row in rows)
     assert all(abs(row.heading) < math.radians(6.0) for row in rows)
     # wheels that contradict fixes and gyro are a path of unknown length
-    assert sum(row.valid for row in rows) > 0.9 * len(rows)
+    assert sum(row.valid for row in rows) > 0.75 * len(rows)
 
 
 def test_given_gravity_along_another_axis_than_by_the_mount_then_the_pose_is_never_valid_and_the_reason_is_reported():

@@ -258,7 +258,7 @@ def test_given_the_filters_estimate_then_the_risk_of_its_limits_is_its_own() -> 
     assert isinstance(state, Aligned)
     P = state.nav.covariance.copy()
     P[8, 8] = math.radians(9.0) ** 2
-    vague = state._replace(nav=state.nav._replace(covariance=P))
+    vague = state._replace(nav=state.nav._replace(covariance=P), bank=None, bounds=None)
     estimate = output.estimate(localizer.setup, vague, localizer.odom, localizer.utime, localizer.utime)
     limit, heading_limit = output.get_limits(localizer.setup, vague)
     # all of it is the heading's
