@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -367,7 +368,7 @@ def test_given_damage_in_the_middle_when_verified_then_it_is_located_and_what_fo
     assert found.reproduced["POSE"] < whole.reproduced["POSE"]
     damage = [each for each in found.findings if each.is_damage]
     assert damage[0].segment == ring[1]
-    assert "checksum" in damage[0].text
+    assert re.search("checksum|no events", damage[0].text)
 
 
 def test_given_an_empty_last_segment_when_verified_then_it_is_a_finding_and_the_rest_is_reproduced(
