@@ -87,6 +87,9 @@ NOISE_CLASSES: Final = (
 """The first is the stated error (time of the setting `gps_correlation_time`); the others are those of receivers that
 state half or a quarter of what they wander by."""
 
+LARGEST_JUMP: Final = 1e4
+"""Largest standard deviation of a jump, m: beyond, the precision of the covariance ends."""
+
 DRIFT_RATE: Final = 0.3
 JUMP_SIZE: Final = 20.0
 """Standard deviations of a drift of fixes (m/s) and of a jump (m): reflections at buildings."""
@@ -94,11 +97,11 @@ JUMP_SIZE: Final = 20.0
 FAULTS: Final[dict[Fault, tuple[float, tuple[tuple[int, float], ...]]]] = {
     Fault.DRIFT: (0.5, ((DRIFT, DRIFT_RATE), (DRIFT + 1, DRIFT_RATE))),
     Fault.SPOOFING: (0.1, ((DRIFT, DRIFT_RATE), (DRIFT + 1, DRIFT_RATE))),
-    Fault.GYRO: (0.1, ((BIAS, 0.01),)),
+    Fault.GYRO: (0.1, ()),
     Fault.WHEELS: (0.1, ((WHEEL_SCALE, 0.05),)),
     Fault.LATENCY: (0.01, ((DELAY, 0.3),)),
 }
-"""How often an hour each begins, and the standard deviations that it opens."""
+"""How often an hour each begins, and the standard deviations that it opens; the gyro's is half of `gyro_bias_step`."""
 
 JUMPS_PER_HOUR: Final = 1.0
 JUMP_ENDS_PER_HOUR: Final = 60.0
@@ -315,7 +318,7 @@ class HypothesisBank(NamedTuple):
         if is_stationary and not math.isnan(bank.rest_rate):
             # the mean ended a step ago: the vehicle has stood since
             bank = bank._measure_rest(bank.rest_rate, seconds, settings)
-        bank = bank._spawn(utime, min(seconds, LONGEST_STEP), fix)
+        bank = bank._spawn(utime, min(seconds, LONGEST_STEP), fix, settings)
         if fix is not None:
             bank, nis = bank._fuse(fix, settings)
             if bank.weights[bank.published] > CERTAIN:
@@ -451,7 +454,7 @@ class HypothesisBank(NamedTuple):
         weights /= weights.sum()
         return weights
 
-    def _spawn(self, utime: int, seconds: float, fix: PlanarFix | None) -> HypothesisBank:
+    def _spawn(self, utime: int, seconds: float, fix: PlanarFix | None, settings: FilterSettings) -> HypothesisBank:
         """Return the bank with the children of the likeliest hypotheses, in which something begins or ends.
 
         A jump that begins may be as large as the fix shows.
@@ -460,6 +463,7 @@ class HypothesisBank(NamedTuple):
         if fix is not None:
             x, y, heading = self.pose
             jump = max(jump, abs(fix.position - complex(x, y) - cmath.rect(1.0, heading) * fix.lever))
+            jump = min(jump, LARGEST_JUMP)
         order = np.argsort(-self.weights, kind="stable")[:8].tolist()
         children: list[tuple[int, float, int, int, int, int]] = []
         opened: list[Sequence[tuple[int, float]]] = []
@@ -499,6 +503,8 @@ class HypothesisBank(NamedTuple):
         best = order[0]
         if self.faults[best] not in (Fault.DRIFT, Fault.SPOOFING):
             for new, (per_hour, opened_by) in FAULTS.items():
+                if new is Fault.GYRO:
+                    opened_by = ((BIAS, 0.5 * settings.gyro_bias_step),)
                 add(best, per_hour, (new, int(self.jumped[best]), int(self.noises[best])), opened_by, onset=utime)
         parents = np.array([each[0] for each in children])
         means, covariances = self.means[parents], self.covariances[parents]

@@ -28,9 +28,8 @@ class FilterSettings(FixSettings):
     gyro_bias_walk: float = 3.5e-5
     """Random walk of the bias, rad/s/sqrt(s): the data sheet's 0.02 deg/s short-term, reached in 100 s."""
     gyro_bias_step: float = 0.02
-    """Change of a gyro's bias that the heading's protection level covers until fixes show it, rad/s: 1 deg/s, as after
-    a shock or with a failing supply. Slow vehicles have a large level by it, up to 0.5 rad: better gyros and a smaller
-    `heading_limit` need a smaller one."""
+    """Change of a gyro's bias that a fault brings, two standard deviations, rad/s: 1 deg/s, as after a shock or with a
+    failing supply. The heading's protection level covers it until fixes show it."""
     lever_arm_sigma: float = 0.1
     """Error of the antenna's place on the vehicle, m, in the protection level: measured with a tape."""
     gyro_scale_sigma: float = 0.01
