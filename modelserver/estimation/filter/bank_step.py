@@ -242,44 +242,41 @@ def _share(setup: Setup, nav: NavState, newest: PathFix) -> _Shared:
 
 
 def _follow(setup: Setup, state: Aligned) -> Aligned:
-    """Return the state set to the published hypothesis: its values, and their covariance by Jeffrey's rule.
+    """Return the state set to the published hypothesis, with its values and covariance; in a new epoch if it moves.
 
-    P' = P + K (C - S) K', K = P H' S^-1, S = H P H': what else the state knows is as it was given them (R. Jeffrey,
-    "The Logic of Decision", 1983, 11). In a new epoch, if the pose moves.
+    What else the state knows stays as it is, and is independent of that: its correlations were those of another
+    explanation. Only the velocity errs with the heading.
     """
     bank, newest, nav = state.bank, state.gnss.last_fix, state.nav
     assert bank is not None
     assert newest is not None
     has_moved = _has_moved(setup, state)
     mean = bank.means[bank.published]
-    target = bank.covariances[bank.published][np.ix_(_STATES, _STATES)]
     turn = wrap_angle(float(mean[HEADING]) - nav.yaw)
     place = nav.position
     nav = heading_alignment.rotate(nav, Rotation(turn, 0.0), setup.layout)._replace(position=place)
     shared = _share(setup, nav, newest)
     change = mean[list(_STATES)] - shared.values
+    # each is one element of the error state, in a unit of its own
+    used = [row for row in range(len(_STATES)) if shared.rows[row].any()]
+    at = [int(np.flatnonzero(shared.rows[row])[0]) for row in used]
+    units = np.array([shared.rows[row, n] for row, n in zip(used, at, strict=True)])
     error = np.zeros(setup.layout.size)
-    error[:2], error[11] = change[:2], change[3]
-    for row in range(4, len(_STATES)):
-        if shared.rows[row].any():
-            at = int(np.flatnonzero(shared.rows[row])[0])
-            error[at] = change[row] / shared.rows[row, at]
-    used = shared.rows.any(axis=1)
-    H, target = shared.rows[used], target[np.ix_(used, used)]
-    P = nav.covariance
-    PH = P @ H.T
-    S = H @ PH
-    S.reshape(-1)[:: len(S) + 1] += 1e-12
-    gain = np.linalg.solve(S, PH.T).T
-    P = P + gain @ (target - S) @ gain.T
+    error[at] = change[used] / units
+    error[8] = 0.0
+    P = nav.covariance.copy()
+    P[at, :] = P[:, at] = 0.0
+    target = bank.covariances[bank.published][np.ix_(_STATES, _STATES)]
+    P[np.ix_(at, at)] = target[np.ix_(used, used)] / np.outer(units, units)
+    T = np.eye(len(P))
+    T[3, 8], T[4, 8] = -nav.velocity[1], nav.velocity[0]
+    P = T @ P @ T.T
     nav = nav.inject(error, 0.5 * (P + P.T))
     common = state.common._replace(epoch=state.common.epoch + 1) if has_moved else state.common
     gnss = state.gnss.place(state.gnss.used_utime)
-    offset = gnss.offset.update(
-        nav, (newest.correlated, newest.correlated, 0.0), math.inf, slice(0, 2), setup.layout, setup.settings
-    )
-    gnss = gnss._replace(offset=offset, outlier_allowance=0.0)
-    return state._replace(nav=nav, gnss=gnss, common=common)
+    sigma = (newest.correlated, newest.correlated, 0.0)
+    offset = gnss.offset.update(nav, sigma, math.inf, slice(0, 2), setup.layout, setup.settings)
+    return state._replace(nav=nav, gnss=gnss._replace(offset=offset, outlier_allowance=0.0), common=common)
 
 
 def _get_pose(setup: Setup, state: Aligned) -> tuple[float, float, float]:
