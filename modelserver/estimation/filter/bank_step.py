@@ -1,14 +1,15 @@
 """Hypothesis bank of an aligned vehicle: started, advanced by dead reckoning and fixes, and what follows from it.
 
-The bank judges the state, and corrects it: it is set to the published hypothesis where that excludes fixes, begins a
-fault of gyro, wheels or latency, or is elsewhere, or where the state's own pose is too likely beyond its limits.
+The bank judges the state, and corrects it: it is set to the published hypothesis where that excludes fixes, has a
+fault of gyro, wheels or latency that is certain, or another heading, or where the state's own pose is too likely beyond
+its limits.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -23,9 +24,7 @@ from modelserver.estimation.filter.hypothesis_bank import (
     BIAS,
     DELAY,
     HEADING,
-    MOVED,
     SHARE_OF_LIMIT,
-    TURNED,
     WHEEL_SCALE,
     Fault,
     HypothesisBank,
@@ -57,11 +56,14 @@ UNMEASURED_SPEED: Final = 1.0
 UNMEASURED_SHARE: Final = 0.3
 """Standard deviation of a speed that wheels do not measure, m/s, or as a share of it; it lasts a second."""
 
+MOVED, TURNED = 1.0, 0.1
+"""Distance (m) and angle (rad) by which another hypothesis is another pose."""
+
 CLEARLY_LESS: Final = 0.1
 """Risk of the hypothesis' pose, relative to that of the state's, with which it is another one."""
 
 MOVED_RISK: Final = 0.5
-"""Probability that a vehicle moves whose fixes move away while it stands, as on a ferry: fixes that drift are alike."""
+"""Probability that a vehicle moves whose fixes move away at rest, as on a ferry: fixes that drift are alike."""
 
 CERTAIN_SIGMAS: Final = 3.0
 """Standard deviations of a hypothesis' heading by which another one is wrong."""
@@ -80,13 +82,6 @@ _STATES: Final = (
     hypothesis_bank.ERROR + 1,
 )
 """States of a hypothesis that the filter has too."""
-
-
-class _Shared(NamedTuple):
-    """Those states by the filter: values (8), and their rows of its error state (8, n)."""
-
-    values: Array
-    rows: Array
 
 
 def can_judge(setup: Setup, state: Aligned, utime: int) -> bool:
@@ -131,7 +126,7 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
     if bank is None:
         return state, ()
     if not can_judge(setup, state, utime):
-        return state._replace(bank=None, bounds=None), ()
+        return state.end_bank(), ()
     if utime - bank.utime < (STEP_US if newest is not None else LONGEST_STEP_US):
         return state, ()
     now = predict_path(setup, state)
@@ -194,15 +189,15 @@ def settle(
 def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
     """Return the state with a bank at its pose."""
     nav, settings = state.nav, setup.settings
-    shared = _share(setup, nav, newest)
-    covariance = shared.rows @ nav.covariance @ shared.rows.T
+    values, rows = _share(setup, nav, newest)
+    covariance = rows @ nav.covariance @ rows.T
     # fixes have shown the heading, and the allowance for their error decays as others confirm it
     covariance[2, 2] += (state.turns.allowance / START_ERROR) ** 2
     sigma = math.hypot(newest.white, newest.correlated)
     bank = hypothesis_bank.start_bank(nav.utime, sigma, settings)
     means, covariances = bank.means.copy(), bank.covariances.copy()
     prior = covariances[0][np.ix_(_STATES, _STATES)]
-    means[0, _STATES] = shared.values
+    means[0, _STATES] = values
     covariances[0][np.ix_(_STATES, _STATES)] = covariance + prior
     bank = bank._replace(means=means, covariances=covariances, reckoning=predict_path(setup, state))
     return state._replace(bank=bank)
@@ -222,8 +217,8 @@ def _get_slip(setup: Setup) -> float:
     return setup.settings.slip_ratio * (SKID_SLIP if setup.wheels.skid else 1.0)
 
 
-def _share(setup: Setup, nav: NavState, newest: PathFix) -> _Shared:
-    """Return the states of the filter that a hypothesis has too."""
+def _share(setup: Setup, nav: NavState, newest: PathFix) -> tuple[Array, Array]:
+    """Return those states by the filter: values (8), and their rows of its error state (8, n)."""
     layout, n = setup.layout, setup.layout.size
     base = nav.point(setup.rig.base)
     x, y, z = so3.rotate(nav.attitude, setup.rig.base)
@@ -238,7 +233,7 @@ def _share(setup: Setup, nav: NavState, newest: PathFix) -> _Shared:
             at = layout.index(name)
             rows[row, at] = unit
             values[row] = unit * nav.extras[at - STRAPDOWN]
-    return _Shared(np.array(values), rows)
+    return np.array(values), rows
 
 
 def _follow(setup: Setup, state: Aligned) -> Aligned:
@@ -255,12 +250,12 @@ def _follow(setup: Setup, state: Aligned) -> Aligned:
     turn = wrap_angle(float(mean[HEADING]) - nav.yaw)
     place = nav.position
     nav = heading_alignment.rotate(nav, Rotation(turn, 0.0), setup.layout)._replace(position=place)
-    shared = _share(setup, nav, newest)
-    change = mean[list(_STATES)] - shared.values
+    values, rows = _share(setup, nav, newest)
+    change = mean[list(_STATES)] - values
     # each is one element of the error state, in a unit of its own
-    used = [row for row in range(len(_STATES)) if shared.rows[row].any()]
-    at = [int(np.flatnonzero(shared.rows[row])[0]) for row in used]
-    units = np.array([shared.rows[row, n] for row, n in zip(used, at, strict=True)])
+    used = [row for row in range(len(_STATES)) if rows[row].any()]
+    at = [int(np.flatnonzero(rows[row])[0]) for row in used]
+    units = np.array([rows[row, n] for row, n in zip(used, at, strict=True)])
     error = np.zeros(setup.layout.size)
     error[at] = change[used] / units
     error[8] = 0.0
@@ -311,7 +306,7 @@ def _judge(setup: Setup, state: Aligned) -> Aligned:
     limits = output.get_limits(setup, state)
     bounds = state.bank.compute_bounds(_get_pose(setup, state), limits, setup.settings, variances)
     if state.bank.may_be_transported:
-        # it is where fixes are, or where it stood
+        # it is where fixes are, or has stayed
         off = abs(state.bank.offset)
         bounds = bounds._replace(horizontal_level=bounds.horizontal_level + off, horizontal_risk=MOVED_RISK)
     return state._replace(bounds=bounds)

@@ -63,9 +63,13 @@ class DeadReckoning(NamedTuple):
         turn = self.turn + 0.5e-6 * (self.rate + rate) * (utime - self.gyro_utime)
         return DeadReckoning(*self[:6], utime, rate, turn, self.turn_variance + variance, self.begin)
 
+    def predict_turn(self, utime: int) -> float:
+        """Return the turn until an instant, at the last rate, rad."""
+        return self.turn + 1e-6 * self.rate * (utime - self.gyro_utime)
+
     def drive(self, utime: int, distance: float, variance: float = 0.0) -> DeadReckoning:
         """Return dead reckoning after `distance` (m) driven since the last wheel sample, with its variance, m2."""
-        heading = self.turn + 1e-6 * self.rate * (utime - self.gyro_utime)
+        heading = self.predict_turn(utime)
         if not self.utime:
             return self._replace(utime=utime, heading=heading, begin=utime)
         half = 0.5 * (heading - self.heading)

@@ -380,13 +380,12 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     P = nav.covariance
     if not math.isfinite(P[0, 0] + P[8, 8] + P[11, 11]):
         return state, NOTHING  # it has diverged
-    turn = reckoning.turn + 1e-6 * reckoning.rate * (nav.utime - reckoning.gyro_utime)
     node = TurnNode(
         nav.utime,
         newest.position,
         newest.white,
         nav.yaw,
-        turn,
+        reckoning.predict_turn(nav.utime),
         nav.gyro_bias[2],
         float(P[8, 8]),
         float(P[11, 11]),

@@ -121,6 +121,8 @@ OUTLIER_NIS: Final = 13.8
 """NIS of two numbers beyond which the gain is reduced: 0.1 % of a normal error."""
 
 ARM_SIGMA_LEAST: Final = 0.3
+"""Least standard deviation of the antenna's place here, m: a wrong one has been entered, or another antenna mounted."""
+
 RATE_FLOOR: Final = 3e-4
 """Sigma of a mean rate at rest beside its noise, rad/s: an idling engine, and what a vehicle sways."""
 
@@ -158,14 +160,11 @@ SHARE_OF_LIMIT: Final = 0.2
 PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
-MOVED, TURNED = 1.0, 0.1
-"""Distance (m) and angle (rad) by which another hypothesis is another pose."""
-
 NEVER: Final = np.iinfo(np.int64).min // 2
 GRID: Final = np.linspace(0.0, 1.0, 33)[:, None, None]
 
 LONGEST_STEP: Final = 5.0
-"""Seconds of a step for which something may have fault_number in it."""
+"""Seconds of a step in which something may begin, at most."""
 
 
 class PlanarFix(NamedTuple):
@@ -199,6 +198,12 @@ class Bounds(NamedTuple):
         """Probability that position or heading are beyond their limits."""
         return self.horizontal_risk + self.heading_risk
 
+    @property
+    def allowance(self) -> float:
+        """The part of the horizontal level that the pose's own covariance does not have, m."""
+        k, _ = compute_factors(LEVEL_RISK)
+        return max(self.horizontal_level - k * math.sqrt(self.variances[0]), 0.0)
+
     def grow(self, variances: tuple[float, float], limits: tuple[float, float], settings: FilterSettings) -> Bounds:
         """Return the bounds of a pose that is predicted from then on, by the growth of its own covariance."""
         (before, heading_before), (after, heading_after) = self.variances, variances
@@ -210,9 +215,8 @@ class Bounds(NamedTuple):
         level, heading_level = compute_factors(LEVEL_RISK)
         protection, heading_protection = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
         more, turned = grown[0] - sigmas[0], grown[1] - sigmas[1]
-        allowance = max(self.horizontal_level - level * sigmas[0], 0.0)
-        least = compute_limit_risks(*sigmas, limits[0] - allowance, limits[1])
-        risks = compute_limit_risks(*grown, limits[0] - allowance, limits[1])
+        least = compute_limit_risks(*sigmas, limits[0] - self.allowance, limits[1])
+        risks = compute_limit_risks(*grown, limits[0] - self.allowance, limits[1])
         return Bounds(
             self.horizontal_level + level * more,
             min(self.heading_level + heading_level * turned, math.pi),
@@ -237,7 +241,7 @@ class HypothesisBank(NamedTuple):
     sigma: of the last fix, m.
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
-    may_be_transported: whether that began while the vehicle stood: a ferry or a trailer may move it.
+    may_be_transported: whether that began while the vehicle was at rest: a ferry or a trailer may move it.
     reckoning: dead reckoning at `utime`.
     """
 
@@ -270,15 +274,10 @@ class HypothesisBank(NamedTuple):
         return Fault(int(self.faults[self.published]))
 
     @property
-    def assumption(self) -> tuple[Fault, bool]:
-        """Which fault the published hypothesis assumes, and whether fixes have jumped."""
-        return self.fault, bool(self.jumped[self.published])
-
-    @property
     def is_suspect(self) -> bool:
         """Whether something seems to be wrong with fixes, gyro or wheels, or may be."""
-        is_certain = self.weights[self.published] > CERTAIN
-        return self.assumption != (Fault.NONE, False) or not is_certain
+        n = self.published
+        return bool(self.faults[n] or self.jumped[n] or not self.weights[n] > CERTAIN)
 
     def judge_fixes(self, limit: float, *, is_stationary: bool) -> HypothesisBank:
         """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
@@ -310,13 +309,13 @@ class HypothesisBank(NamedTuple):
         bias = self.means[self.published, BIAS]
         # it begins to turn before wheels and accelerations show it, and a bias that has changed is constant
         is_constant = abs(rate - self.rest_rate) < CONSTANT_RATE
-        is_stationary = step.is_stationary and (is_constant or abs(rate - bias) < TURNING_RATE)
-        stands = step.is_stationary
+        rests = step.is_stationary
+        is_stationary = rests and (is_constant or abs(rate - bias) < TURNING_RATE)
         step = step._replace(is_stationary=is_stationary)
         bank = self if fix is None else self._replace(sigma=fix.sigma)
         bank = bank._predict(step, settings, slip)
         if is_stationary and not math.isnan(bank.rest_rate):
-            # the mean ended a step ago: the vehicle has stood since
+            # the mean ended a step ago: the vehicle is at rest since
             bank = bank._measure_rest(bank.rest_rate, seconds, settings)
         bank = bank._spawn(utime, min(seconds, LONGEST_STEP), fix, settings)
         if fix is not None:
@@ -324,7 +323,7 @@ class HypothesisBank(NamedTuple):
             if bank.weights[bank.published] > CERTAIN:
                 change = min(seconds, 2.0) / 30.0 * (min(0.5 * nis, 9.0) - 1.0)
                 bank = bank._replace(inflation=min(max(bank.inflation * (1.0 + change), 1.0), 4.0))
-        return bank._reduce(utime)._replace(rest_rate=rate if stands else math.nan)
+        return bank._reduce(utime)._replace(rest_rate=rate if rests else math.nan)
 
     def _predict(self, step: Increment, settings: FilterSettings, slip: float) -> HypothesisBank:
         """Return the bank after dead reckoning, equations (1) and (2)."""
@@ -437,8 +436,8 @@ class HypothesisBank(NamedTuple):
         a, b, c = S[:, 0, 0] + white, S[:, 0, 1], S[:, 1, 1] + white
         det = a * c - b * b
         inverse = np.stack((c, -b, -b, a), axis=1).reshape(k, 2, 2) / det[:, None, None]
-        weighed = (inverse @ y[:, :, None])[:, :, 0]
-        nis = (y * weighed).sum(axis=1)
+        scaled = (inverse @ y[:, :, None])[:, :, 0]
+        nis = (y * scaled).sum(axis=1)
         likely = -0.5 * (nis + np.log(det)) + math.log1p(-OUTLIER_SHARE)
         outlier = math.log(OUTLIER_SHARE) - 0.5 * (y * y).sum(axis=1) / OUTLIER_SIGMA**2 - 2.0 * math.log(OUTLIER_SIGMA)
         weights = self._weigh(np.logaddexp(likely, outlier))

@@ -138,10 +138,8 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
         P = nav.covariance.copy()
         P[11, 11] += settings.gyro_bias_walk**2 * lag
         nav = nav._replace(covariance=P)
-    reckoning = state.reckoning
-    gap = (utime - reckoning.gyro_utime) * 1e-6
-    missed = (settings.gap_rate_sigma * gap) ** 2 / 3.0 if gap > settings.rate_hold else 0.0
-    state = state._replace(nav=nav, imu=imu, stationary=detector, reckoning=reckoning.follow_gyro(utime, rate, missed))
+    reckoning = propagation.follow_gyro(setup, state.reckoning, utime, rate)
+    state = state._replace(nav=nav, imu=imu, stationary=detector, reckoning=reckoning)
     if not (
         state.is_stationary and detector.sum_time > 1.0 and detector.get_quiet_time(utime) >= settings.recapture_time
     ):
@@ -203,7 +201,7 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
         state = release_motion(state)._replace(stationary=StationaryDetector(), common=common)
         state = state._replace(constraints=state.constraints._replace(contradiction=0.0))
         if isinstance(state, Aligned):
-            state = state._replace(bank=None, bounds=None)
+            state = state.end_bank()
         return state, (*decisions, report_event(state, constraints.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
     detector = state.stationary
     if detector.sum_time > 0.0:

@@ -129,7 +129,7 @@ def _compute_levels(setup: Setup, state: Aligned, P: Array, limits: tuple[float,
     turned = state.turns.allowance if state.turns.is_transported else 0.0
     risks = protection_levels.compute_limit_risks(sigma, heading_sigma, limits[0] - allowance, limits[1] - turned)
     horizontal = protection_levels.compute_horizontal(P, state.gnss.outlier_allowance, settings)
-    heading = min(protection_levels.compute_heading(variances[1], settings) + state.turns.allowance, math.pi)
+    heading = _compute_heading_protection(setup, state, variances[1])
     heading_level = min(heading_level + turned, math.pi)
     return Bounds(level, heading_level, horizontal, heading, *risks, variances)
 
@@ -139,6 +139,10 @@ def get_heading_protection(setup: Setup, state: Aligned) -> float:
     if state.bounds is not None:
         return state.bounds.heading_protection
     variance = float(state.nav.covariance[8, 8]) + latency_estimator.compute_heading_variance(state.nav, setup.layout)
+    return _compute_heading_protection(setup, state, variance)
+
+
+def _compute_heading_protection(setup: Setup, state: Aligned, variance: float) -> float:
     return min(protection_levels.compute_heading(variance, setup.settings) + state.turns.allowance, math.pi)
 
 
@@ -212,8 +216,7 @@ def _get_allowance(setup: Setup, state: Aligned) -> float:
     errors are: the state may be off instead.
     """
     if state.bounds is not None:
-        k, _ = protection_levels.compute_factors(protection_levels.LEVEL_RISK)
-        return max(state.bounds.horizontal_level - k * math.sqrt(state.bounds.variances[0]), 0.0)
+        return state.bounds.allowance
     gnss, allowance = state.gnss, 0.0
     if gnss.last_fix is not None:
         at = setup.layout.extra_index(CORRELATED_ERROR[0])

@@ -90,25 +90,32 @@ def propagate_imu(
             nav = eskf.propagate(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= eskf.COVARIANCE_STEP:
             nav = eskf.propagate_covariance(nav, _select_imu_noise(setup, state), setup.layout)
-    return state.with_imu(nav, imu, stationary, _follow_gyro(setup, state, nav, utime, rate, imu))
+    return state.with_imu(nav, imu, stationary, _follow_gyros(setup, state, nav, utime, rate, imu))
 
 
-def _follow_gyro(
+def _follow_gyros(
     setup: Setup, state: Navigating, nav: NavState, utime: int, rate: Vector3, imu: ImuMonitor
 ) -> DeadReckoning:
     """Return dead reckoning after a sample of the gyros; `nav` is the state after it."""
-    reckoning = state.reckoning
-    gap = (utime - reckoning.gyro_utime) * 1e-6
-    variance = 0.0
-    if imu.is_interpolated:
-        variance = setup.interpolated.yaw * min(gap, setup.settings.rate_hold)
-    if gap > setup.settings.rate_hold:
-        variance = (setup.settings.gap_rate_sigma * gap) ** 2 / 3.0
     w, x, y, z = nav.attitude
     a, b, c = rate
     # the last row of the rotation: the rate about the vertical
     level = 2.0 * ((x * z - w * y) * a + (y * z + w * x) * b) + (1.0 - 2.0 * (x * x + y * y)) * c
-    return reckoning.follow_gyro(utime, level, variance)
+    return follow_gyro(setup, state.reckoning, utime, level, is_interpolated=imu.is_interpolated)
+
+
+def follow_gyro(
+    setup: Setup, reckoning: DeadReckoning, utime: int, rate: float, *, is_interpolated: bool = False
+) -> DeadReckoning:
+    """Return dead reckoning after a rate about the vertical, rad/s, and what the gyro has missed before it."""
+    settings = setup.settings
+    gap = (utime - reckoning.gyro_utime) * 1e-6
+    variance = 0.0
+    if gap > settings.rate_hold:
+        variance = (settings.gap_rate_sigma * gap) ** 2 / 3.0
+    elif is_interpolated:
+        variance = setup.interpolated.yaw * gap
+    return reckoning.follow_gyro(utime, rate, variance)
 
 
 def predict(setup: Setup, state: N, utime: int) -> N:

@@ -257,6 +257,10 @@ class Aligned(NamedTuple):
         """Return the state after an IMU sample: what `_replace` does, at a fraction of its cost."""
         return new_tuple(Aligned, (nav, imu, stationary, reckoning, *self[4:]))
 
+    def end_bank(self) -> Aligned:
+        """Return the state without its bank, whose path was wrong or is not measured any more."""
+        return self._replace(bank=None, bounds=None)
+
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""
         return new_tuple(Aligned, (nav, *self[1:]))

@@ -197,7 +197,7 @@ def _judge(
         state = release_motion(state)
     if isinstance(state, Aligned):
         # its path is that of wheels that were stuck
-        state = state._replace(bank=None, bounds=None)
+        state = state.end_bank()
     state = state._replace(stationary=state.stationary._replace(wheels_stationary=None))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 
