@@ -3,6 +3,9 @@
 Noise changes the last digit of every real sample. So a unit that repeats one sample for `frozen_time` is frozen, and
 numbers that stay, or change along a straight line in all six components, were made up by a driver that filled a gap.
 Three such samples in a row cannot be chance. While they last, the process noise is that of a gap.
+
+A gyro's axis that stays while others change is dead. Two samples of noise s with steps of q are equal by chance with
+p = q / (2 sqrt(pi) s), so n in a row with p^n: a unit with coarse steps may repeat a rate for long.
 """
 
 from __future__ import annotations
@@ -29,6 +32,41 @@ LINE_TOLERANCE: Final = 3e-4
 INTERPOLATED_SAMPLES: Final = 3
 """Samples in a row on one line, in all six components, that cannot be chance."""
 
+DEAD_SAMPLES: Final = 10
+DEAD_CHANCE: Final = 1e-12
+"""Samples in a row in which a gyro's axis is dead, at least, and the chance that a healthy one repeats its rate: once
+in three hundred years at 100 Hz."""
+
+
+class GyroAxes(NamedTuple):
+    """How often each axis of the gyro has repeated its rate, and the smallest step that it has changed by, rad/s."""
+
+    rate: Vector3 = ZERO
+    repeats: tuple[int, int, int] = (0, 0, 0)
+    steps: Vector3 = (math.inf, math.inf, math.inf)
+
+    def update(self, rate: Vector3) -> GyroAxes:
+        """Return the axes after a sample, by the unit's own axes; a repeated sample shows nothing."""
+        (a, b, c), (x, y, z) = rate, self.rate
+        if a == x and b == y and c == z:
+            return self
+        n, m, k = self.repeats
+        d, e, f = self.steps
+        p, q, r = abs(a - x), abs(b - y), abs(c - z)
+        repeats = (0 if p else n + 1, 0 if q else m + 1, 0 if r else k + 1)
+        steps = (p if 0.0 < p < d else d, q if 0.0 < q < e else e, r if 0.0 < r < f else f)
+        return new_tuple(GyroAxes, (rate, repeats, steps))
+
+    def is_dead(self, sigma: float) -> bool:
+        """Return whether an axis repeats a rate that has noise `sigma`, rad/s, as by chance it does not."""
+        if max(self.repeats) < DEAD_SAMPLES:
+            return False
+        for count, step in zip(self.repeats, self.steps, strict=True):
+            chance = step / (2.0 * math.sqrt(math.pi) * sigma)
+            if count >= DEAD_SAMPLES and chance < 1.0 and chance**count < DEAD_CHANCE:
+                return True
+        return False
+
 
 class ImuMonitor(NamedTuple):
     """The last sample of the IMU, and how its numbers change.
@@ -42,6 +80,7 @@ class ImuMonitor(NamedTuple):
     num_collinear: samples in a row that continue exactly along that slope.
     used_utime: the last sample that was used for leveling or propagation.
     is_interpolated: whether the process noise is that of interpolated samples.
+    axes: of the gyro, as they are.
     """
 
     utime: int = 0
@@ -52,18 +91,19 @@ class ImuMonitor(NamedTuple):
     num_collinear: int = 0
     used_utime: int = 0
     is_interpolated: bool = False
+    axes: GyroAxes = GyroAxes()
 
-    def update(self, utime: int, rate: Vector3, force: Vector3) -> ImuMonitor:
+    def update(self, utime: int, rate: Vector3, force: Vector3, axes: GyroAxes) -> ImuMonitor:
         """Return the monitor after a used sample; the caller sets `used_utime` back if it rejects the sample."""
-        before, last_rate, last_force, _, last_slope, num_collinear, _, is_interpolated = self
+        before, last_rate, last_force, _, last_slope, num_collinear, _, is_interpolated, _ = self
         if not before:
-            return ImuMonitor(utime, rate, force, utime, (), 0, utime, is_interpolated)
+            return ImuMonitor(utime, rate, force, utime, (), 0, utime, is_interpolated, axes)
         dt = (utime - before) * 1e-6
         if dt <= 0.0:
             return self._replace(used_utime=utime)
         if rate == last_rate and force == last_force:
             count = num_collinear + 1 if not last_slope else 1
-            return self._replace(utime=utime, slope=(), num_collinear=count, used_utime=utime)
+            return self._replace(utime=utime, slope=(), num_collinear=count, used_utime=utime, axes=axes)
         (a, b, c), (d, e, f) = last_rate, last_force
         (g, h, i), (j, k, m) = rate, force
         slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
@@ -74,7 +114,7 @@ class ImuMonitor(NamedTuple):
                     break
             else:
                 count = num_collinear + 1
-        return new_tuple(ImuMonitor, (utime, rate, force, utime, slope, count, utime, is_interpolated))
+        return new_tuple(ImuMonitor, (utime, rate, force, utime, slope, count, utime, is_interpolated, axes))
 
     @property
     def seems_interpolated(self) -> bool:

@@ -61,6 +61,9 @@ LONG_REST_TIME: Final = 5.0
 UNNOTICED_TIME: Final = 10.0
 """Seconds for which the heading may have turned by that change unnoticed: then fixes hold it."""
 
+SHORTEST_PERIOD: Final = 1e-3
+"""Seconds between two samples, at least: no unit measures faster, but stamps may be closer."""
+
 LOST_ATTITUDE_SIGMA: Final = 0.7
 """Sigma of the attitude, rad, beyond which a gap in the IMU makes the filter level again."""
 
@@ -78,7 +81,12 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, (reject(item, values),)
     rate, force = values
     utime, settings = item.utime, setup.settings
-    imu = state.imu.update(utime, rate, force)
+    assert sample.angular_velocity is not None
+    imu = state.imu.update(utime, rate, force, state.imu.axes.update(sample.angular_velocity))
+    seconds = max((utime - state.imu.utime) * 1e-6, SHORTEST_PERIOD)
+    if not state.stationary.since and imu.axes.is_dead(settings.gyro_noise / math.sqrt(seconds)):
+        imu = imu._replace(used_utime=state.imu.used_utime)
+        return state._replace(imu=imu), (reject(item, "axis"),)
     # a sample that is like the one before it changed before
     if imu.changed_utime != utime and imu.get_frozen_time(utime) > settings.frozen_time:
         imu = imu._replace(used_utime=state.imu.used_utime)

@@ -14,6 +14,7 @@ from modelserver.estimation.filter import eskf
 from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.measurements.wheels import TurnRate
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, N, Navigating
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
@@ -116,6 +117,16 @@ def follow_gyro(
     elif is_interpolated:
         variance = setup.interpolated.yaw * gap
     return reckoning.follow_gyro(utime, rate, variance)
+
+
+def follow_wheels(setup: Setup, state: Navigating, utime: int, turn: TurnRate) -> DeadReckoning:
+    """Return dead reckoning after the turn rate by wheels in place of a gyro that has gone silent."""
+    reckoning, settings = state.reckoning, setup.settings
+    if not reckoning.gyro_utime or (utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold:
+        return reckoning
+    # what a gyro with the present bias would measure; an error lasts `slip_time`
+    rate, gap = turn.value + state.nav.gyro_bias[2], (utime - reckoning.gyro_utime) * 1e-6
+    return reckoning.follow_gyro(utime, rate, turn.sigma**2 * max(settings.slip_time, gap) * gap)
 
 
 def predict(setup: Setup, state: N, utime: int) -> N:

@@ -38,7 +38,7 @@ from modelserver.estimation.filter.measurements.wheels import (
 )
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, PreviousSample
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample
 from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
 from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
 from modelserver.transforms import so3
@@ -97,7 +97,7 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         state = state._replace(reckoning=bank_step.predict_path(setup, state))
     nav = state.nav._replace(travel=ZERO, rotation=ZERO)
     state = state._replace(nav=nav, common=remember(state.common, (item.source, item.kind), item))
-    if not has_imu:
+    if not (has_imu and _has_gyro(setup, state, item.utime)):
         state, more = _fuse_stationary(setup, state, item.utime, are_stationary is True)
         decisions += more
     # the first wheels that measure a speed leave the sideways speed to the constraint
@@ -152,7 +152,7 @@ def _fuse_speed(
             innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     nav = latency_estimator.hold_latency(context.nav, nav, setup.layout)
-    has_gyro = setup.uses_imu(state.common.mode) and (item.utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold
+    has_gyro = _has_gyro(setup, state, item.utime)
     if has_gyro and not are_stationary and len(innovation.residual) > 1:
         # two sides roll differently for good, by more than a gyro's bias
         nav = hold_bias(context.nav, nav)
@@ -166,6 +166,7 @@ def _fuse_speed(
         turn_rate = TurnRate(nav.angular_rate[2], settings.wheel_rate_sigma)
         if not has_gyro:
             turn_rate = estimate_turn_rate(sample, previous, measurement, settings, context.steering)
+            state = state._replace(reckoning=propagation.follow_wheels(setup, state, item.utime, turn_rate))
         wheels = wheels._replace(used_utime=item.utime, turn_rate=turn_rate)
         if age < math.inf:
             missed = float(innovation.residual.mean()) * age
@@ -253,6 +254,11 @@ def _has_speed_sigma(nav: NavState, sigma: float) -> bool:
     """Return whether the standard deviation of the horizontal velocity is larger, m/s."""
     P = nav.covariance
     return float(P[3, 3] + P[4, 4]) > sigma**2
+
+
+def _has_gyro(setup: Setup, state: Navigating, utime: int) -> bool:
+    """Return whether the IMU propagates the state at an instant."""
+    return setup.uses_imu(state.common.mode) and (utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold
 
 
 def _get_wheels(previous: PreviousSample | None) -> WheelsSample | None:
