@@ -17,8 +17,8 @@ from modelserver.estimation.filter import heading_alignment, heading_step, hypot
 from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import NavState
-from modelserver.estimation.filter.fusion import report_event
-from modelserver.estimation.filter.gnss_monitor import AIDED_TIME
+from modelserver.estimation.filter.fusion import release_motion, report_event
+from modelserver.estimation.filter.gnss_monitor import AIDED_TIME, MOVING_TIME
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.hypothesis_bank import (
     BIAS,
@@ -35,7 +35,8 @@ from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_longest_variance
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Navigating, Unaligned
+from modelserver.estimation.filter.state import Aligned, N, Navigating, Unaligned
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.turn_monitor import START_ERROR
 from modelserver.messages import Decision, Verdict
 from modelserver.transforms import so3
@@ -133,8 +134,13 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
     step = now.since(bank.reckoning, is_stationary=state.is_stationary)
     fix = None if newest is None else _read_fix(setup, state, newest)
     after = bank.advance(utime, step, fix, setup.settings, _get_slip(setup))._replace(reckoning=now)
-    after = after.judge_fixes(output.get_limits(setup, state)[0], is_stationary=state.is_stationary)
+    after = after.judge_fixes(output.get_limits(setup, state)[0])
     state = state._replace(bank=after)
+    if after.may_be_transported and abs(after.rest_turn) > TURNED:
+        state = suspect_wheels(setup, state)
+        state = state._replace(turns=state.turns.transport())
+        text = "the vehicle moves and turns, and its wheels do not: it is transported"
+        return state, (report_event(state, KIND, Verdict.RESET, text),)
     if newest is None:
         return _judge(setup, state), ()
     if not after.excludes_fixes:
@@ -149,6 +155,23 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
         text = f"fixes are {abs(after.offset):.1f} m off dead reckoning: {what}"
         decisions = (report_event(state, KIND, Verdict.RESET, text),)
     return _judge(setup, _follow(setup, state)), decisions
+
+
+def distrust_path(setup: Setup, state: Aligned) -> Aligned:
+    """Return the state without its bank, whose path was that of wheels that do not measure: fixes are right."""
+    newest = state.gnss.last_fix
+    if state.bank is not None and state.bank.excludes_fixes and newest is not None:
+        state = heading_step.place(setup, state, newest)
+    return state.end_bank()
+
+
+def suspect_wheels(setup: Setup, state: N) -> N:
+    """Return the state of a vehicle that moves with its wheels at rest: they are stuck, or it is transported."""
+    until = state.nav.utime + round(MOVING_TIME * 1e6)
+    common = state.common._replace(moving_until=until, wheels=state.common.wheels.suspect())
+    constraints = state.constraints._replace(is_stationary=False, contradiction=0.0)
+    state = release_motion(state)._replace(stationary=StationaryDetector(), common=common, constraints=constraints)
+    return distrust_path(setup, state) if isinstance(state, Aligned) else state
 
 
 def settle(

@@ -194,8 +194,16 @@ def fuse_constraint(setup: Setup, state: N, kind: str, innovation: Innovation) -
     return state._replace(nav=nav), decision
 
 
-def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]:
-    """Return the state after the non-holonomic constraint, and the decision."""
+def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state after the non-holonomic constraint, and the decision.
+
+    There is none for a vehicle that is transported, or may be, since its wheels are at rest while fixes move: they show
+    how.
+    """
+    if isinstance(state, Aligned):
+        may_be = state.common.wheels.is_suspect and not propagation.is_outage(state, utime)
+        if may_be or state.turns.is_transported:
+            return state, NOTHING
     dt = (utime - state.constraints.non_holonomic_utime) * 1e-6
     state = propagation.propagate_covariance(setup, state)
     state = state._replace(constraints=state.constraints._replace(non_holonomic_utime=utime))
@@ -211,7 +219,7 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, Decision]
         # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would change
         # the bias for good, and make bias and heading known that are not
         nav = hold_bias(before, nav, (8, 11))
-    return state._replace(nav=nav), decision
+    return state._replace(nav=nav), (decision,)
 
 
 def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) -> NavState:

@@ -425,18 +425,12 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     return state, (report_event(state, bank_step.KIND, Verdict.RESET, text),)
 
 
-def _place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
-    """Return the state at a fix, in a new epoch."""
-    nav = heading_alignment.place(state.nav, newest, 0j, setup.rig.lever_arm(setup.rig.gps_frame), setup.layout)
-    return start_epoch(state._replace(nav=nav, gnss=state.gnss.place(newest.utime)))
-
-
 def _check_heading(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after a fix more for the check of a restored heading: confirmed, corrected, or still neither."""
     check, rotation, decision = heading_check.update(setup, state, newest)
     state = state._replace(heading_check=check)
     if rotation is not None:
-        state = start_epoch(heading_step.initialize(setup, state, state.nav, rotation, newest))
+        state = heading_step.start_epoch(heading_step.initialize(setup, state, state.nav, rotation, newest))
     return state, () if decision is None else (decision,)
 
 
@@ -456,14 +450,14 @@ def reset_position(setup: Setup, state: Aligned) -> tuple[Aligned, Decision | No
         # fixes show a course alone, which is not the heading of a vehicle that is transported
         text = f"fixes move {math.degrees(abs(rotation.angle)):.0f} deg beside the vehicle's own axis"
         decision = Decision(nav.utime, "filter", 0, "gps_position", Verdict.RESET, text)
-        return _place(setup, state._replace(turns=state.turns.transport()), newest), decision
+        return heading_step.place(setup, state._replace(turns=state.turns.transport()), newest), decision
     state = heading_step.initialize(setup, state, nav, rotation, newest)
     if rotation is fit.rotation:
         state = _allow_start(state, newest, fit.distance)
     decision = Decision(
         nav.utime, "filter", 0, "gps_position", Verdict.RESET, "fixes agree with the path driven, the state does not"
     )
-    return start_epoch(state), decision
+    return heading_step.start_epoch(state), decision
 
 
 def _allow_start(state: Aligned, newest: PathFix, distance: float) -> Aligned:
@@ -471,9 +465,3 @@ def _allow_start(state: Aligned, newest: PathFix, distance: float) -> Aligned:
     fix_sigma = math.hypot(newest.white, newest.correlated)
     is_measured = state.common.measures_wheel_speed(newest.utime)
     return state._replace(turns=state.turns.start_heading(fix_sigma, distance, is_measured=is_measured))
-
-
-def start_epoch(state: Aligned) -> Aligned:
-    """Return the state in a new epoch, without an allowance for earlier outliers."""
-    common = state.common._replace(epoch=state.common.epoch + 1)
-    return state._replace(common=common, gnss=state.gnss._replace(outlier_allowance=0.0))

@@ -157,6 +157,18 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
     return _align(state, nav, state.site, gnss)._replace(heading_check=check)
 
 
+def place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state at a fix, in a new epoch."""
+    nav = heading_alignment.place(state.nav, newest, 0j, setup.rig.lever_arm(setup.rig.gps_frame), setup.layout)
+    return start_epoch(state._replace(nav=nav, gnss=state.gnss.place(newest.utime)))
+
+
+def start_epoch(state: Aligned) -> Aligned:
+    """Return the state in a new epoch, without an allowance for earlier outliers."""
+    common = state.common._replace(epoch=state.common.epoch + 1)
+    return state._replace(common=common, gnss=state.gnss._replace(outlier_allowance=0.0))
+
+
 def _align(state: Navigating, nav: NavState, site: LocalFrame, gnss: GnssMonitor) -> Aligned:
     """Return the aligned state at a pose that was just found, in the tangent plane `site`."""
     latitude, _, height = geodetic_from_ecef(site.ecef)

@@ -238,6 +238,8 @@ class HypothesisBank(NamedTuple):
     published: index of the one that is published.
     inflation: of the white noise of fixes, learned, 1 to 4.
     rest_rate: mean turn rate of the step before, rad/s, of a vehicle at rest; nan: it was not.
+    rest_bias, rest_turn: of a vehicle whose wheels are at rest, the gyro's bias when that began, rad/s, and the turn
+        since, rad; nan: they are not.
     sigma: of the last fix, m.
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
@@ -256,6 +258,8 @@ class HypothesisBank(NamedTuple):
     published: int = 0
     inflation: float = 1.0
     rest_rate: float = math.nan
+    rest_bias: float = math.nan
+    rest_turn: float = 0.0
     sigma: float = 1.0
     settled: Fault = Fault.NONE
     excludes_fixes: bool = False
@@ -279,7 +283,7 @@ class HypothesisBank(NamedTuple):
         n = self.published
         return bool(self.faults[n] or self.jumped[n] or not self.weights[n] > CERTAIN)
 
-    def judge_fixes(self, limit: float, *, is_stationary: bool) -> HypothesisBank:
+    def judge_fixes(self, limit: float) -> HypothesisBank:
         """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
 
         They are not once they are certain to be off, by a share of the limit that matters; that lasts as long as the
@@ -290,7 +294,8 @@ class HypothesisBank(NamedTuple):
         if excludes and not self.excludes_fixes:
             is_far = abs(self.offset) > SHARE_OF_LIMIT * limit
             excludes = is_far and bool(self.weights[off].sum() > SETTLED)
-        begins_at_rest = not self.excludes_fixes and is_stationary and not self.jumped[self.published]
+        is_at_rest = not math.isnan(self.rest_bias)
+        begins_at_rest = not self.excludes_fixes and is_at_rest and not self.jumped[self.published]
         may_be_transported = excludes and (self.may_be_transported or begins_at_rest)
         return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported)
 
@@ -323,7 +328,12 @@ class HypothesisBank(NamedTuple):
             if bank.weights[bank.published] > CERTAIN:
                 change = min(seconds, 2.0) / 30.0 * (min(0.5 * nis, 9.0) - 1.0)
                 bank = bank._replace(inflation=min(max(bank.inflation * (1.0 + change), 1.0), 4.0))
-        return bank._reduce(utime)._replace(rest_rate=rate if rests else math.nan)
+        rest_bias, rest_turn = math.nan, 0.0
+        if rests or step.driven < settings.stationary_speed * seconds:
+            rest_bias = bias if math.isnan(self.rest_bias) else self.rest_bias
+            rest_turn = self.rest_turn + step.turn - rest_bias * seconds
+        rest_rate = rate if rests else math.nan
+        return bank._reduce(utime)._replace(rest_rate=rest_rate, rest_bias=rest_bias, rest_turn=rest_turn)
 
     def _predict(self, step: Increment, settings: FilterSettings, slip: float) -> HypothesisBank:
         """Return the bank after dead reckoning, equations (1) and (2)."""
@@ -563,7 +573,7 @@ class HypothesisBank(NamedTuple):
             int(group[np.searchsorted(left, self.published)]),
             self.inflation,
             self.rest_rate,
-            self.sigma,
+            sigma=self.sigma,
             excludes_fixes=self.excludes_fixes,
             may_be_transported=self.may_be_transported,
             reckoning=self.reckoning,

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import eskf, imu_monitor, leveling, propagation
+from modelserver.estimation.filter import bank_step, eskf, imu_monitor, leveling, propagation
 from modelserver.estimation.filter.eskf import ZERO, Innovation
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
@@ -24,7 +24,6 @@ from modelserver.estimation.filter.fusion import (
     fuse_constraint,
     fuse_non_holonomic,
     reject,
-    release_motion,
     report_event,
     report_reset,
 )
@@ -33,7 +32,6 @@ from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.measurements import constraints
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, N, Navigating
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import Decision, ImuSample, Mode, Verdict
 from modelserver.transforms.so3 import to_vector3
 
@@ -184,10 +182,7 @@ def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Deci
     wheels_utime = state.common.wheels.used_utime
     if wheels_utime and (utime - wheels_utime) * 1e-6 < settings.wheel_period + CONSTRAINT_PERIOD:
         return state, NOTHING  # the next wheel sample brings it
-    if isinstance(state, Aligned) and state.turns.is_transported:
-        return state, NOTHING  # it moves beside its own axis
-    state, decision = fuse_non_holonomic(setup, state, utime)
-    return state, (decision,)
+    return fuse_non_holonomic(setup, state, utime)
 
 
 def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:
@@ -203,13 +198,7 @@ def _fuse_stationary(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decis
     state = state._replace(constraints=state.constraints._replace(contradiction=contradiction))
     if contradiction > LARGEST_CONTRADICTION and state.stationary.is_confirmed_by_wheels(utime):
         # wheels that are stuck, and it moves so smoothly that it seems stationary
-        common = state.common._replace(
-            moving_until=utime + round(MOVING_TIME * 1e6), wheels=state.common.wheels.suspect()
-        )
-        state = release_motion(state)._replace(stationary=StationaryDetector(), common=common)
-        state = state._replace(constraints=state.constraints._replace(contradiction=0.0))
-        if isinstance(state, Aligned):
-            state = state.end_bank()
+        state = bank_step.suspect_wheels(setup, state)
         return state, (*decisions, report_event(state, constraints.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
     detector = state.stationary
     if detector.sum_time > 0.0:

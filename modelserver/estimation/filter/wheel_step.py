@@ -103,8 +103,8 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     # the first wheels that measure a speed leave the sideways speed to the constraint
     since = (item.utime - state.constraints.non_holonomic_utime) * 1e-6
     if not state.is_stationary and (is_first_speed or since >= 0.5 * CONSTRAINT_PERIOD):
-        state, decision = fuse_non_holonomic(setup, state, item.utime)
-        decisions += (decision,)
+        state, more = fuse_non_holonomic(setup, state, item.utime)
+        decisions += more
     if isinstance(state, Aligned) and state.bank is not None:
         state, more = bank_step.advance(setup, state)
         decisions += more
@@ -197,8 +197,7 @@ def _judge(
     if state.is_stationary or judged.has_held:
         state = release_motion(state)
     if isinstance(state, Aligned):
-        # its path is that of wheels that were stuck
-        state = state.end_bank()
+        state = bank_step.distrust_path(setup, state)
     state = state._replace(stationary=state.stationary._replace(wheels_stationary=None))
     return state, (report_event(state, item.kind, Verdict.REJECTED, "the wheels are stuck"),)
 

@@ -130,7 +130,7 @@ def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bia
         """Return the change of the bias, the sideways speed, and the change of the variances."""
         utime = slid.nav.utime + 100_000
         before = propagation.propagate_covariance(setup, slid).nav.covariance
-        after, decision = fusion.fuse_non_holonomic(setup, slid, utime)
+        after, (decision,) = fusion.fuse_non_holonomic(setup, slid, utime)
         assert decision.verdict is Verdict.USED
         learned = after.nav.gyro_bias[2] - slid.nav.gyro_bias[2]
         return learned, after.nav.body_velocity(RIG.base)[1], np.diagonal(after.nav.covariance - before)
