@@ -131,7 +131,11 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
     if utime - bank.utime < (STEP_US if newest is not None else LONGEST_STEP_US):
         return state, ()
     now = predict_path(setup, state)
-    step = now.since(bank.reckoning, is_stationary=state.is_stationary)
+    step = now.since(
+        bank.reckoning,
+        is_stationary=state.is_stationary,
+        are_wheels_stationary=state.stationary.is_confirmed_by_wheels(utime),
+    )
     fix = None if newest is None else _read_fix(setup, state, newest)
     after = bank.advance(utime, step, fix, setup.settings, _get_slip(setup))._replace(reckoning=now)
     after = after.judge_fixes(output.get_limits(setup, state)[0])

@@ -18,7 +18,8 @@ class Increment(NamedTuple):
     """Dead reckoning over a step.
 
     `seconds`; `turn` (rad); `path` and `moment` (m, m s), forward + i left in the heading at its begin; `driven` (m);
-    `turn_variance` and `path_variance`, of what gyro and wheels have missed (rad2, m2); `is_stationary`.
+    `turn_variance` and `path_variance`, of what gyro and wheels have missed (rad2, m2); `is_stationary`, and
+    whether the wheels are.
     """
 
     seconds: float
@@ -29,6 +30,7 @@ class Increment(NamedTuple):
     turn_variance: float = 0.0
     path_variance: float = 0.0
     is_stationary: bool = False
+    are_wheels_stationary: bool = False
 
 
 class DeadReckoning(NamedTuple):
@@ -85,7 +87,7 @@ class DeadReckoning(NamedTuple):
             path_variance=self.path_variance + variance,
         )
 
-    def since(self, start: DeadReckoning, *, is_stationary: bool) -> Increment:
+    def since(self, start: DeadReckoning, *, is_stationary: bool, are_wheels_stationary: bool) -> Increment:
         """Return the step from an earlier instant."""
         spin = cmath.rect(1.0, -start.heading)
         path = self.path - start.path
@@ -99,4 +101,5 @@ class DeadReckoning(NamedTuple):
             self.turn_variance - start.turn_variance,
             max(self.path_variance - start.path_variance, 0.0),
             is_stationary,
+            are_wheels_stationary,
         )

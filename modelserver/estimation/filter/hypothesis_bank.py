@@ -160,6 +160,10 @@ SHARE_OF_LIMIT: Final = 0.2
 PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
+OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
+"""Meters that a vehicle has driven by itself, and standard deviations of a rate at which fixes go on to drift then, so
+that it is not transported."""
+
 NEVER: Final = np.iinfo(np.int64).min // 2
 GRID: Final = np.linspace(0.0, 1.0, 33)[:, None, None]
 
@@ -239,7 +243,7 @@ class HypothesisBank(NamedTuple):
     inflation: of the white noise of fixes, learned, 1 to 4.
     rest_rate: mean turn rate of the step before, rad/s, of a vehicle at rest; nan: it was not.
     rest_bias, rest_turn: of a vehicle whose wheels are at rest, the gyro's bias when that began, rad/s, and the turn
-        since, rad; nan: they are not.
+        since, rad; nan: they are not, and the vehicle has `driven` some m since.
     sigma: of the last fix, m.
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
@@ -260,6 +264,7 @@ class HypothesisBank(NamedTuple):
     rest_rate: float = math.nan
     rest_bias: float = math.nan
     rest_turn: float = 0.0
+    driven: float = 0.0
     sigma: float = 1.0
     settled: Fault = Fault.NONE
     excludes_fixes: bool = False
@@ -297,6 +302,10 @@ class HypothesisBank(NamedTuple):
         is_at_rest = not math.isnan(self.rest_bias)
         begins_at_rest = not self.excludes_fixes and is_at_rest and not self.jumped[self.published]
         may_be_transported = excludes and (self.may_be_transported or begins_at_rest)
+        if self.fault is Fault.SPOOFING and self.driven > OWN_WAY:
+            x, P = self.means[self.published], self.covariances[self.published]
+            variance = max(P[DRIFT, DRIFT], P[DRIFT + 1, DRIFT + 1])
+            may_be_transported &= math.hypot(x[DRIFT], x[DRIFT + 1]) < DRIFT_SIGMAS * math.sqrt(variance)
         return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported)
 
     @property
@@ -328,12 +337,13 @@ class HypothesisBank(NamedTuple):
             if bank.weights[bank.published] > CERTAIN:
                 change = min(seconds, 2.0) / 30.0 * (min(0.5 * nis, 9.0) - 1.0)
                 bank = bank._replace(inflation=min(max(bank.inflation * (1.0 + change), 1.0), 4.0))
-        rest_bias, rest_turn = math.nan, 0.0
-        if rests or step.driven < settings.stationary_speed * seconds:
+        rest_bias, rest_turn, driven = math.nan, 0.0, self.driven + step.driven
+        if step.are_wheels_stationary:
             rest_bias = bias if math.isnan(self.rest_bias) else self.rest_bias
-            rest_turn = self.rest_turn + step.turn - rest_bias * seconds
+            rest_turn, driven = self.rest_turn + step.turn - rest_bias * seconds, 0.0
         rest_rate = rate if rests else math.nan
-        return bank._reduce(utime)._replace(rest_rate=rest_rate, rest_bias=rest_bias, rest_turn=rest_turn)
+        bank = bank._reduce(utime)
+        return bank._replace(rest_rate=rest_rate, rest_bias=rest_bias, rest_turn=rest_turn, driven=driven)
 
     def _predict(self, step: Increment, settings: FilterSettings, slip: float) -> HypothesisBank:
         """Return the bank after dead reckoning, equations (1) and (2)."""
