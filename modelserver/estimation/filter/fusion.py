@@ -14,6 +14,7 @@ from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf, latency_estimator, propagation
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
+from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.own import OwnMeasurement
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
 from modelserver.estimation.filter.setup import Setup
@@ -216,17 +217,22 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Dec
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
     nav = latency_estimator.hold_latency(before, state.nav, setup.layout)
     if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
-        # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would change
-        # the bias for good, and make bias and heading known that are not
+        # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would turn the
+        # heading and change the bias for good
         nav = hold_bias(before, nav, (8, 11))
     return state._replace(nav=nav), (decision,)
 
 
 def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) -> NavState:
-    """Return the state `after` an update with the yaw gyro's bias of `before`, and no less variance along `axes`."""
+    """Return the state `after` an update with the yaw gyro's bias of `before`, and no less variance along `axes`.
+
+    8 among them: with the heading of before too.
+    """
     P = after.covariance.copy()
     for axis in axes:
         P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
+    if 8 in axes:
+        after = after.change(8, wrap_angle(before.yaw - after.yaw))
     return after.change(11, before.gyro_bias[2] - after.gyro_bias[2])._replace(covariance=P)
 
 

@@ -50,9 +50,6 @@ SOURCE_TIMEOUT: Final = 2.0
 FORCE_AGE_US: Final = 50_000
 """Microseconds for which a measured force is that of a wheel sample."""
 
-UNSTUCK_SPEED: Final = 0.3
-"""Speed, m/s, at least, at which wheels that were stuck show that they are not."""
-
 UNKNOWN_SPEED_SIGMA: Final = 2.0
 """Sigma of the horizontal speed, m/s, beyond which the speed is unknown: that of a walk."""
 
@@ -185,7 +182,7 @@ def _judge(
     nav, wheels = state.nav, state.common.wheels
     P = nav.covariance
     sigma = math.sqrt(max(P[3, 3], P[4, 4]))
-    is_moving = math.hypot(*nav.velocity[:2]) > 4.0 * sigma + UNSTUCK_SPEED
+    is_moving = math.hypot(*nav.velocity[:2]) > 3.0 * sigma
     ratio = decision.statistic / decision.limit
     is_used = decision.verdict is Verdict.USED
     judged = wheels.compare(ratio, is_used=is_used, are_stationary=are_stationary, is_moving=is_moving)

@@ -301,6 +301,36 @@ def test_given_a_vehicle_that_is_transported_beside_its_own_axis_then_no_valid_h
     assert abs(found.last.heading) < math.radians(3.0)
 
 
+def test_given_a_carrier_that_turns_when_the_wheels_are_at_rest_then_no_pose_is_wrong_and_valid():
+    phases = (*EIGHT, DrivePhase(80.0, 0.0), *EIGHT)
+    begin = sum(each.duration for each in EIGHT) + 10.0
+    rate, speed, seconds = 0.03, 2.0, 60.0
+
+    def carry(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            t = min(max((event.header.utime - START_UTIME) * 1e-6 - begin, 0.0), seconds)
+            if isinstance(event, ImuSample) and 0.0 < t < seconds:
+                turn = so3.rotate(so3.conjugate(MOUNT.wxyz), (0.0, 0.0, rate))
+                event = replace(event, angular_velocity=so3.add(event.angular_velocity, turn))
+            elif isinstance(event, GpsSample):
+                # along an arc; after it, the drive is turned by it
+                moved = speed / rate * (cmath.rect(1.0, rate * t) - 1.0)
+                north, east = moved.imag / 111_200.0, moved.real / 111_200.0
+                event = replace(
+                    event,
+                    latitude_deg=event.latitude_deg + north,
+                    longitude_deg=event.longitude_deg + east / math.cos(math.radians(event.latitude_deg)),
+                )
+            yield event
+
+    found = drive(simulation(phases), begin + 70.0, transform=carry)
+
+    riding = found.between(begin + 20.0, begin + seconds)
+    assert not any(row.valid for row in riding)
+    reasons = [each.reason for each in found.ledger if each.verdict is not Verdict.USED]
+    assert any("it is transported" in each or "it moves" in each for each in reasons)
+
+
 @pytest.mark.parametrize("step", [0.02, -0.02])
 def test_given_a_gyro_whose_bias_changes_at_speed_then_it_is_corrected_for_good_by_wheels_of_unequal_size(step):
     phases = (*EIGHT[:-1], DrivePhase(6.0, 8.0), DrivePhase(70.0, 8.0), DrivePhase(6.0, 0.0))

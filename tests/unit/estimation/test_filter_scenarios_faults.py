@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,8 +15,9 @@ from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.magnetometer import magnetic_field
-from modelserver.messages import Invalid, Phase, Verdict, WheelsSample, YawSource
+from modelserver.messages import ImuSample, Invalid, Phase, Verdict, WheelsSample, YawSource
 from modelserver.simulation import (
+    DrivePhase,
     EncoderModel,
     Event,
     MagnetometerModel,
@@ -169,6 +170,49 @@ def test_given_an_imu_that_freezes_then_it_is_rejected_and_the_pose_is_not_valid
     assert found.decisions("inertial", Verdict.REJECTED, "frozen")
     assert all(Invalid.STALE_IMU in row.estimate.invalid for row in found.between(27.0))
     assert found.at(24.0).valid
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_given_an_axis_of_the_gyro_that_is_dead_then_the_imu_is_rejected_and_the_wheels_turn_the_heading(axis):
+    def stop(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, ImuSample) and 25.0 <= (event.header.utime - START_UTIME) * 1e-6 < 45.0:
+                rate = [*event.angular_velocity]
+                rate[axis] = 0.0
+                event = replace(event, angular_velocity=tuple(rate))
+            yield event
+
+    found = drive(simulation(EIGHT), 50.0, transform=stop)
+
+    words = found.decisions("inertial", Verdict.REJECTED, "axis")
+    assert found.seconds(words[0]) < 25.5
+    assert all(abs(row.heading) < row.estimate.heading_level for row in found.between(20.0))
+    assert all(row.off < 1.5 for row in found.between(20.0))
+    assert all(row.valid for row in found.between(46.0))
+
+
+def test_given_a_gyro_of_coarse_steps_then_no_axis_is_dead():
+    def round_rates(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, ImuSample):
+                rate = tuple(0.02 * round(each / 0.02) for each in event.angular_velocity)
+                event = replace(event, angular_velocity=rate)
+            yield event
+
+    found = drive(simulation(EIGHT), 50.0, transform=round_rates)
+
+    assert not found.decisions("inertial", Verdict.REJECTED)
+    assert all(row.valid for row in found.between(20.0))
+
+
+def test_given_an_imu_that_fails_at_rest_when_the_vehicle_sets_off_then_the_pose_follows_the_wheels():
+    phases = (*EIGHT, DrivePhase(8.0, 0.0), DrivePhase(3.0, 2.5), DrivePhase(30.0, 2.5), DrivePhase(3.0, 0.0))
+    at = sum(each.duration for each in EIGHT) + 4.0
+
+    found = drive(simulation(phases, imu_model=replace(IMU, outages=((at, at + 60.0),))), at + 30.0)
+
+    assert found.last.speed > 2.0
+    assert all(row.off < 1.5 for row in found.between(at))
 
 
 def test_given_gaps_of_the_imu_then_they_are_bridged_and_the_protection_level_covers_the_error():

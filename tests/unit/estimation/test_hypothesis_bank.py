@@ -42,7 +42,7 @@ def turn_on_circle(rate: float, seconds: float, bias: float = 0.0) -> list[DeadR
 @pytest.mark.parametrize("rate", [0.0, 0.3, -1.0])
 def test_given_a_circle_then_increments_are_its_chords_in_their_own_heading(rate: float) -> None:
     for start, end in pairwise(turn_on_circle(rate, 20.0)):
-        step = end.since(start, is_stationary=False)
+        step = end.since(start, is_stationary=False, are_wheels_stationary=False)
         chord = SPEED * (1.0 if rate == 0.0 else (cmath.exp(1j * rate) - 1.0) / (1j * rate))
         assert (step.seconds, step.turn) == pytest.approx((1.0, rate))
         assert abs(step.path - chord) < 1e-6
@@ -55,7 +55,10 @@ def test_given_a_bias_then_the_moment_has_the_path_that_it_bends() -> None:
     bias = 0.01
     right, wrong = turn_on_circle(0.4, 20.0), turn_on_circle(0.4, 20.0, bias)
     for (a, b), (c, d) in zip(pairwise(right), pairwise(wrong), strict=True):
-        true, bent = b.since(a, is_stationary=False), d.since(c, is_stationary=False)
+        true, bent = (
+            b.since(a, is_stationary=False, are_wheels_stationary=False),
+            d.since(c, is_stationary=False, are_wheels_stationary=False),
+        )
         assert abs(bent.path - 1j * bias * bent.moment - true.path) < 1e-3
 
 
@@ -76,7 +79,7 @@ def drive(bank: HypothesisBank, seconds: int, shift: complex = 0j, turn: float =
         step = Increment(1.0, turn, complex(SPEED), complex(0.5 * SPEED), SPEED)
         x, y = (0.15 * SIGMA * noise.standard_normal(2)).tolist()
         fix = PlanarFix(complex(SPEED * t + x, y) + shift, SIGMA, 0j, complex(SPEED), 0.0)
-        bank = bank.advance(t * 1_000_000, step, fix, SETTINGS, SLIP).judge_fixes(LIMITS[0], is_stationary=False)
+        bank = bank.advance(t * 1_000_000, step, fix, SETTINGS, SLIP).judge_fixes(LIMITS[0])
     return bank
 
 
@@ -105,6 +108,35 @@ def test_given_fixes_that_jump_then_they_are_excluded_and_used_again_once_they_a
     once = drive(good, 1, shift=30j)
     assert not once.excludes_fixes
     assert once.pose[1] == pytest.approx(good.pose[1], abs=0.5)
+
+
+def rest(bank: HypothesisBank, seconds: int, speed: float, turn: float = 0.0) -> HypothesisBank:
+    """Return the bank after seconds with wheels at rest, while fixes move north and the gyro turns, rad/s."""
+    begin = round(bank.utime * 1e-6)
+    for t in range(begin + 1, begin + seconds + 1):
+        step = Increment(1.0, turn, 0j, 0j, 0.0, are_wheels_stationary=True)
+        fix = PlanarFix(complex(begin * SPEED, speed * (t - begin)), SIGMA, 0j, 0j, 0.0)
+        bank = bank.advance(t * 1_000_000, step, fix, SETTINGS, SLIP).judge_fixes(LIMITS[0])
+    return bank
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.02])
+def test_given_fixes_that_move_away_from_wheels_at_rest_then_the_vehicle_may_be_transported(turn):
+    bank = rest(drive(start(), 60), 40, 1.0, turn)
+
+    assert bank.excludes_fixes
+    assert bank.may_be_transported
+    assert bank.rest_turn == pytest.approx(40.0 * turn, abs=0.1)
+
+
+def test_given_fixes_that_drift_on_while_it_drives_then_the_vehicle_is_not_transported():
+    parked = rest(drive(start(), 60), 40, 1.0)
+    bank = parked
+    for n in range(60):
+        bank = drive(bank, 1, shift=complex(-40.0 * SPEED, 41.0 + n))
+
+    assert bank.excludes_fixes
+    assert not bank.may_be_transported
 
 
 def test_given_a_gyro_that_errs_then_it_is_named_once_it_is_certain_and_the_heading_is_right() -> None:
