@@ -209,7 +209,9 @@ def settle(
             text = "fixes agree with dead reckoning, the pose does not"
     if not text:
         return state, ()
-    state = _judge(setup, _follow(setup, state))
+    # fixes that are off by the hypothesis that the state is set to would move it away again
+    bank = bank.judge_fixes(output.get_limits(setup, state)[0], least=0.0)
+    state = _judge(setup, _follow(setup, state._replace(bank=bank)))
     return state, (report_event(state, KIND, Verdict.RESET, text),)
 
 

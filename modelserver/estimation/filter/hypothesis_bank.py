@@ -288,17 +288,17 @@ class HypothesisBank(NamedTuple):
         n = self.published
         return bool(self.faults[n] or self.jumped[n] or not self.weights[n] > CERTAIN)
 
-    def judge_fixes(self, limit: float) -> HypothesisBank:
+    def judge_fixes(self, limit: float, least: float = SETTLED) -> HypothesisBank:
         """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
 
-        They are not once they are certain to be off, by a share of the limit that matters; that lasts as long as the
-        published hypothesis has them off.
+        They are not once they are certain to be off (with a weight of `least`), by a share of the limit that matters;
+        that lasts as long as the published hypothesis has them off.
         """
         off = (self.jumped > 0) | (self.faults == Fault.DRIFT) | (self.faults == Fault.SPOOFING)
         excludes = bool(off[self.published])
         if excludes and not self.excludes_fixes:
             is_far = abs(self.offset) > SHARE_OF_LIMIT * limit
-            excludes = is_far and bool(self.weights[off].sum() > SETTLED)
+            excludes = is_far and bool(self.weights[off].sum() > least)
         is_at_rest = not math.isnan(self.rest_bias)
         begins_at_rest = not self.excludes_fixes and is_at_rest and not self.jumped[self.published]
         may_be_transported = excludes and (self.may_be_transported or begins_at_rest)
