@@ -153,12 +153,7 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
         state = state._replace(gnss=state.gnss.restart(utime))
         text = "fixes are trusted again: they agree with dead reckoning"
         return state, (report_event(state, KIND, Verdict.USED, text),)
-    decisions: tuple[Decision, ...] = ()
-    if not bank.excludes_fixes or bank.fault is not after.fault:
-        what = "they jumped" if after.jumped[after.published] else "they drift"
-        text = f"fixes are {abs(after.offset):.1f} m off dead reckoning: {what}"
-        decisions = (report_event(state, KIND, Verdict.RESET, text),)
-    return _judge(setup, _follow(setup, state)), decisions
+    return _correct(setup, state, bank)
 
 
 def distrust_path(setup: Setup, state: Aligned) -> Aligned:
@@ -197,20 +192,36 @@ def settle(
         return _judge(setup, _start(setup, state, state.gnss.last_fix)), ()
     if bank is before:
         return state, ()
+    assert before is not None
+    return _correct(setup, state, before)
+
+
+def _correct(setup: Setup, state: Aligned, before: HypothesisBank) -> tuple[Aligned, tuple[Decision, ...]]:
+    """Return the state after a fix, used or not, judged by its bank, and set to its hypothesis where it must be.
+
+    `before`: the bank before the fix.
+    """
+    bank, limits = state.bank, output.get_limits(setup, state)
+    assert bank is not None
     state = _judge(setup, state)
     assert state.bounds is not None
     text = _describe(bank)
-    ends = before is not None and before.excludes_fixes and _has_moved(setup, state)
-    if not text and _is_turned(setup, state):
+    ends = before.excludes_fixes and not bank.excludes_fixes and _has_moved(setup, state)
+    if bank.excludes_fixes and not before.excludes_fixes:
+        what = "they jumped" if bank.jumped[bank.published] else "they drift"
+        text = f"fixes are {abs(bank.offset):.1f} m off dead reckoning: {what}"
+    elif not text and _is_turned(setup, state):
         text = "the heading is not that of dead reckoning which fixes agree with"
-    if not text and (ends or state.bounds.risk > LIMIT_RISK):
-        own = bank.compute_bounds(bank.pose, output.get_limits(setup, state), setup.settings)
+    elif not text and bank.excludes_fixes and _get_distance(setup, state) > SHARE_OF_LIMIT * limits[0]:
+        text = "fixes that drift show another path than dead reckoning"
+    elif not text and (ends or state.bounds.risk > LIMIT_RISK):
+        own = bank.compute_bounds(bank.pose, limits, setup.settings)
         if ends or own.risk < CLEARLY_LESS * state.bounds.risk:
             text = "fixes agree with dead reckoning, the pose does not"
     if not text:
         return state, ()
     # fixes that are off by the hypothesis that the state is set to would move it away again
-    bank = bank.judge_fixes(output.get_limits(setup, state)[0], least=0.0)
+    bank = bank.judge_fixes(limits[0], least=0.0)
     state = _judge(setup, _follow(setup, state._replace(bank=bank)))
     return state, (report_event(state, KIND, Verdict.RESET, text),)
 
@@ -310,11 +321,17 @@ def _get_pose(setup: Setup, state: Aligned) -> tuple[float, float, float]:
     return x + a, y + b, state.nav.yaw
 
 
+def _get_distance(setup: Setup, state: Aligned) -> float:
+    """Return how far the published hypothesis is from the state's position, m."""
+    assert state.bank is not None
+    (x, y, _), (a, b, _) = state.bank.pose, state.nav.point(setup.rig.base)
+    return math.hypot(x - a, y - b)
+
+
 def _has_moved(setup: Setup, state: Aligned) -> bool:
     """Return whether the published hypothesis is another pose than the state's."""
     assert state.bank is not None
-    (x, y, heading), (a, b, _) = state.bank.pose, state.nav.point(setup.rig.base)
-    return math.hypot(x - a, y - b) > MOVED or abs(wrap_angle(heading - state.nav.yaw)) > TURNED
+    return _get_distance(setup, state) > MOVED or abs(wrap_angle(state.bank.pose[2] - state.nav.yaw)) > TURNED
 
 
 def _is_turned(setup: Setup, state: Aligned) -> bool:
