@@ -11,9 +11,11 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import GeodesyError
-from modelserver.estimation.filter import eskf, latency_estimator, propagation
+from modelserver.estimation.filter import eskf, propagation
+from modelserver.estimation.filter.error_layout import ErrorLayout
 from modelserver.estimation.filter.eskf import Innovation, NavState
 from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, constraints
+from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.own import OwnMeasurement
 from modelserver.estimation.filter.measurements.wheels import read_speedometer
@@ -34,6 +36,7 @@ from modelserver.messages import (
     Verdict,
 )
 from modelserver.named_tuples import new_tuple
+from modelserver.transforms.so3 import Array
 
 CONSTRAINT_PERIOD: Final = 0.1
 """Seconds between two non-holonomic updates, if no wheel sample brings one."""
@@ -44,6 +47,9 @@ HELD_TURN: Final = 0.05
 HELD_RATE: Final = 0.01
 """Sigma of the speed (m/s), the tilt and the turn (rad) and the gyro's bias (rad/s) after a mistaken rest of seconds: a
 tilt explains a speed that did not change."""
+
+SEPARATE_CORRELATION: Final = 0.1
+"""Correlation of heading and latency up to which fixes separate the two; on a steady circle it becomes 0.5."""
 
 ZUPT_PERIOD: Final = 0.2
 """Seconds between two zero-velocity updates."""
@@ -215,7 +221,7 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Dec
     )
     before = state.nav
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
-    nav = latency_estimator.hold_latency(before, state.nav, setup.layout)
+    nav = hold_latency(before, state.nav, setup.layout)
     if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
         # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would turn the
         # heading and change the bias for good
@@ -234,6 +240,24 @@ def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) 
     if 8 in axes:
         after = after.change(8, wrap_angle(before.yaw - after.yaw))
     return after.change(11, before.gyro_bias[2] - after.gyro_bias[2])._replace(covariance=P)
+
+
+def hold_latency(before: NavState, after: NavState, layout: ErrorLayout) -> NavState:
+    """Return the state `after` an update with the latency that it had `before`, where fixes cannot separate it.
+
+    What turns the heading on a steady circle stays an error of heading and gyro, which fixes correct.
+    """
+    if LATENCY not in layout:
+        return after
+    at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
+    if _is_separate(after.covariance, at):
+        return after
+    return after.change(at, before.extras[extra] - after.extras[extra])
+
+
+def _is_separate(P: Array, at: int) -> bool:
+    """Return whether fixes separate latency, at index `at`, and heading, by their covariance (n, n)."""
+    return bool(P[8, at] ** 2 <= SEPARATE_CORRELATION**2 * P[8, 8] * P[at, at])
 
 
 def release_motion(state: N) -> N:

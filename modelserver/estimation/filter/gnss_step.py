@@ -19,7 +19,6 @@ from modelserver.estimation.filter import (
     heading_alignment,
     heading_check,
     heading_step,
-    latency_estimator,
     leveling,
     propagation,
 )
@@ -31,6 +30,7 @@ from modelserver.estimation.filter.fusion import (
     accept_fix,
     create_context,
     fuse_measurement,
+    hold_latency,
     reject,
     report_event,
     report_reset,
@@ -209,19 +209,12 @@ def _fuse_aligned(
     uncorrected = state.nav
     state, decision = _gate_fix(setup, state, innovation, newest, item, is_continuous=is_continuous)
     if decision.verdict is Verdict.USED:
-        state = state._replace(nav=latency_estimator.hold_latency(uncorrected, state.nav, layout))
+        state = state._replace(nav=hold_latency(uncorrected, state.nav, layout))
     if not adds_nothing and decision.verdict is Verdict.USED:
         gnss = state.gnss.learn_inflation(decision, since, settings)
-        nav = latency_estimator.inflate_latency(
-            state.nav,
-            decision.residual,
-            latency_estimator.get_drift_weight(gnss.noise_inflation, since, settings),
-            layout,
-            is_speed_measured=state.common.measures_wheel_speed(state.nav.utime),
-        )
         sigma = (newest.correlated, newest.correlated, 0.0)
-        offset = gnss.offset.update(nav, sigma, since, slice(0, 2), layout, settings)
-        state = state._replace(nav=nav, gnss=gnss._replace(offset=offset))
+        offset = gnss.offset.update(state.nav, sigma, since, slice(0, 2), layout, settings)
+        state = state._replace(gnss=gnss._replace(offset=offset))
     if state.heading_check is None:
         settled, more = bank_step.settle(setup, state, bank)
         return settled, (*decisions, decision, *more)
@@ -309,11 +302,7 @@ def _gate_fix(
         return state._replace(nav=after, common=common, gnss=gnss), decision
     if decision.verdict is Verdict.MONITORED:
         decision = decision._replace(verdict=Verdict.REJECTED, reason="gate")
-    since = (newest.utime - gnss.rejected[-1].utime) * 1e-6 if gnss.rejected else 0.0
     is_measured = state.common.measures_wheel_speed(nav.utime)
-    nav = latency_estimator.inflate_latency(
-        nav, innovation.residual.tolist(), min(since, 2.0), setup.layout, is_speed_measured=is_measured
-    )
     gnss = gnss.reject(newest, settings, is_speed_measured=is_measured)
     state = state._replace(nav=nav, gnss=gnss)
     pending = state.common.pending

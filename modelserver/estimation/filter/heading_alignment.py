@@ -21,6 +21,7 @@ here assumes a direction of travel, so the linear fit of the complex p_0, v_0, q
 from c = -1, once the vehicle has braked, accelerated or turned enough.
 
 Initialization in the world rotates N by the angle found (`rotate`) and puts the antenna on the newest fix (`place`).
+Fixes that are later than the state's latency turn the path in a bend; so it is fitted too (`fit_latency`).
 """
 
 from __future__ import annotations
@@ -419,3 +420,60 @@ def set_speed(nav: NavState, speed: float, sigma: float) -> NavState:
     variance = sigma * sigma + (0.1 * speed) ** 2 + 0.04
     error, P = eskf.correct(nav.covariance, np.array((speed - along,)), H, np.array(((variance,),)))
     return nav.inject(error, P)
+
+
+# --- latency of fixes -----------------------------------------------------------------------------------------
+
+LATENCY_FIXES: Final = 6
+"""Fixes to fit the latency from: twice the numbers that are fitted."""
+
+LATENCY_SIGMAS: Final = 4.0
+"""Standard deviations by which the fitted and the estimated latency may differ."""
+
+
+class LatencyFit(NamedTuple):
+    """Latency of fixes by dead reckoning, and its standard deviation, seconds."""
+
+    seconds: float
+    sigma: float
+
+
+def fit_latency(segment: tuple[PathFix, ...]) -> LatencyFit | None:
+    """Fit p = p_0 + c (u - t u') for the latency t as well; None if the path does not show it."""
+    if len(segment) < LATENCY_FIXES:
+        return None
+    paths = [each.path for each in segment]
+    # at the ends the velocity is that of half an interval away, which would look like a changing one
+    velocities = np.array(compute_velocities(segment, paths))[1:-1]
+    A = np.column_stack((np.ones(len(velocities)), np.array(paths[1:-1]) - paths[0], velocities))
+    try:
+        inverse = np.linalg.inv(A.conj().T @ A)
+    except np.linalg.LinAlgError:
+        return None
+    positions = np.array([each.position - segment[0].position for each in segment[1:-1]])
+    _, c, displaced = inverse @ (A.conj().T @ positions)
+    variance = float(inverse[2, 2].real)
+    if not (abs(c) > 0.0 and 0.0 < variance < math.inf):
+        return None
+    return LatencyFit(-float((displaced / c).real), segment[-1].white * math.sqrt(variance) / abs(c))
+
+
+def reconcile_latency(nav: NavState, fit: LatencyFit | None, layout: ErrorLayout) -> NavState:
+    """Return the state with its latency halfway to a fit that contradicts it, and the difference as its sigma.
+
+    A fit within the uncertainties is left to the updates. Beyond, either may be wrong: the fixes may be late, or may
+    have stayed in place while the vehicle drove off, as receivers make them do at low speed.
+    """
+    if fit is None:
+        return nav
+    at, extra = layout.index(LATENCY), layout.extra_index(LATENCY)
+    difference = fit.seconds - nav.extras[extra]
+    if abs(difference) <= LATENCY_SIGMAS * math.hypot(math.sqrt(nav.covariance[at, at]), fit.sigma):
+        return nav
+    P = nav.covariance.copy()
+    P[at, :] = 0.0
+    P[:, at] = 0.0
+    P[at, at] = difference**2 + fit.sigma**2
+    extras = list(nav.extras)
+    extras[extra] += 0.5 * difference
+    return nav._replace(covariance=P, extras=tuple(extras))

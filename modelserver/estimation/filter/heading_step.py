@@ -18,7 +18,6 @@ import numpy as np
 from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
 from modelserver.estimation.filter import (
     heading_alignment,
-    latency_estimator,
     leveling,
     propagation,
     protection_levels,
@@ -146,7 +145,7 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
     displacement *= cmath.rect(1.0, rotation.angle)
     if isinstance(state, Unaligned):
         known = heading_alignment.select_known_speed(state.alignment.fixes)
-        nav = latency_estimator.reconcile_latency(nav, latency_estimator.fit_latency(known), setup.layout)
+        nav = heading_alignment.reconcile_latency(nav, heading_alignment.fit_latency(known), setup.layout)
         gnss = GnssMonitor(last_fix=state.alignment.last_fix)
     else:
         gnss = state.gnss

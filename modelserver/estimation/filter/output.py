@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
-from modelserver.estimation.filter import eskf, latency_estimator, propagation, protection_levels
+from modelserver.estimation.filter import eskf, propagation, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN
 from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
 from modelserver.estimation.filter.hypothesis_bank import Bounds
@@ -74,7 +74,6 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     silent = 0.0 if state.is_stationary else (utime - gnss.used_utime) * 1e-6
     offset, variance = gnss.offset.decay(silent, settings)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + variance[0], P[1, 1] + variance[1], P[2, 2] + variance[2]
-    P[5, 5] += latency_estimator.compute_heading_variance(nav, setup.layout)
     limits = get_limits(setup, state)
     if state.bounds is None:
         levels = _compute_levels(setup, state, P, limits)
@@ -138,7 +137,7 @@ def get_heading_protection(setup: Setup, state: Aligned) -> float:
     """Return the protection level of the heading at the state's instant, rad."""
     if state.bounds is not None:
         return state.bounds.heading_protection
-    variance = float(state.nav.covariance[8, 8]) + latency_estimator.compute_heading_variance(state.nav, setup.layout)
+    variance = float(state.nav.covariance[8, 8])
     return _compute_heading_protection(setup, state, variance)
 
 

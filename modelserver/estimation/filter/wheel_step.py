@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from modelserver.estimation.filter import bank_step, eskf, latency_estimator, leveling, propagation
+from modelserver.estimation.filter import bank_step, eskf, leveling, propagation
 from modelserver.estimation.filter.eskf import ZERO, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
     CONSTRAINT_PERIOD,
@@ -24,6 +24,7 @@ from modelserver.estimation.filter.fusion import (
     fuse_constraint,
     fuse_non_holonomic,
     hold_bias,
+    hold_latency,
     reject,
     release_motion,
     remember,
@@ -148,7 +149,7 @@ def _fuse_speed(
         if not isinstance(again, str) and again.jacobian.shape == innovation.jacobian.shape:
             innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
-    nav = latency_estimator.hold_latency(context.nav, nav, setup.layout)
+    nav = hold_latency(context.nav, nav, setup.layout)
     has_gyro = _has_gyro(setup, state, item.utime)
     if has_gyro and not are_stationary and len(innovation.residual) > 1:
         # two sides roll differently for good, by more than a gyro's bias

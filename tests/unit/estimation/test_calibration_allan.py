@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from modelserver.estimation.calibration import CalibrationError
-from modelserver.estimation.calibration.allan import (
+from mstools.calibration import CalibrationError
+from mstools.calibration.allan import (
     INSTABILITY_FLOOR,
     AllanCurve,
     NoiseParameters,
@@ -18,7 +18,7 @@ from modelserver.estimation.calibration.allan import (
     cluster_sizes,
     fit_noise_parameters,
 )
-from modelserver.estimation.calibration.sample_ranges import find_gap_free_ranges, find_stationary_ranges, median_period
+from mstools.calibration.sample_ranges import find_gap_free_ranges, find_stationary_ranges, median_period
 
 Series = npt.NDArray[np.float64]
 

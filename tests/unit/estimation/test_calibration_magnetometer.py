@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from modelserver.estimation.calibration import CalibrationError
-from modelserver.estimation.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level, project_to_level
 from modelserver.transforms import so3
+from mstools.calibration import CalibrationError
+from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level, project_to_level
 
 Fields = npt.NDArray[np.float64]
 

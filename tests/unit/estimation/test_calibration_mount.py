@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from modelserver.estimation.calibration import CalibrationError
-from modelserver.estimation.calibration.mount import MAX_TILT, aligned_rotations, axis_name, check_mount
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
+from mstools.calibration import CalibrationError
+from mstools.calibration.mount import MAX_TILT, aligned_rotations, axis_name, check_mount
 
 
 def create_mount(*rpy_deg: float) -> Quaternion:

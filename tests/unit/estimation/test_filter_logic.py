@@ -14,10 +14,10 @@ from support_cart import IMU as IMU_FRAME
 
 from modelserver.estimation.filter import (
     clock_monitor,
+    fusion,
     heading_alignment,
     heading_step,
     imu_monitor,
-    latency_estimator,
     leveling,
     output,
     step,
@@ -25,8 +25,7 @@ from modelserver.estimation.filter import (
 from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, level_attitude
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
-from modelserver.estimation.filter.heading_alignment import PathFix, Rotation
-from modelserver.estimation.filter.latency_estimator import LatencyFit
+from modelserver.estimation.filter.heading_alignment import LatencyFit, PathFix, Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.wheels import (
@@ -500,7 +499,7 @@ def create_delayed_segment(latency: float, speed: str, rate: float = 0.0) -> tup
 @pytest.mark.parametrize("rate", [0.0, 0.3])
 @pytest.mark.parametrize("latency", [0.0, 0.1, 0.4])
 def test_given_delayed_fixes_then_their_latency_is_found_on_a_path_of_changing_speed(latency, rate):
-    found = latency_estimator.fit_latency(create_delayed_segment(latency, "from rest", rate=rate))
+    found = heading_alignment.fit_latency(create_delayed_segment(latency, "from rest", rate=rate))
     assert found is not None
     assert found.sigma < 0.02
     # to first order in the latency, and with corners that four fixes a second round off
@@ -509,14 +508,14 @@ def test_given_delayed_fixes_then_their_latency_is_found_on_a_path_of_changing_s
 
 @pytest.mark.parametrize("rate", [0.0, 0.5])
 def test_given_a_path_at_constant_speed_then_it_does_not_show_the_latency_of_fixes(rate):
-    found = latency_estimator.fit_latency(create_delayed_segment(0.4, "steady", rate=rate))
+    found = heading_alignment.fit_latency(create_delayed_segment(0.4, "steady", rate=rate))
     assert found is None or found.sigma > 1.0
 
 
 def test_given_too_few_fixes_then_they_do_not_show_their_latency():
-    assert latency_estimator.fit_latency(create_delayed_segment(0.0, "from rest")[:5]) is None
+    assert heading_alignment.fit_latency(create_delayed_segment(0.0, "from rest")[:5]) is None
     stationary = tuple(each._replace(path=0j) for each in create_delayed_segment(0.0, "from rest"))
-    assert latency_estimator.fit_latency(stationary) is None
+    assert heading_alignment.fit_latency(stationary) is None
 
 
 def test_given_delayed_fixes_on_a_circle_then_the_rotation_has_its_change_per_latency():
@@ -558,9 +557,9 @@ def test_given_a_fit_that_contradicts_the_latency_then_it_lies_halfway_with_the_
     P[latency_at, latency_at] = 0.1**2
     extras = tuple(0.0 if n == extra else value for n, value in enumerate(nav.extras))
     nav = nav._replace(covariance=P, extras=extras)
-    assert latency_estimator.reconcile_latency(nav, LatencyFit(0.3, 0.01), SETUP.layout) is nav
-    assert latency_estimator.reconcile_latency(nav, LatencyFit(0.8, 5.0), SETUP.layout) is nav
-    after = latency_estimator.reconcile_latency(nav, LatencyFit(0.8, 0.01), SETUP.layout)
+    assert heading_alignment.reconcile_latency(nav, LatencyFit(0.3, 0.01), SETUP.layout) is nav
+    assert heading_alignment.reconcile_latency(nav, LatencyFit(0.8, 5.0), SETUP.layout) is nav
+    after = heading_alignment.reconcile_latency(nav, LatencyFit(0.8, 0.01), SETUP.layout)
     assert after.extras[extra] == pytest.approx(0.4)
     assert after.covariance[latency_at, latency_at] == pytest.approx(0.8**2 + 0.01**2)
     assert np.count_nonzero(after.covariance[latency_at]) == 1
@@ -756,19 +755,6 @@ def correlate_heading_with_latency(correlation: float):
     return nav._replace(covariance=P, rate=rate, velocity=(3.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("correlation", "is_inflated"), [(0.0, True), (0.05, True), (0.5, False), (-0.5, False)])
-def test_given_a_heading_that_goes_with_the_latency_then_it_is_not_inflated_but_may_have_changed(
-    correlation, is_inflated
-):
-    nav = correlate_heading_with_latency(correlation)
-    at = SETUP.layout.index(LATENCY)
-    after = latency_estimator.inflate_latency(nav, (2.0, 0.0), 0.5, SETUP.layout, is_speed_measured=True)
-    variance = 0.05**2 + 0.5 * latency_estimator.CHANGE_SIGMA**2 if is_inflated else 0.05**2
-    assert after.covariance[at, at] == pytest.approx(variance)
-    of_heading = latency_estimator.compute_heading_variance(nav, SETUP.layout)
-    assert of_heading == pytest.approx(0.0 if is_inflated else 0.4**2 * (latency_estimator.CHANGE_SIGMA**2 - 0.05**2))
-
-
 @pytest.mark.parametrize(("correlation", "is_held"), [(0.0, False), (0.05, False), (0.5, True), (-0.5, True)])
 def test_given_a_heading_that_goes_with_the_latency_then_fixes_correct_the_heading_alone(correlation, is_held):
     before = correlate_heading_with_latency(correlation)
@@ -777,7 +763,7 @@ def test_given_a_heading_that_goes_with_the_latency_then_fixes_correct_the_headi
     error = before.covariance[:, at] * (0.2 / before.covariance[at, at])
     corrected = before.inject(error, before.covariance)
     assert corrected.extras[extra] == pytest.approx(before.extras[extra] + 0.2)
-    after = latency_estimator.hold_latency(before, corrected, SETUP.layout)
+    after = fusion.hold_latency(before, corrected, SETUP.layout)
     if not is_held:
         assert after is corrected
         return
@@ -785,6 +771,4 @@ def test_given_a_heading_that_goes_with_the_latency_then_fixes_correct_the_headi
     assert after.yaw == pytest.approx(before.yaw, abs=1e-3)
     # what the latency does not explain stays in the heading
     turned = before.inject(np.eye(len(error))[8] * 0.05 + error, before.covariance)
-    assert latency_estimator.hold_latency(before, turned, SETUP.layout).yaw == pytest.approx(
-        before.yaw + 0.05, abs=3e-3
-    )
+    assert fusion.hold_latency(before, turned, SETUP.layout).yaw == pytest.approx(before.yaw + 0.05, abs=3e-3)

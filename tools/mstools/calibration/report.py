@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from modelserver.estimation.calibration.allan import INSTABILITY_FLOOR, AllanCurve, NoiseParameter, NoiseParameters
-from modelserver.estimation.calibration.ellipsoid import SECTORS, MagnetometerFit, project_to_level
-from modelserver.estimation.calibration.mount import MountCheck
 from modelserver.transforms.so3 import Array, Vector3
+from mstools.calibration.allan import INSTABILITY_FLOOR, AllanCurve, NoiseParameter, NoiseParameters
+from mstools.calibration.ellipsoid import SECTORS, MagnetometerFit, project_to_level
+from mstools.calibration.mount import MountCheck
 from mstools.report import charts
 from mstools.terminal.output import escape, format_count
 

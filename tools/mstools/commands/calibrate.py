@@ -13,15 +13,15 @@ import numpy as np
 import typer
 
 from modelserver.errors import ModelServerError
-from modelserver.estimation.calibration import CalibrationError, mount
-from modelserver.estimation.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
-from modelserver.estimation.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
-from modelserver.estimation.calibration.sample_ranges import SampleRange, find_stationary_ranges
 from modelserver.transforms.so3 import Vector3
+from mstools.calibration import CalibrationError, mount
 from mstools.calibration import imu_recording as calibrate_log
 from mstools.calibration import report as calibrate_report
+from mstools.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
+from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
 from mstools.calibration.imu_recording import ImuRecording
 from mstools.calibration.report import AxisNoise, ImuNoise
+from mstools.calibration.sample_ranges import SampleRange, find_stationary_ranges
 from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, write_file

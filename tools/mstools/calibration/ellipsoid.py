@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration import CalibrationError, quadric
 from modelserver.transforms.so3 import Array, Matrix3, Vector3, to_vector3
+from mstools.calibration import CalibrationError, quadric
 
 SECTORS = 12
 """Sectors of 30 degrees in which the directions are counted."""

@@ -10,9 +10,9 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 
-from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
+from mstools.calibration import CalibrationError
 
 MAX_TILT = 0.6
 """Largest angle between the measured up and the geometry's, rad. No vehicle starts on a slope of 35 degrees; the wrong

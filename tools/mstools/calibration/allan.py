@@ -20,8 +20,8 @@ from itertools import groupby
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
+from mstools.calibration import CalibrationError
 
 INSTABILITY_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Allan deviation of bias instability B, divided by B: 0.664."""

@@ -20,8 +20,8 @@ from itertools import combinations_with_replacement
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
+from mstools.calibration import CalibrationError
 
 TUKEY = 4.685
 SPREAD = 1.4826

@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
+from mstools.calibration import CalibrationError
 
 MAX_GAP_PERIODS = 5.0
 """A step of more periods between stamps is a gap. Serial lines deliver unevenly and lose single samples; five in a row
