@@ -25,6 +25,7 @@ from modelserver.estimation.filter.hypothesis_bank import (
     DELAY,
     HEADING,
     SHARE_OF_LIMIT,
+    SHARED,
     WHEEL_SCALE,
     Fault,
     HypothesisBank,
@@ -71,18 +72,6 @@ CERTAIN_SIGMAS: Final = 3.0
 
 SKID_SLIP: Final = 3.0
 """Slip of the wheels of a skid-steered vehicle beside that of others: they slide in every turn."""
-
-_STATES: Final = (
-    hypothesis_bank.EAST,
-    hypothesis_bank.NORTH,
-    HEADING,
-    BIAS,
-    WHEEL_SCALE,
-    DELAY,
-    hypothesis_bank.ERROR,
-    hypothesis_bank.ERROR + 1,
-)
-"""States of a hypothesis that the filter has too."""
 
 
 def can_judge(setup: Setup, state: Aligned, utime: int) -> bool:
@@ -234,13 +223,8 @@ def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
     # fixes have shown the heading, and the allowance for their error decays as others confirm it
     covariance[2, 2] += (state.turns.allowance / START_ERROR) ** 2
     sigma = math.hypot(newest.white, newest.correlated)
-    bank = hypothesis_bank.start_bank(nav.utime, sigma, settings)
-    means, covariances = bank.means.copy(), bank.covariances.copy()
-    prior = covariances[0][np.ix_(_STATES, _STATES)]
-    means[0, _STATES] = values
-    covariances[0][np.ix_(_STATES, _STATES)] = covariance + prior
-    bank = bank._replace(means=means, covariances=covariances, reckoning=predict_path(setup, state))
-    return state._replace(bank=bank)
+    bank = hypothesis_bank.start_bank(nav.utime, sigma, settings, values, covariance)
+    return state._replace(bank=bank._replace(reckoning=predict_path(setup, state)))
 
 
 def _read_fix(setup: Setup, state: Aligned, newest: PathFix) -> PlanarFix:
@@ -262,7 +246,7 @@ def _share(setup: Setup, nav: NavState, newest: PathFix) -> tuple[Array, Array]:
     layout, n = setup.layout, setup.layout.size
     base = nav.point(setup.rig.base)
     x, y, z = so3.rotate(nav.attitude, setup.rig.base)
-    rows = np.zeros((len(_STATES), n))
+    rows = np.zeros((len(SHARED), n))
     rows[0, (0, 7, 8)] = 1.0, z, -y
     rows[1, (1, 6, 8)] = 1.0, -z, x
     rows[2, 8] = rows[3, 11] = 1.0
@@ -291,9 +275,9 @@ def _follow(setup: Setup, state: Aligned) -> Aligned:
     place = nav.position
     nav = heading_alignment.rotate(nav, Rotation(turn, 0.0), setup.layout)._replace(position=place)
     values, rows = _share(setup, nav, newest)
-    change = mean[list(_STATES)] - values
+    change = mean[list(SHARED)] - values
     # each is one element of the error state, in a unit of its own
-    used = [row for row in range(len(_STATES)) if rows[row].any()]
+    used = [row for row in range(len(SHARED)) if rows[row].any()]
     at = [int(np.flatnonzero(rows[row])[0]) for row in used]
     units = np.array([rows[row, n] for row, n in zip(used, at, strict=True)])
     error = np.zeros(setup.layout.size)
@@ -301,7 +285,7 @@ def _follow(setup: Setup, state: Aligned) -> Aligned:
     error[8] = 0.0
     P = nav.covariance.copy()
     P[at, :] = P[:, at] = 0.0
-    target = bank.covariances[bank.published][np.ix_(_STATES, _STATES)]
+    target = bank.covariances[bank.published][np.ix_(SHARED, SHARED)]
     P[np.ix_(at, at)] = target[np.ix_(used, used)] / np.outer(units, units)
     T = np.eye(len(P))
     T[3, 8], T[4, 8] = -nav.velocity[1], nav.velocity[0]

@@ -685,15 +685,22 @@ def _find_level(weights: Array, distances: Array, sigmas: Array, risk: float) ->
     return low
 
 
-def start_bank(utime: int, sigma: float, settings: FilterSettings) -> HypothesisBank:
-    """Return a bank of one hypothesis: what is known of gyro, latency and lever arm before a vehicle drives.
+SHARED: Final = (EAST, NORTH, HEADING, BIAS, WHEEL_SCALE, DELAY, ERROR, ERROR + 1)
+"""States of a hypothesis that the filter has too."""
 
-    `sigma` is that of a fix, m. Pose and ordinary error of fixes are 0 without variance.
+
+def start_bank(utime: int, sigma: float, settings: FilterSettings, values: Array, covariance: Array) -> HypothesisBank:
+    """Return a bank of one hypothesis, before a vehicle drives.
+
+    `sigma` is that of a fix, m; `values` (8) and `covariance` (8, 8) are those of the states SHARED, beside which gyro,
+    latency and lever arm have a variance that no fix has shown yet.
     """
-    P = np.zeros((1, SIZE, SIZE))
+    X, P = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
     arm = max(settings.lever_arm_sigma, ARM_SIGMA_LEAST)
     sigmas = {BIAS: START_BIAS, DELAY: LATENCY_SIGMA, GYRO_SCALE: settings.gyro_scale_sigma, ARM: arm, ARM + 1: arm}
     for at, each in sigmas.items():
         P[0, at, at] = each**2
+    X[0, SHARED] = values
+    P[0][np.ix_(SHARED, SHARED)] += covariance
     none = np.zeros(1, np.int64)
-    return HypothesisBank(utime, np.zeros((1, SIZE)), P, np.ones(1), none, none, none, np.full(1, NEVER), sigma=sigma)
+    return HypothesisBank(utime, X, P, np.ones(1), none, none, none, np.full(1, NEVER), sigma=sigma)

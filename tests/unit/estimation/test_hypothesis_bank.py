@@ -11,8 +11,6 @@ import pytest
 
 from modelserver.estimation.filter.dead_reckoning import DeadReckoning, Increment
 from modelserver.estimation.filter.hypothesis_bank import (
-    ERROR,
-    HEADING,
     Fault,
     HypothesisBank,
     PlanarFix,
@@ -64,11 +62,8 @@ def test_given_a_bias_then_the_moment_has_the_path_that_it_bends() -> None:
 
 def start(heading_sigma: float = 0.05) -> HypothesisBank:
     """Return a bank at the origin, heading east."""
-    bank = start_bank(0, SIGMA, SETTINGS)
-    P = bank.covariances.copy()
-    for at, sigma in ((0, SIGMA), (1, SIGMA), (HEADING, heading_sigma), (ERROR, SIGMA), (ERROR + 1, SIGMA)):
-        P[0, at, at] = sigma**2
-    return bank._replace(covariances=P)
+    variances = (SIGMA**2, SIGMA**2, heading_sigma**2, 0.0, 0.0, 0.0, SIGMA**2, SIGMA**2)
+    return start_bank(0, SIGMA, SETTINGS, np.zeros(8), np.diag(variances))
 
 
 def drive(bank: HypothesisBank, seconds: int, shift: complex = 0j, turn: float = 0.0) -> HypothesisBank:
