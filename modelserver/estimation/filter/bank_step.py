@@ -283,14 +283,11 @@ def _follow(setup: Setup, state: Aligned) -> Aligned:
     error = np.zeros(setup.layout.size)
     error[at] = change[used] / units
     error[8] = 0.0
-    P = nav.covariance.copy()
-    P[at, :] = P[:, at] = 0.0
     target = bank.covariances[bank.published][np.ix_(SHARED, SHARED)]
-    P[np.ix_(at, at)] = target[np.ix_(used, used)] / np.outer(units, units)
-    T = np.eye(len(P))
+    T = np.eye(setup.layout.size)
     T[3, 8], T[4, 8] = -nav.velocity[1], nav.velocity[0]
-    P = T @ P @ T.T
-    nav = nav.inject(error, 0.5 * (P + P.T))
+    nav = nav.forget(at, target[np.ix_(used, used)] / np.outer(units, units)).transform(T)
+    nav = nav.inject(error, nav.covariance)
     common = state.common._replace(epoch=state.common.epoch + 1) if has_moved else state.common
     gnss = state.gnss.place(state.gnss.used_utime)
     sigma = (newest.correlated, newest.correlated, 0.0)

@@ -33,7 +33,7 @@ Read top-down: `NavState` -> `propagate` -> `propagate_covariance` -> `update` -
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache, partial
 from struct import Struct
 from typing import Any, Final, NamedTuple
@@ -169,6 +169,31 @@ class NavState(NamedTuple):
                 *self[8:],
             ),
         )
+
+    def widen(self, variances: Mapping[int, float]) -> NavState:
+        """Return the state with independent errors added: their variances by the index of the element."""
+        P = self.covariance.copy()
+        for at, variance in variances.items():
+            P[at, at] += variance
+        return self._replace(covariance=P)
+
+    def forget(self, elements: slice | Sequence[int], covariance: Array | Sequence[float] = ()) -> NavState:
+        """Return the state with m elements of the error independent of the others.
+
+        Their `covariance` is (m, m), or the variances (m); empty: they are certain.
+        """
+        P = self.covariance.copy()
+        P[elements, :] = P[:, elements] = 0.0
+        if len(covariance):
+            at = np.arange(len(P))[elements]
+            given = np.asarray(covariance)
+            P[np.ix_(at, at)] = np.diag(given) if given.ndim == 1 else given
+        return self._replace(covariance=P)
+
+    def transform(self, T: Array) -> NavState:
+        """Return the state with T (n, n) times its error as the error."""
+        P = T @ self.covariance @ T.T
+        return self._replace(covariance=0.5 * (P + P.T))
 
     def change(self, index: int, amount: float) -> NavState:
         """Return the state with one element of the error changed by an amount, and the others as is expected with it.

@@ -262,12 +262,9 @@ def _is_separate(P: Array, at: int) -> bool:
 
 def release_motion(state: N) -> N:
     """Return the state with the uncertainty of a vehicle whose wheels are stationary, and that is not."""
-    P = state.nav.covariance.copy()
-    for axis, sigma in ((3, HELD_SPEED), (4, HELD_SPEED), (6, HELD_TILT), (7, HELD_TILT), (8, HELD_TURN)):
-        P[axis, axis] += sigma * sigma
-    if state.is_stationary:
-        P[11, 11] += HELD_RATE * HELD_RATE  # ZARU
-    return state._replace(nav=state.nav._replace(covariance=P))
+    rate = HELD_RATE if state.is_stationary else 0.0  # ZARU
+    held = ((3, HELD_SPEED), (4, HELD_SPEED), (6, HELD_TILT), (7, HELD_TILT), (8, HELD_TURN), (11, rate))
+    return state._replace(nav=state.nav.widen({axis: sigma * sigma for axis, sigma in held}))
 
 
 def fuse_measurement(setup: Setup, state: FilterState, item: Item) -> Fused:

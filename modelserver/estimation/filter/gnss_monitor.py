@@ -216,11 +216,8 @@ def inflate_correlated_error(
     if inflation <= 1.0 or seconds <= 0.0:
         return nav
     at = layout.index(CORRELATED_ERROR[0])
-    P = nav.covariance.copy()
     more = (inflation - 1.0) * 2.0 * min(seconds, 2.0) / settings.gps_correlation_time
-    for axis in (at, at + 1, at + 2):
-        P[axis, axis] += more
-    return nav._replace(covariance=P)
+    return nav.widen({at: more, at + 1: more, at + 2: more})
 
 
 def is_continuous(before: PathFix | None, newest: PathFix, settings: FilterSettings) -> bool:

@@ -137,10 +137,7 @@ def _fuse_unaligned(
             if state.is_stationary and not state.common.measures_wheel_speed(newest.utime):
                 # it has set off so smoothly that it seemed stationary
                 speed = abs(newest.position - each.position) / ((newest.utime - each.utime) * 1e-6)
-                P = state.nav.covariance.copy()
-                P[3, 3] += speed**2
-                P[4, 4] += speed**2
-                state = state._replace(nav=state.nav._replace(covariance=P))
+                state = state._replace(nav=state.nav.widen({3: speed**2, 4: speed**2}))
             state = _set_moving(state, newest.utime)
             break
     state = state._replace(site=site, earth=earth, alignment=state.alignment._replace(last_fix=newest))
@@ -403,9 +400,7 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     if abs(angle) > 0.5 * math.pi:
         return state, NOTHING  # it may drive in reverse
     if abs(angle) > 2.0 * math.hypot(sigma, math.sqrt(float(P[8, 8]))):
-        P = P.copy()
-        P[8, :] = P[:, 8] = 0.0
-        turned_nav = heading_alignment.rotate(nav._replace(covariance=P), Rotation(angle, sigma), setup.layout)
+        turned_nav = heading_alignment.rotate(nav.forget([8]), Rotation(angle, sigma), setup.layout)
         # fixes show the velocity, whatever the heading
         state = state._replace(nav=turned_nav._replace(position=nav.position, velocity=nav.velocity))
     common = state.common._replace(epoch=state.common.epoch + 1)

@@ -379,34 +379,20 @@ def place(nav: NavState, fix: PathFix, displacement: complex, lever: Vector3, la
     latency = nav.extras[layout.extra_index(LATENCY)]
     antenna = fix.position + displacement + latency * complex(vx, vy)
     position = (antenna.real - arm[0], antenna.imag - arm[1], fix.up - arm[2])
-    P = nav.covariance.copy()
-    n = len(P)
-    latency_at = layout.index(LATENCY)
+    variance_of, latency_at, at = nav.covariance.item, layout.index(LATENCY), layout.index(CORRELATED_ERROR[0])
     # second order: the product of latency and velocity, both unknown
-    second = [P[latency_at, latency_at] * P[k, k] for k in (3, 4)]
-    P[0:3, :] = 0.0
-    P[:, 0:3] = 0.0
-    at = layout.index(CORRELATED_ERROR[0])
-    P[at : at + 3, :] = 0.0
-    P[:, at : at + 3] = 0.0
+    second = [variance_of(latency_at, latency_at) * variance_of(k, k) for k in (3, 4)]
     # p = antenna - R lever + latency v: an error of attitude moves p by -theta x (R lever) = [arm]x theta
-    L = np.zeros((3, n))
-    L[:, 6:9] = so3.skew(arm)
-    L[:2, latency_at] = vx, vy
-    P[0:3, :] += L @ P
-    P[:, 0:3] += P @ L.T
-    correlated = (fix.correlated, fix.correlated, fix.up_sigma)
-    white = (fix.white, fix.white, 0.5 * fix.up_sigma)
-    for axis in range(3):
-        P[axis, axis] += correlated[axis] ** 2 + white[axis] ** 2
-        P[axis, at + axis] = P[at + axis, axis] = -correlated[axis]
-        P[at + axis, at + axis] = 1.0
-    P[0, 0] += second[0]
-    P[1, 1] += second[1]
+    T = np.eye(layout.size)
+    T[0:3, 6:9] = so3.skew(arm)
+    T[:2, latency_at] = vx, vy
+    T[range(3), range(at, at + 3)] = -fix.correlated, -fix.correlated, -fix.up_sigma
+    nav = nav.forget(slice(0, 3)).forget(slice(at, at + 3), np.ones(3)).transform(T)
+    nav = nav.widen({0: second[0] + fix.white**2, 1: second[1] + fix.white**2, 2: 0.25 * fix.up_sigma**2})
     extras = list(nav.extras)
     for name in CORRELATED_ERROR:
         extras[layout.extra_index(name)] = 0.0
-    return nav._replace(position=position, covariance=0.5 * (P + P.T), extras=tuple(extras))
+    return nav._replace(position=position, extras=tuple(extras))
 
 
 def set_speed(nav: NavState, speed: float, sigma: float) -> NavState:
@@ -470,10 +456,6 @@ def reconcile_latency(nav: NavState, fit: LatencyFit | None, layout: ErrorLayout
     difference = fit.seconds - nav.extras[extra]
     if abs(difference) <= LATENCY_SIGMAS * math.hypot(math.sqrt(nav.covariance[at, at]), fit.sigma):
         return nav
-    P = nav.covariance.copy()
-    P[at, :] = 0.0
-    P[:, at] = 0.0
-    P[at, at] = difference**2 + fit.sigma**2
     extras = list(nav.extras)
     extras[extra] += 0.5 * difference
-    return nav._replace(covariance=P, extras=tuple(extras))
+    return nav.forget([at], [difference**2 + fit.sigma**2])._replace(extras=tuple(extras))

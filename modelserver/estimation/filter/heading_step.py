@@ -204,10 +204,8 @@ def lose_heading(state: Aligned) -> Unaligned:
     nav = state.nav
     T = np.eye(len(nav.covariance))
     T[3, 8], T[4, 8] = nav.velocity[1], -nav.velocity[0]
-    P = T @ nav.covariance @ T.T
-    P[8, :] = P[:, 8] = 0.0
     return Unaligned(
-        nav._replace(covariance=P),
+        nav.transform(T).forget([8]),
         state.imu,
         state.stationary,
         state.reckoning,
@@ -382,10 +380,6 @@ def _set_pose(
     assert not isinstance(again, str)
     x, y, z = nav.position
     a, b, c = again.residual[:3].tolist()
-    P = nav.covariance.copy()
-    P[0:3, :] = 0.0
-    P[:, 0:3] = 0.0
-    P[0:3, 0:3] = again.noise[:3, :3]
-    nav = nav._replace(position=(x + a, y + b, z + c), covariance=P)
+    nav = nav.forget(slice(0, 3), again.noise[:3, :3])._replace(position=(x + a, y + b, z + c))
     aligned = _align(state, nav, site, GnssMonitor(last_fix=state.alignment.last_fix))
     return aligned, (report_reset(item, "position and heading were set"),)

@@ -141,9 +141,7 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
     lag = nav.lag
     if lag >= eskf.COVARIANCE_STEP:
         nav = eskf.propagate_covariance(nav, propagation.select_noise(setup, state, nav), setup.layout)
-        P = nav.covariance.copy()
-        P[11, 11] += settings.gyro_bias_walk**2 * lag
-        nav = nav._replace(covariance=P)
+        nav = nav.widen({11: settings.gyro_bias_walk**2 * lag})
     reckoning = propagation.follow_gyro(setup, state.reckoning, utime, rate)
     state = state._replace(nav=nav, imu=imu, stationary=detector, reckoning=reckoning)
     if not (
@@ -235,13 +233,10 @@ def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float
     P = nav.covariance
     if time < CHANGED_TIME or np.all(change**2 < CHANGED_SIGMAS**2 * (np.diagonal(P)[9:12] + variance)):
         return state, NOTHING
-    P = P.copy()
-    P[9:12, :] = P[:, 9:12] = 0.0
     # the mean may be from before it too
-    P[[9, 10, 11], [9, 10, 11]] = change**2 + variance
+    nav = nav.forget(slice(9, 12), change**2 + variance)._replace(gyro_bias=to_vector3(turn / time))
     if isinstance(state, Aligned):
-        P[8, 8] += max(UNNOTICED_TIME * abs(change[2]), state.turns.allowance) ** 2
-    nav = nav._replace(gyro_bias=to_vector3(turn / time), covariance=P)
+        nav = nav.widen({8: max(UNNOTICED_TIME * abs(change[2]), state.turns.allowance) ** 2})
     state = state._replace(nav=nav, constraints=rest._replace(rest_turn=ZERO, rest_time=0.0))
     text = f"the bias of a gyro has changed by {math.degrees(np.abs(change).max()):.2f} deg/s"
     return state, (report_event(state, constraints.ZERO_RATE, Verdict.RESET, text),)
