@@ -234,12 +234,9 @@ def hold_bias(before: NavState, after: NavState, axes: tuple[int, ...] = (11,)) 
 
     8 among them: with the heading of before too.
     """
-    P = after.covariance.copy()
-    for axis in axes:
-        P[axis, axis] = max(P[axis, axis], before.covariance[axis, axis])
-    if 8 in axes:
-        after = after.change(8, wrap_angle(before.yaw - after.yaw))
-    return after.change(11, before.gyro_bias[2] - after.gyro_bias[2])._replace(covariance=P)
+    lost = {axis: max(before.covariance.item(axis, axis) - after.covariance.item(axis, axis), 0.0) for axis in axes}
+    nav = after.change(8, wrap_angle(before.yaw - after.yaw)) if 8 in axes else after
+    return nav.change(11, before.gyro_bias[2] - nav.gyro_bias[2]).widen(lost)
 
 
 def hold_latency(before: NavState, after: NavState, layout: ErrorLayout) -> NavState:

@@ -170,17 +170,14 @@ def start_from(setup: Setup, first: Leveling, last: Estimate, before: Estimate) 
     along = moved[0] / dt if dt > 0.0 else 0.0
     nav = create_nav(setup, last.utime, pose.wxyz, LEVEL_SIGMA, settings.course_speed, ZERO, settings.gyro_bias_sigma)
     arm = so3.rotate(pose.wxyz, rig.imu)
-    P = nav.covariance.copy()
-    stated = np.array(last.covariance).reshape(6, 6)
-    P[0:3, 0:3] = np.diag(np.diagonal(stated)[:3])
-    P[6:9, 6:9] = np.diag(np.maximum(np.diagonal(stated)[3:], 1e-4))
+    stated = np.diagonal(np.array(last.covariance).reshape(6, 6))
+    nav = nav.forget(slice(0, 3), stated[:3]).forget(slice(6, 9), np.maximum(stated[3:], 1e-4))
     x, y, z = pose.xyz
     latitude, _, height = geodetic_from_ecef(geodesy.tangent.ecef)
     return Aligned(
         nav._replace(
             position=(x + arm[0], y + arm[1], z + arm[2]),
             velocity=so3.rotate(pose.wxyz, (along, 0.0, 0.0)),
-            covariance=P,
         ),
         ImuMonitor(used_utime=last.utime),
         first.stationary,
