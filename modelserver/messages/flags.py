@@ -39,7 +39,7 @@ _INVALID_TEXT = {
     Invalid.NOT_MOVED_YET: "heading is not known before the vehicle moves",
     Invalid.STATIONARY_HEADING: "stationary for too long, the heading has drifted",
     Invalid.STALE_GPS: "the last usable GPS fix is too old",
-    Invalid.STALE_IMU: "the last inertial sample is too old",
+    Invalid.STALE_IMU: "the last usable inertial sample is too old",
     Invalid.GPS_REJECTED: "GPS fixes arrive but are rejected",
     Invalid.LIMIT_EXCEEDED: "the error may be beyond the limit: that is more probable than 0.01",
     Invalid.CLOCK_STEPPED: "the clock stepped, localization restarts at the new time",

@@ -34,6 +34,7 @@ from modelserver.estimation.filter.hypothesis_bank import (
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
+from modelserver.estimation.filter.propagation import OUTAGE_US
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_longest_variance
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, N, Navigating, Unaligned
@@ -127,7 +128,7 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
     )
     fix = None if newest is None else _read_fix(setup, state, newest)
     after = bank.advance(utime, step, fix, setup.settings, _get_slip(setup))._replace(reckoning=now)
-    after = after.judge_fixes(output.get_limits(setup, state)[0])
+    after = after.judge_fixes(output.get_limits(setup, state)[0], is_outage=_ends_outage(state))
     state = state._replace(bank=after)
     if after.may_be_transported and abs(after.rest_turn) > TURNED:
         state = suspect_wheels(setup, state)
@@ -142,7 +143,36 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
         state = state._replace(gnss=state.gnss.restart(utime))
         text = "fixes are trusted again: they agree with dead reckoning"
         return state, (report_event(state, KIND, Verdict.USED, text),)
-    return _correct(setup, state, bank)
+    return _correct(setup, _suspect_path(setup, state, newest), bank)
+
+
+def _ends_outage(state: Aligned) -> bool:
+    """Return whether fixes are the first ones after a while."""
+    rejected = state.gnss.rejected
+    first = rejected[0].utime if rejected else state.nav.utime
+    return first - state.gnss.used_utime >= OUTAGE_US
+
+
+def _suspect_path(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
+    """Return the state after a fix that is not used; those with the shape of the path may be right, and it was lost."""
+    bank, settings = state.bank, setup.settings
+    assert bank is not None
+    reckoning = bank.reckoning
+    lever = newest.arm * cmath.rect(1.0, -state.nav.yaw)
+    path = reckoning.path + cmath.rect(1.0, reckoning.heading) * lever
+    gnss = state.gnss.reject(newest._replace(path=path), settings, is_speed_measured=True)
+    state = state._replace(gnss=gnss)
+    fit = gnss.fit_rejected(state.nav, settings)
+    if fit is None:
+        return state
+    heading = wrap_angle(fit.rotation.angle + reckoning.heading)
+    _, limit = output.get_limits(setup, state)
+    turned = abs(wrap_angle(heading - bank.pose[2]))
+    if turned < max(limit, CERTAIN_SIGMAS * fit.rotation.sigma) and not bank.may_be_lost:
+        return state  # fixes that are off by a constant, or drift slowly, look the same
+    place = newest.position - cmath.rect(1.0, heading) * lever
+    bank = bank.suspect_path(state.nav.utime, (place.real, place.imag, heading), fit.rotation.sigma, settings)
+    return state._replace(bank=bank)
 
 
 def distrust_path(setup: Setup, state: Aligned) -> Aligned:
@@ -210,7 +240,7 @@ def _correct(setup: Setup, state: Aligned, before: HypothesisBank) -> tuple[Alig
     if not text:
         return state, ()
     # fixes that are off by the hypothesis that the state is set to would move it away again
-    bank = bank.judge_fixes(limits[0], least=0.0)
+    bank = bank.judge_fixes(limits[0], least=0.0, is_outage=_ends_outage(state))
     state = _judge(setup, _follow(setup, state._replace(bank=bank)))
     return state, (report_event(state, KIND, Verdict.RESET, text),)
 

@@ -160,6 +160,10 @@ SHARE_OF_LIMIT: Final = 0.2
 PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
+LOST_SHARE, LOST_AFTER_OUTAGE = 1e-3, 0.1
+"""Probability that dead reckoning was lost where fixes that are off have the shape of its path, turned, and after an
+outage: gyro and wheels fail as often as fixes jump in ten outages of a minute."""
+
 OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
 """Meters that a vehicle has driven by itself, and standard deviations of a rate at which fixes go on to drift then, so
 that it is not transported."""
@@ -248,6 +252,7 @@ class HypothesisBank(NamedTuple):
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
     may_be_transported: whether that began while the vehicle was at rest: a ferry or a trailer may move it.
+    may_be_lost: whether that began with the first fixes after an outage: dead reckoning may be wrong.
     reckoning: dead reckoning at `utime`.
     """
 
@@ -269,6 +274,7 @@ class HypothesisBank(NamedTuple):
     settled: Fault = Fault.NONE
     excludes_fixes: bool = False
     may_be_transported: bool = False
+    may_be_lost: bool = False
     reckoning: DeadReckoning = DeadReckoning()
 
     @property
@@ -288,11 +294,11 @@ class HypothesisBank(NamedTuple):
         n = self.published
         return bool(self.faults[n] or self.jumped[n] or not self.weights[n] > CERTAIN)
 
-    def judge_fixes(self, limit: float, least: float = SETTLED) -> HypothesisBank:
+    def judge_fixes(self, limit: float, *, least: float = SETTLED, is_outage: bool = False) -> HypothesisBank:
         """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
 
         They are not once they are certain to be off (with a weight of `least`), by a share of the limit that matters;
-        that lasts as long as the published hypothesis has them off.
+        that lasts as long as the published hypothesis has them off. `is_outage`: whether no fix was used for a while.
         """
         off = (self.jumped > 0) | (self.faults == Fault.DRIFT) | (self.faults == Fault.SPOOFING)
         excludes = bool(off[self.published])
@@ -306,7 +312,37 @@ class HypothesisBank(NamedTuple):
             x, P = self.means[self.published], self.covariances[self.published]
             variance = max(P[DRIFT, DRIFT], P[DRIFT + 1, DRIFT + 1])
             may_be_transported &= math.hypot(x[DRIFT], x[DRIFT + 1]) < DRIFT_SIGMAS * math.sqrt(variance)
-        return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported)
+        may_be_lost = excludes and (self.may_be_lost if self.excludes_fixes else is_outage)
+        return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported, may_be_lost=may_be_lost)
+
+    def suspect_path(
+        self, utime: int, pose: tuple[float, float, float], heading_sigma: float, settings: FilterSettings
+    ) -> HypothesisBank:
+        """Return the bank beside the hypothesis that dead reckoning was lost, and that fixes are right.
+
+        `pose` is the one that fixes show: east, north (m), heading (rad). It is a fault of the gyro, and one at a time.
+        """
+        share = LOST_AFTER_OUTAGE if self.may_be_lost else LOST_SHARE
+        if self.weights[(self.faults == Fault.GYRO) & (self.jumped == 0)].sum() > share:
+            return self
+        mean, P = self.means[self.published].copy(), np.zeros((SIZE, SIZE))
+        mean[:3] = pose
+        mean[ERROR:] = 0.0
+        variances = np.diagonal(self.covariances[self.published]).copy()
+        variances[[EAST, NORTH, ERROR, ERROR + 1]] = self.sigma**2
+        variances[HEADING] = heading_sigma**2
+        variances[BIAS] += (0.5 * settings.gyro_bias_step) ** 2
+        variances[ERROR_RATE:] = 0.0
+        P[np.diag_indices(SIZE)] = variances
+        return self._replace(
+            means=np.concatenate((self.means, mean[None])),
+            covariances=np.concatenate((self.covariances, P[None])),
+            weights=np.append(self.weights * (1.0 - share), share),
+            faults=np.append(self.faults, Fault.GYRO),
+            jumped=np.append(self.jumped, 0),
+            noises=np.append(self.noises, 0),
+            onsets=np.append(self.onsets, utime),
+        )
 
     @property
     def offset(self) -> complex:
@@ -586,6 +622,7 @@ class HypothesisBank(NamedTuple):
             sigma=self.sigma,
             excludes_fixes=self.excludes_fixes,
             may_be_transported=self.may_be_transported,
+            may_be_lost=self.may_be_lost,
             reckoning=self.reckoning,
         )
         return bank._select()

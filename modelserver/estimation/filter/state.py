@@ -259,7 +259,8 @@ class Aligned(NamedTuple):
 
     def end_bank(self) -> Aligned:
         """Return the state without its bank, whose path was wrong or is not measured any more."""
-        return self._replace(bank=None, bounds=None)
+        gnss = self.gnss._replace(rejected=(), num_rejected=0)  # beside the path of the bank
+        return self._replace(bank=None, bounds=None, gnss=gnss)
 
     def with_nav(self, nav: NavState) -> Aligned:
         """Return the state propagated to a later instant."""

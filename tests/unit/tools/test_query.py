@@ -377,7 +377,7 @@ def test_given_a_world_pose_then_people_see_time_grid_bounds_and_what_speaks_aga
     assert "protection      1.50 m, heading 5.73 deg" in text
     assert "flags           PREDICTED" in text
     assert "epoch           3, origin 0000000000000abc" in text
-    assert text.splitlines()[-1].startswith("  NOT VALID       the last usable GPS fix is too old; the last inertial")
+    assert text.splitlines()[-1].startswith("  NOT VALID       the last usable GPS fix is too old; the last usable inertial")
 
 
 def test_given_a_world_pose_then_scripts_see_the_same() -> None:
