@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pytest
 from support_shared import SameObject, freeze, run_shared, share
 
 from modelserver.earth.geodesy import origin_at
@@ -33,7 +32,6 @@ from modelserver.simulation import (
     WheelsModel,
 )
 from modelserver.transforms.pose import Pose
-from modelserver.version import is_filter_compiled
 
 ORIGIN = origin_at(50.27, -111.18, 700.0)
 WHEELS = {"left": "Car:Left", "right": "Car:Right"}
@@ -83,12 +81,6 @@ def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential"
 
 
 RIG = rig()
-
-
-def skip_if_compiled() -> None:
-    """Skip a test that replaces a constant or function of a module that is compiled: its own code would not see it."""
-    if is_filter_compiled():
-        pytest.skip("the filter is compiled, and its modules cannot be patched")
 
 
 def simulation(

@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
-from modelserver.version import __version__, is_filter_compiled
+from modelserver.version import __version__
 from mstools.terminal.output import escape, print_problems
 from mstools.terminal.problems import suggest_path
 
@@ -184,7 +184,7 @@ def _stub() -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"modelserver {__version__}{' (compiled filter)' if is_filter_compiled() else ''}")
+        typer.echo(f"modelserver {__version__}")
         raise typer.Exit
 
 
@@ -193,7 +193,7 @@ def _options(
         bool,
         typer.Option(
             "--version",
-            help="Print the version, and whether the filter is compiled.",
+            help="Print the version.",
             callback=_show_version,
             is_eager=True,
         ),

@@ -51,8 +51,7 @@ from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
 
 KalmanFilter: Final = import_kalman_filter()
 
-ZERO: Vector3 = (0.0, 0.0, 0.0)
-"""Not Final: the compiled build could not read it, see `tools/wheel_hook.py`."""
+ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
 
 STANDARD_GRAVITY: Final = 9.80665
 EARTH_RADIUS: Final = 6_371_000.0

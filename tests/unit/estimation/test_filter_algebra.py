@@ -11,7 +11,6 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from scipy import stats
 from support_cart import rig, some_nav
-from support_filter import skip_if_compiled
 
 from modelserver.estimation.filter import eskf, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN, ErrorLayout, ErrorState
@@ -68,7 +67,6 @@ def create_covariance(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def predict(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """Return the covariance that the filter propagates with given matrices instead of those of its state."""
-    skip_if_compiled()
     nav = some_nav(SETUP, 1)._replace(covariance=P, lag=0.1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(eskf, "_transition_matrix", lambda *_: F)

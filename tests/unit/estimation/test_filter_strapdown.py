@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_nav
-from support_filter import skip_if_compiled
 
 from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.dead_reckoning import DeadReckoning
@@ -37,7 +36,6 @@ def earth_here() -> Earth:
 
 @pytest.mark.slow
 def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_position_is_right_to_a_centimeter(monkeypatch):
-    skip_if_compiled()
     # the simulator's vertical is that of the origin everywhere
     monkeypatch.setattr(eskf, "EARTH_RADIUS", 1e15)
     terrain = Terrain(0.05, -0.03, (Wave(0.8, 30.0, 0.4), Wave(0.3, 17.0, -1.0, 1.0)))

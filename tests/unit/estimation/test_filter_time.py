@@ -14,7 +14,6 @@ from hypothesis import Phase as Step
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support_cart import MOUNTS, ORIGIN, drive, localizer, process_all, rig, same
-from support_filter import skip_if_compiled
 
 from modelserver.estimation.filter.fusion import split_sample
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
@@ -155,7 +154,6 @@ def test_given_a_sample_twice_then_the_second_is_rejected_whatever_its_sequence_
 
 
 def test_given_more_items_than_a_horizon_can_hold_then_delayed_ones_are_rejected(monkeypatch):
-    skip_if_compiled()
     monkeypatch.setattr("modelserver.estimation.filter.timeline.MAX_ITEMS", 10)
     samples = select_events(WARM, WARM + CHUNK)
     done = process_all(drive_until_aligned(), [each for each in samples if isinstance(each, ImuSample)])

@@ -16,7 +16,6 @@ from support_samples import GEOMETRY
 from modelserver import __version__
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality
 from modelserver.transforms import Pose, Transformation
-from modelserver.version import is_filter_compiled
 from mstools.cli import COMMANDS, main
 from mstools.commands.query import as_dict, describe
 
@@ -277,8 +276,7 @@ def test_given_wrong_usage_then_exit_is_2_and_the_way_to_help_is_reported(run: C
 
 
 def test_given_version_then_it_is_printed(run: Command) -> None:
-    build = " (compiled filter)" if is_filter_compiled() else ""
-    assert run("--version") == (0, f"modelserver {__version__}{build}\n", "")
+    assert run("--version") == (0, f"modelserver {__version__}\n", "")
 
 
 def test_given_help_then_every_command_is_listed_with_its_summary(run: Command) -> None:
@@ -377,7 +375,9 @@ def test_given_a_world_pose_then_people_see_time_grid_bounds_and_what_speaks_aga
     assert "protection      1.50 m, heading 5.73 deg" in text
     assert "flags           PREDICTED" in text
     assert "epoch           3, origin 0000000000000abc" in text
-    assert text.splitlines()[-1].startswith("  NOT VALID       the last usable GPS fix is too old; the last usable inertial")
+    assert text.splitlines()[-1].startswith(
+        "  NOT VALID       the last usable GPS fix is too old; the last usable inertial"
+    )
 
 
 def test_given_a_world_pose_then_scripts_see_the_same() -> None:
