@@ -1,25 +1,22 @@
 #!/usr/bin/env python3
-"""Regenerate what follows from the wire contract: `make types`.
+"""Write the Python that follows from lcmtypes/*.lcm: the package mslcm, the values and their codec, and contract.lock.
 
-lcmtypes/mslcm and lcmtypes/contract.lock come from lcmtypes/*.lcm.
+A build or an installation runs it (`wheel_hook.py`); after a change of an .lcm file, `make types` does.
 """
 
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import message_generator
 
-from mstools.spy.lcm_wheel import find_binary
-
 ROOT = Path(__file__).resolve().parent.parent
-TYPES = ROOT / "lcmtypes"
 
 LOCK_HEADER = """\
 # The wire contract: every type and its fingerprint, which lcm-gen computes from the names, types and sizes of
@@ -34,8 +31,11 @@ LOCK_HEADER = """\
 
 def generate(types: Path, folder: Path) -> None:
     """Write the Python package mslcm of the .lcm files in `types` into `folder`."""
-    files = sorted(types.glob("*.lcm"))
-    subprocess.run([find_binary("lcm-gen"), "--python", "--ppath", folder, *files], check=True)
+    spec = find_spec("lcm")
+    if spec is None or spec.origin is None:
+        raise RuntimeError("the package lcm, which has lcm-gen, is missing: pip install lcm")
+    program = Path(spec.origin).resolve().parent.parent / "bin" / "lcm-gen"
+    subprocess.run([program, "--python", "--ppath", folder, *sorted(types.glob("*.lcm"))], check=True)
 
 
 def read_fingerprints(folder: Path, names: Iterable[str]) -> dict[str, str]:
@@ -61,38 +61,31 @@ def read_lock(text: str) -> dict[str, str]:
     return dict(re.findall(r"^(\w+) 0x([0-9a-f]{16})$", text, re.MULTILINE))
 
 
-def generate_modules(types: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
-    """Return the formatted text of each generated Python module by its path in the repository."""
-    texts = message_generator.generate(types, fingerprints)
-    return {path: format_python(text, path) for path, text in texts.items()}
-
-
-def format_python(text: str, path: str) -> str:
-    """Return Python code without unused imports, with sorted ones, formatted."""
-    for command in (("check", "--fix-only", "--quiet"), ("format", "--quiet")):
-        ruff = [sys.executable, "-m", "ruff", *command, "--stdin-filename", str(ROOT / path), "-"]
-        text = subprocess.run(ruff, input=text, capture_output=True, text=True, check=True).stdout
-    return text
+def write(root: Path) -> dict[str, str]:
+    """Write all modules below the repository `root`, and return the fingerprints; files that are right stay."""
+    types = root / "lcmtypes"
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        generate(types, folder)
+        fingerprints = read_fingerprints(folder, [path.stem for path in sorted(types.glob("*.lcm"))])
+        texts = {f"lcmtypes/mslcm/{path.name}": path.read_text("utf-8") for path in (folder / "mslcm").glob("*.py")}
+    for path in (types / "mslcm").glob("*.py"):
+        if f"lcmtypes/mslcm/{path.name}" not in texts:
+            path.unlink()
+    for name, text in (texts | message_generator.generate(types, fingerprints)).items():
+        path = root / name
+        if not path.is_file() or path.read_text("utf-8") != text:
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return fingerprints
 
 
 def main() -> int:
-    """Write all files, and print the changes of the contract."""
-    names = [path.stem for path in sorted(TYPES.glob("*.lcm"))]
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        generate(TYPES, folder)
-        fingerprints = read_fingerprints(folder, names)
-        fresh = {path.name for path in (folder / "mslcm").glob("*.py")}
-        for path in (TYPES / "mslcm").glob("*.py"):
-            if path.name not in fresh:
-                path.unlink()
-        for name in fresh:
-            shutil.copyfile(folder / "mslcm" / name, TYPES / "mslcm" / name)
-    lock = TYPES / "contract.lock"
+    """Write all files and contract.lock, and print the changes of the contract."""
+    fingerprints = write(ROOT)
+    lock = ROOT / "lcmtypes" / "contract.lock"
     before = read_lock(lock.read_text(encoding="utf-8")) if lock.exists() else {}
     lock.write_text(format_lock(fingerprints), encoding="utf-8")
-    for path, text in generate_modules(TYPES, fingerprints).items():
-        (ROOT / path).write_text(text, encoding="utf-8")
     for name in sorted(before.keys() | fingerprints.keys()):
         if before.get(name) != fingerprints.get(name):
             print(f"{name}: {before.get(name, 'new')} -> {fingerprints.get(name, 'removed')}")

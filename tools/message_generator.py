@@ -718,7 +718,7 @@ def _docstring(text: str, indent: str) -> str:
 
 
 def generate(folder: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
-    """Return the text of each generated module by its path in the repository, not formatted yet.
+    """Return the text of each generated module by its path in the repository.
 
     Parameters
     ----------
@@ -736,7 +736,6 @@ def generate(folder: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
 
 
 def _values_module(body: str) -> str:
-    # the formatter removes the imports that are not used
     return (
         '"""Values of the messages. Generated from lcmtypes/*.lcm by `make types`; do not edit."""\n\n'
         "from __future__ import annotations\n\n"
