@@ -381,7 +381,9 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     if state.common.measures_wheel_speed(nav.utime):
         return state._replace(turns=before.append(node)), NOTHING
     noise = propagation.select_noise(setup, state, nav).yaw
-    turns = before.compare(node, noise, settings.gyro_bias_walk**2, math.hypot(*nav.velocity))
+    is_at_rest = state.common.wheels.is_suspect
+    speed = math.hypot(*nav.velocity)
+    turns = before.compare(node, noise, settings.gyro_bias_walk**2, speed, is_at_rest=is_at_rest)
     state = state._replace(turns=turns)
     if turns.suspect is None:
         if not before.is_transported:
@@ -393,7 +395,7 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
         text = f"the vehicle moves {turned:.0f} deg beside its own axis"
         return state, (report_event(state, bank_step.KIND, Verdict.RESET, text),)
     shown = turns.find_own_course()
-    if shown is None:
+    if shown is None or is_at_rest:
         return state, NOTHING
     heading, sigma = shown
     angle = wrap_angle(heading - nav.yaw)

@@ -130,6 +130,9 @@ START_BIAS: Final = 0.003
 """Standard deviation of the bias of a gyro beside what alignment has shown, rad/s: what it changes by while warming up.
 """
 
+REST_TURN_TIME: Final = 60.0
+"""Seconds in which a turn at rest fades: by then the bias is off by a tenth of what matters."""
+
 TURNING_RATE: Final = 0.03
 CONSTANT_RATE: Final = 0.005
 """Rate of a vehicle that begins to turn, rad/s, and by what that of one at rest differs from step to step: the noise of
@@ -247,7 +250,7 @@ class HypothesisBank(NamedTuple):
     inflation: of the white noise of fixes, learned, 1 to 4.
     rest_rate: mean turn rate of the step before, rad/s, of a vehicle at rest; nan: it was not.
     rest_bias, rest_turn: of a vehicle whose wheels are at rest, the gyro's bias when that began, rad/s, and the turn
-        since, rad; nan: they are not, and the vehicle has `driven` some m since.
+        of the last minute since, rad; nan: they are not, and the vehicle has `driven` some m since.
     sigma: of the last fix, m.
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
@@ -376,7 +379,8 @@ class HypothesisBank(NamedTuple):
         rest_bias, rest_turn, driven = math.nan, 0.0, self.driven + step.driven
         if step.are_wheels_stationary:
             rest_bias = bias if math.isnan(self.rest_bias) else self.rest_bias
-            rest_turn, driven = self.rest_turn + step.turn - rest_bias * seconds, 0.0
+            faded = math.exp(-seconds / REST_TURN_TIME) * self.rest_turn
+            rest_turn, driven = faded + step.turn - rest_bias * seconds, 0.0
         rest_rate = rate if rests else math.nan
         bank = bank._reduce(utime)
         return bank._replace(rest_rate=rest_rate, rest_bias=rest_bias, rest_turn=rest_turn, driven=driven)

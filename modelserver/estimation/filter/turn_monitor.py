@@ -123,11 +123,13 @@ class TurnMonitor(NamedTuple):
         error = START_ERROR if is_measured else UNMEASURED_START_ERROR
         return self._replace(allowance=max(self.allowance, math.atan2(error * fix_sigma, distance)))
 
-    def compare(self, node: TurnNode, heading_noise: float, bias_noise: float, speed: float) -> TurnMonitor:
+    def compare(
+        self, node: TurnNode, heading_noise: float, bias_noise: float, speed: float, *, is_at_rest: bool = False
+    ) -> TurnMonitor:
         """Return the monitor after a fix.
 
         The densities of the random walks are those of the heading, rad2/s, and of the yaw gyro's bias, rad2/s3; `speed`
-        is the vehicle's, m/s.
+        is the vehicle's, m/s. `is_at_rest`: its wheels are, so what transports it has not ended.
         """
         last = self.newest[-1] if self.newest else None
         if last is not None and node.utime - last.utime > MAX_GAP_US and self.suspect is None:
@@ -146,7 +148,7 @@ class TurnMonitor(NamedTuple):
             unexplained = abs(find_turn(self.suspect, node))
             if unexplained < ALLOWED * _get_turn_sigma(self.suspect, node, heading_noise, bias_noise):
                 agreed_utime = self.agreed_utime or node.utime
-            if agreed_utime and node.utime - agreed_utime > AGREEMENT_US:
+            if agreed_utime and node.utime - agreed_utime > AGREEMENT_US and not is_at_rest:
                 return TurnMonitor(newest=(node,), allowance=unexplained, compared_utime=node.utime)
         elif 0 < num_exceeded < CONFIRMATIONS:
             return self._replace(num_exceeded=num_exceeded)  # outliers do not widen the level

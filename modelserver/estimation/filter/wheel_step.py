@@ -39,7 +39,7 @@ from modelserver.estimation.filter.measurements.wheels import (
 )
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample, Unaligned
 from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
 from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
 from modelserver.transforms import so3
@@ -191,6 +191,9 @@ def _judge(
     if judged.is_suspect == wheels.is_suspect:
         return state, NOTHING
     if not judged.is_suspect:
+        if isinstance(state, Unaligned):
+            # what carried it may have turned it
+            state = state._replace(alignment=state.alignment._replace(fixes=()))
         return state, (report_event(state, item.kind, Verdict.USED, "the wheels measure the speed again"),)
     if state.is_stationary or judged.has_held:
         state = release_motion(state)

@@ -121,7 +121,8 @@ def test_given_fixes_that_move_away_from_wheels_at_rest_then_the_vehicle_may_be_
 
     assert bank.excludes_fixes
     assert bank.may_be_transported
-    assert bank.rest_turn == pytest.approx(40.0 * turn, abs=0.1)
+    # of the last minute
+    assert bank.rest_turn == pytest.approx(60.0 * turn * (1.0 - math.exp(-40.0 / 60.0)), abs=0.1)
 
 
 def test_given_fixes_that_drift_on_while_it_drives_then_the_vehicle_is_not_transported():
