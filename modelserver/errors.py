@@ -4,11 +4,11 @@ A message states what is wrong, where, what was expected, and what to do. `Probl
 ConfigError and GeometryError hold all of them. A QueryError has a `Status`, the wire's code, from which the client
 raises the same class again.
 
-Suggestions have two strengths. `find_nearest_names` lists similar names for a person (difflib's ratio, 2 M / (a + b),
-at least 0.6). `find_suggestion` returns the one name that is meant, or none: the optimal string alignment distance (one
-insertion, deletion, substitution, or transposition of neighbors per step) is at most 1 for names of up to six
-characters, else 2, and the nearest name is unique. Names come from strangers too, so the cost is bounded: from many
-known names those that share the most bigrams with the wanted one are compared.
+Suggestions have two strengths, both by difflib's ratio, 2 M / (a + b) for M equal characters. `find_nearest_names`
+lists similar names for a person (at least `MIN_RATIO`). `find_suggestion` returns the one name that is meant, or none:
+of the longer of the two names at most one character is not equal for names of up to six characters, else two, and the
+nearest name is unique. Names come from strangers too, so the cost is bounded: from many known names those that share
+the most bigrams with the wanted one are compared.
 """
 
 from __future__ import annotations
@@ -160,6 +160,9 @@ def has_error(problems: Iterable[Problem]) -> bool:
     return any(each.severity is Severity.ERROR for each in problems)
 
 
+MIN_RATIO = 0.6
+"""Names with a lower ratio are not similar."""
+
 MAX_KNOWN_NAMES = 20_000
 MAX_COMPARED_LENGTH = 100
 MAX_COMPARED_NAMES = 16
@@ -172,31 +175,40 @@ def find_nearest_names(name: str, known: Iterable[str], count: int = 3) -> tuple
 
     Names longer than 100 characters are not compared. 10,000 known names take about 10 ms.
     """
+    return tuple(each for _, each in _rank_names(name, known)[:count])
+
+
+def _rank_names(name: str, known: Iterable[str]) -> list[tuple[float, str]]:
+    """Return the similar known names, best first, each after its ratio."""
     if not name or len(name) > MAX_COMPARED_LENGTH:
-        return ()
+        return []
+    # names that differ more than this in length cannot reach the ratio
+    shortest, longest = len(name) * MIN_RATIO / (2.0 - MIN_RATIO), len(name) * (2.0 - MIN_RATIO) / MIN_RATIO
+    candidates = [each for each in dict.fromkeys(islice(known, MAX_KNOWN_NAMES)) if shortest <= len(each) <= longest]
     wanted = name.casefold()
-    by_folded: dict[str, str] = {}
-    for candidate in islice(known, MAX_KNOWN_NAMES):
-        by_folded.setdefault(candidate.casefold(), candidate)
-    # names that differ more than this in length cannot reach a ratio of 0.6
-    shortest, longest = len(wanted) * 3 / 7, len(wanted) * 7 / 3
-    candidates = [each for each in by_folded if shortest <= len(each) <= longest]
     if len(candidates) > MAX_COMPARED_NAMES:
         candidates = _select_by_bigrams(wanted, candidates)
-    return tuple(by_folded[key] for key in difflib.get_close_matches(wanted, candidates, n=count, cutoff=0.6))
+    matcher = difflib.SequenceMatcher(b=wanted)
+    found = []
+    for each in candidates:
+        matcher.set_seq1(each.casefold())
+        if matcher.quick_ratio() >= MIN_RATIO and (ratio := matcher.ratio()) >= MIN_RATIO:
+            found.append((ratio, each))
+    return sorted(found, reverse=True)
 
 
 def _select_by_bigrams(wanted: str, candidates: list[str]) -> list[str]:
-    """Return the candidates with the most bigrams of `wanted`; of equals, those nearest in length.
+    """Return the candidates with the most bigrams of `wanted`, whatever their case; of equals, those nearest in length.
 
     The loops over the candidates run in C.
     """
     pairs = list(dict.fromkeys(wanted[i : i + 2] for i in range(max(1, len(wanted) - 1))))
     # spread evenly over a long name
     pairs = pairs[:: -(-len(pairs) // MAX_COMPARED_PAIRS)]
-    shared = map(sum, zip(*(map(operator.contains, candidates, repeat(pair)) for pair in pairs), strict=True))
-    lengths = map(abs, map(operator.sub, map(len, candidates), repeat(len(wanted))))
-    ranked = zip(map(operator.neg, shared), lengths, range(len(candidates)), strict=True)
+    folded = list(map(str.casefold, candidates))
+    shared = map(sum, zip(*(map(operator.contains, folded, repeat(pair)) for pair in pairs), strict=True))
+    lengths = map(abs, map(operator.sub, map(len, folded), repeat(len(wanted))))
+    ranked = zip(map(operator.neg, shared), lengths, range(len(folded)), strict=True)
     return [candidates[index] for _, _, index in heapq.nsmallest(MAX_COMPARED_NAMES, ranked)]
 
 
@@ -210,19 +222,12 @@ def find_suggestion(name: str, known: Iterable[str], *, is_family: bool = True) 
     With `is_family`, numbers and single letters must be equal: they distinguish the members of a family (`Wheel1`,
     `CameraL`, `UtmGrid10S`), and another member is another thing.
     """
-    wanted = name.casefold()
-    if not 3 <= len(wanted) <= MAX_COMPARED_LENGTH:
-        exact = [each for each in islice(known, MAX_KNOWN_NAMES) if each.casefold() == wanted and name]
-        return exact[0] if len(exact) == 1 else ""
-    most = 1 if len(wanted) <= 6 else 2
-    names = [each for each in islice(known, MAX_KNOWN_NAMES) if abs(len(each) - len(wanted)) <= most]
-    if len(names) > MAX_COMPARED_NAMES:
-        folded = [each.casefold() for each in names]
-        chosen = set(_select_by_bigrams(wanted, folded))
-        names = [each for each, key in zip(names, folded, strict=True) if key in chosen]
-    found = sorted(
-        (distance, each) for each in names if (distance := _alignment_distance(wanted, each.casefold(), most)) <= most
+    most = (len(name) > 2) + (len(name) > 6)
+    counts = (
+        (max(len(each), len(name)) - round(0.5 * ratio * (len(each) + len(name))), each)
+        for ratio, each in _rank_names(name, known)
     )
+    found = sorted(each for each in counts if each[0] <= most)
     if not found or (len(found) > 1 and found[0][0] == found[1][0]):
         return ""
     best = found[0][1]
@@ -245,23 +250,6 @@ def _find_codes(name: str) -> list[str]:
     """Return the numbers and single letters among the words of a name."""
     words = [word.casefold() for word in _WORD.findall(name)]
     return [word for word in words if len(word) == 1 or word.isdecimal()]
-
-
-def _alignment_distance(a: str, b: str, most: int) -> int:
-    """Return the optimal string alignment distance of two words, or more than `most`."""
-    two_above: list[int] = []
-    above = list(range(len(b) + 1))
-    for i, letter in enumerate(a, 1):
-        row = [i]
-        for j, other in enumerate(b, 1):
-            cost = min(above[j] + 1, row[j - 1] + 1, above[j - 1] + (letter != other))
-            if i > 1 and j > 1 and letter == b[j - 2] and a[i - 2] == other:
-                cost = min(cost, two_above[j - 2] + 1)
-            row.append(cost)
-        if min(row) > most:
-            return most + 1
-        two_above, above = above, row
-    return above[-1]
 
 
 def quote(name: str, limit: int = 80) -> str:
