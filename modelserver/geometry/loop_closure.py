@@ -21,6 +21,7 @@ from modelserver.geometry.parts import BodyFrame
 from modelserver.geometry.topology import Crossing, list_edges
 from modelserver.transforms import chain, so3
 from modelserver.transforms.chain import ChainLink
+from modelserver.transforms.covariance import chi_square_survival
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 
@@ -124,24 +125,8 @@ def chi_square_to_sigmas(square: float, degrees: int) -> float:
     if square > 1.5 * MAX_SIGMAS**2:
         # more than MAX_SIGMAS for up to six degrees of freedom; the probability underflows from 1480 on
         return MAX_SIGMAS
-    probability = _chi_square_survival(square, degrees)
+    probability = chi_square_survival(square, degrees)
     return min(MAX_SIGMAS, max(0.0, -NormalDist().inv_cdf(probability / 2.0)))
-
-
-def _chi_square_survival(square: float, degrees: int) -> float:
-    """Return the probability that a chi-square variable exceeds `square` (Abramowitz and Stegun, 26.4.4 and 26.4.5)."""
-    half = square / 2.0
-    if degrees % 2:
-        total, power = math.erfc(math.sqrt(half)), 0.5
-        term = math.exp(-half) * math.sqrt(half) / math.gamma(1.5)
-    else:
-        total, power = math.exp(-half), 1.0
-        term = math.exp(-half) * half
-    while power < degrees / 2.0:
-        total += term
-        power += 1.0
-        term *= half / power
-    return min(1.0, total)
 
 
 _EXACT = np.zeros((6, 1))

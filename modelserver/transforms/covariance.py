@@ -1,4 +1,4 @@
-"""Transport of 6x6 pose covariances along transforms.
+"""Transport of 6x6 pose covariances along transforms, and the chi-square distribution of normalized errors.
 
 A covariance is ordered x, y, z, about x, about y, about z; the perturbation is `X = (p + dp, exp(dtheta) R)` with dp
 and dtheta along the fixed axes of the frame of reference. For a chain A-B-C, to first order,
@@ -7,6 +7,8 @@ dp_AC = dp_AB + dtheta_AB x (R_AB p_BC) + R_AB dp_BC.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -94,3 +96,14 @@ def find_problem(cov: Array) -> str:
 
 def _symmetric(cov: Array) -> Array:
     return np.asarray((cov + cov.T) / 2)
+
+
+def chi_square_survival(value: float, dof: int) -> float:
+    """Return the probability that a chi-square variable of `dof` degrees of freedom exceeds `value`.
+
+    In closed form: Abramowitz and Stegun (1964), 26.4.4 for odd `dof`, 26.4.5 for even.
+    """
+    half = 0.5 * value
+    found = math.erfc(math.sqrt(half)) if dof % 2 else 0.0
+    exponents = (n + 0.5 * (dof % 2) for n in range(dof // 2))
+    return found + math.exp(-half) * math.fsum(half**each / math.gamma(each + 1.0) for each in exponents)

@@ -47,6 +47,7 @@ from modelserver.estimation.filterpy_import import import_kalman_filter
 from modelserver.messages import Decision, Verdict
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
+from modelserver.transforms.covariance import chi_square_survival
 from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
 
 KalmanFilter: Final = import_kalman_filter()
@@ -585,17 +586,6 @@ def _invert_scalar(S: Array) -> Array:
     if s == 0.0:
         raise np.linalg.LinAlgError("singular")
     return np.array(((1.0 / s,),))
-
-
-def chi_square_survival(value: float, dof: int) -> float:
-    """Return the probability that a chi-square variable of `dof` degrees of freedom exceeds `value`.
-
-    In closed form: Abramowitz and Stegun (1964), 26.4.4 for odd `dof`, 26.4.5 for even.
-    """
-    half = 0.5 * value
-    found = math.erfc(math.sqrt(half)) if dof % 2 else 0.0
-    exponents = (n + 0.5 * (dof % 2) for n in range(dof // 2))
-    return found + math.exp(-half) * math.fsum(half**each / math.gamma(each + 1.0) for each in exponents)
 
 
 @lru_cache(maxsize=256)
