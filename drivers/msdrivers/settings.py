@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
-from modelserver.config.reader import Path_, SettingsReader, find_renamed_key, get_value, list_known_keys
+from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
 from msdrivers.line_settings import LineSettings, NtripSettings, TcpSettings, get_line_key
 from msdrivers.registry import KINDS, DeviceKind
@@ -154,17 +154,16 @@ class SectionReader(SettingsReader):
                 self._report_misspelled(key, known)
 
     def suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
-        """Return what an unknown key at a path had become, or misspells, and the fix."""
+        """Return what an unknown key at a path misspells, and the fix."""
         known = list_known_keys(self.schema, at)
         near = self._suggest((*at, key), known)
         return near, f"write {near[0]}" if near else f"known here: {', '.join(known)}"
 
     def _suggest(self, path: Path_, known: list[str]) -> Suggestion:
-        """Return the key that an unknown one at a path had become, or misspells; none that is given already."""
+        """Return the key that an unknown one at a path misspells; none that is given already."""
         given = get_value(self.section, path[:-1])
         known = [each for each in known if not isinstance(given, dict) or each not in given]
-        renamed = find_renamed_key(".".join(map(str, ("drivers", self.name, *path))))
-        return Suggestion.of(str(path[-1]), renamed) if renamed in known else suggest_key(str(path[-1]), known)
+        return suggest_key(str(path[-1]), known)
 
     def _report_misspelled(self, key: str, known: list[str]) -> None:
         """Report an unknown key; its value is that of the key that is meant, which is not missing then."""

@@ -5,7 +5,7 @@ lines are recorded, and validated by pydantic with the dataclass as the schema: 
 
 pydantic examines the rules of a section (its `__post_init__`) only when every value in it has the right type. So the
 validation is repeated without the keys that were found wrong, until nothing new is found (`read_partly`). The value
-under a misspelled or renamed key moves to the key that is meant: it is examined, and not reported as missing.
+under a misspelled key moves to the key that is meant: it is examined, and not reported as missing.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from fnmatch import fnmatchcase
 from functools import cache
-from typing import Any, Final, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -31,53 +30,9 @@ MAX_DEPTH = 16
 MAX_ROUNDS = 8
 """Validations of one file at most, each without what the ones before found wrong."""
 
-RENAMED_KEYS: Final[Mapping[str, str]] = {
-    "restart": "warm_start",
-    "warm_start.keep": "persist",
-    "origin.keep": "persist",
-    "sensors.second_writer": "publisher_conflict",
-    "limits.parked_requests": "waiting_requests",
-    "localization.*.clock_ahead": "clock_jump",
-    "localization.*.clock_samples": "clock_jump_samples",
-    "localization.*.standing_rate": "stationary_rate",
-    "localization.*.standing_speed": "stationary_speed",
-    "localization.*.standing_time": "stationary_time",
-    "localization.filter.standing_force": "stationary_force",
-    "localization.filter.standing_sigma": "stationary_sigma",
-    "localization.filter.levelling_time": "leveling_time",
-    "localization.filter.levelling_limit": "leveling_timeout",
-    "localization.filter.levelling_acceleration": "leveling_acceleration",
-    "localization.filter.slip_share": "slip_ratio",
-    "localization.filter.gps_wander_time": "gps_correlation_time",
-    "localization.filter.restless_time": "gps_inflation_time",
-    "localization.filter.restless_limit": "gps_inflation_limit",
-    "localization.filter.follow_speed": "position_slew_rate",
-    "localization.raw.fix_error_time": "fix_correlation_time",
-    "localization.raw.course_refusals": "course_rejections",
-    "localization.raw.refusals": "fix_rejections",
-    "drivers.*.answer": "answer_timeout",
-    "drivers.*.command.driving": "drive_signals",
-    "drivers.*.command.stopping": "stop_signals",
-    "drivers.*.limits.beyond": "over_limit",
-    "drivers.*.registers.number": "sequence",
-    "drivers.*.reply": "reply_timeout",
-    "drivers.*.restore_on_leaving": "restore_on_exit",
-    "drivers.*.retry": "retry_delay",
-    "drivers.*.status.commands_refused": "commands_rejected",
-    "drivers.*.wheels.*.count.metres_per_count": "meters_per_count",
-    "drivers.*.wheels.*.count.up_only": "counts_up_only",
-    "drivers.*.wheels.*.steers": "is_steered",
-}
-"""Keys of earlier versions, by their path (`*` for any name; sections under their present names), and the new key."""
-
 S = TypeVar("S")
 Path_ = tuple[str | int, ...]
 """Keys and list indices from the top of the file down to a value."""
-
-
-def find_renamed_key(path: str) -> str:
-    """Return the present name of a key of an earlier version by its dotted path, empty for any other key."""
-    return next((new for old, new in RENAMED_KEYS.items() if fnmatchcase(path, old)), "")
 
 
 def read(raw: bytes, name: str, schema: type[S]) -> S:
@@ -282,11 +237,6 @@ class SettingsReader:
         """Return the known keys nearest to an unknown one at a path, and the fix."""
         known = list_known_keys(self.schema, at)
         present = {each for each in known if (*at, each) in self.lines}
-        renamed = find_renamed_key(".".join(map(str, (*at, key))))
-        if renamed and renamed in present:
-            return (), f"remove it; {renamed} is its new name"
-        if renamed:
-            return Suggestion.of(key, renamed), f"write {renamed}, its new name"
         below: dict[str, list[str]] = {}
         for section in known:
             for each in list_known_keys(self.schema, (*at, section)):

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from support_samples import VEHICLE, write_vehicle
 
-from modelserver.config import reader
 from modelserver.config.reader import MAX_BYTES
 from modelserver.config.vehicle_file import (
     AidingConfig,
@@ -25,7 +24,6 @@ from modelserver.config.vehicle_file import (
 )
 from modelserver.errors import ConfigError, Problem, Severity
 from modelserver.messages import Mode
-from msdrivers.settings import read_drivers
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
@@ -227,59 +225,9 @@ def test_given_a_key_that_stands_one_level_deeper_then_where_is_named(text: str,
     assert f"unknown key '{key}'" in found.message
 
 
-@pytest.mark.parametrize("path", reader.RENAMED_KEYS)
-def test_given_a_key_of_an_earlier_version_then_its_new_name_is_suggested(path: str) -> None:
-    new = reader.RENAMED_KEYS[path]
-    path = path.replace("*", "raw")
-    assert reader.find_renamed_key(path) == new
-    if path.startswith("drivers"):
-        return  # msdrivers reads the section
-    *sections, key = path.split(".")
-    text = "".join(f"{'  ' * depth}{name}:\n" for depth, name in enumerate(sections))
-    value = "{}" if path == "restart" else "1"
-    found = problems(f"{text}{'  ' * len(sections)}{key}: {value}\n")[0]
-    assert (found.element, found.nearest, found.fix) == (path, (new,), f"write {new}, its new name")
-    assert found.message == f"unknown key '{key}'"
-    assert found.edit is not None
-    assert found.edit.apply(f"{BASE}{text}{'  ' * len(sections)}{key}: {value}\n").endswith(f"{new}: {value}\n")
-
-
-def test_given_an_old_section_then_the_keys_in_it_are_examined_under_its_new_name() -> None:
-    found = problems("restart: {keep: false, period_s: 0}\n")
-    assert [each.element for each in found] == ["restart", "warm_start.keep", "warm_start.period_s"]
-
-
-OLD_DRIVER_KEYS = {
-    "meters_per_count:": "metres_per_count:",
-    "is_steered:": "steers:",
-    "over_limit:": "beyond:",
-    "commands_rejected:": "commands_refused:",
-    "drive_signals:": "driving:",
-    "stop_signals:": "stopping:",
-    "sequence:": "number:",
-}
-
-
-@pytest.mark.parametrize("new", OLD_DRIVER_KEYS)
-def test_given_a_driver_with_a_key_of_an_earlier_version_then_its_new_name_is_suggested(new: str) -> None:
-    text = (ROOT / "config" / "raptor" / "vehicle.yaml").read_text(encoding="utf-8")
-    config = parse_config(text.replace(new, OLD_DRIVER_KEYS[new]).encode())
-    _, found = read_drivers(config.drivers)
-    assert found
-    assert {each.nearest for each in found} == {(new[:-1],)}
-    assert {each.replaced for each in found} == {OLD_DRIVER_KEYS[new][:-1]}
-
-
-def test_given_a_key_under_its_old_and_its_new_name_then_the_old_one_is_to_be_removed() -> None:
-    found = problem("origin: {keep: true, persist: true}\n")
-    assert (found.element, found.nearest, found.fix) == ("origin.keep", (), "remove it; persist is its new name")
-
-
-def test_given_the_renamed_keys_then_each_new_name_is_a_key() -> None:
-    for path, new in reader.RENAMED_KEYS.items():
-        if not path.startswith("drivers"):
-            text = path.replace("*", "raw").rpartition(".")[0]
-            assert new in reader.list_known_keys(VehicleConfig, tuple(filter(None, text.split("."))))
+def test_given_a_misspelled_section_then_the_keys_in_it_are_examined_under_its_name() -> None:
+    found = problems("warm_strat: {persits: false, period_s: 0}\n")
+    assert [each.element for each in found] == ["warm_strat", "warm_start.persits", "warm_start.period_s"]
 
 
 def test_given_an_unknown_key_like_one_that_is_given_already_then_that_is_not_proposed() -> None:
