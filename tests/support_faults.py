@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import support_stream_faults as faults
+
 from modelserver.messages import ImuSample
-from modelserver.simulation import EncoderModel, Event, GpsModel, ImuModel, Timing, WheelsModel, faults
+from modelserver.simulation import EncoderModel, Event, GpsModel, ImuModel, Timing, WheelsModel
 
 FROM_S = 10.0
 """When a fault begins, seconds since the drive did."""

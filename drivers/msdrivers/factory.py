@@ -110,11 +110,10 @@ def make_emulator(
     folder: Path,
     samples: Iterable[Any],
     faults: tuple[InjectedFault, ...] = (),
-    memory: Path | None = None,
 ) -> Endpoint[Any]:
     """Return the endpoint of the emulated device; see `EmulatorInputs`. Raises ConfigError."""
     with _locate_errors(driver):
-        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults, memory))
+        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults))
 
 
 @contextmanager

@@ -48,15 +48,13 @@ class DeviceModules(NamedTuple):
 class EmulatorInputs(NamedTuple):
     """Inputs of an emulator: the driver's settings, their folder, samples in the order of their stamps.
 
-    faults: of the kinds in `DeviceKind.faults`. memory_file: non-volatile memory of a device with
-    `DeviceKind.has_memory`; None: not persisted.
+    faults: of the kinds in `DeviceKind.faults`.
     """
 
     settings: Any
     folder: Path
     samples: Iterable[Any]
     faults: tuple[InjectedFault, ...] = ()
-    memory_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +65,6 @@ class DeviceKind:
     load, make_emulator: import its modules. baud: factory setting. presets: settings that the kind implies.
     command_channel: channel of the commands that it accepts, empty for none. faults: kinds of faults of its emulator
     and the meaning of their amounts. follows_samples: the emulator's state comes from samples, not from commands.
-    has_memory: the emulator can persist its memory in a file. has_hard_iron: it has a hard-iron calibration.
     has_z_down: z of its own axes points down when it is mounted upright. example: further lines of its section, which
     it needs. takes_corrections: what it gets on its line may be corrections for it (RTCM).
     """
@@ -83,8 +80,6 @@ class DeviceKind:
     command_channel: str = ""
     faults: Mapping[str, str] = field(default_factory=lambda: FAULT_AMOUNTS)
     follows_samples: bool = True
-    has_memory: bool = False
-    has_hard_iron: bool = False
     has_z_down: bool = False
     example: tuple[str, ...] = ()
     takes_corrections: bool = False
@@ -168,13 +163,8 @@ def _make_xsens_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
 def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.gx1 import Gx1Emulator, Gx1Unit
-    from msdrivers.gx1_eeprom_file import read_eeprom, write_eeprom
 
-    unit = Gx1Unit(faults=wanted.faults)
-    if wanted.memory_file is None:
-        return Gx1Emulator(wanted.samples, unit=unit)
-    memory = wanted.memory_file
-    return Gx1Emulator(wanted.samples, read_eeprom(memory), unit, lambda eeprom: write_eeprom(memory, eeprom))
+    return Gx1Emulator(wanted.samples, unit=Gx1Unit(faults=wanted.faults))
 
 
 def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -259,8 +249,6 @@ _KINDS = (
         _make_gx1_emulator,
         38400,
         faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
-        has_memory=True,
-        has_hard_iron=True,
         has_z_down=True,
     ),
     DeviceKind(

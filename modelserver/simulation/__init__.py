@@ -8,7 +8,7 @@ for sample in simulation.events(30.0):      # in order of arrival
 simulation.truth(sample.header.utime).enu   # true pose of the base frame
 
 Options: uneven ground (`Terrain`), side slip (`SideSlip`), errors of every sensor (`GpsModel`, `ImuModel`, ...), aiding
-sensors; `faults` has transport faults between sensor and server.
+sensors.
 """
 
 from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, RelativePoseModel
@@ -18,11 +18,8 @@ from modelserver.simulation.imu import ImuModel, MagnetometerModel, TriadModel
 from modelserver.simulation.maneuvers import (
     city,
     figure_eight,
-    reverse_eight,
     stationary,
-    stop_and_go,
     straight,
-    there_and_back,
 )
 from modelserver.simulation.scenario import Event, Simulation, Truth
 from modelserver.simulation.timing import Timing
@@ -55,9 +52,6 @@ __all__ = [
     "city",
     "figure_eight",
     "make_motion",
-    "reverse_eight",
     "stationary",
-    "stop_and_go",
     "straight",
-    "there_and_back",
 ]

@@ -4,8 +4,8 @@ Kinematics: the speed of a contact point at (x, y, z) of the rolling frame is v_
 and for a steered wheel the speed along the wheel, which is steered for
 level ground without side slip. Travel is its integral: closed form on level ground without slip, else Gauss-Legendre
 with three nodes per sample.
-Encoder: travel is quantized to pulses; scale error per wheel; slip proportional to traction, with `loads` also to the
-mean load over the wheel's own; bursts of wheel spin; stuck and swapped encoders (`EncoderModel`).
+Encoder: travel is quantized to pulses; scale error per wheel; slip proportional to traction; bursts
+of wheel spin; stuck and swapped encoders (`EncoderModel`).
 Limits: side slip is not measured by a wheel; the wheels follow the slope of the ground without suspension.
 """
 
@@ -19,7 +19,6 @@ from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, Wh
 from modelserver.simulation.noise import NoiseSource, quantize
 from modelserver.simulation.timing import Run, Timing
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
-from modelserver.simulation.wheel_loads import WheelLoads
 from modelserver.transforms.so3 import Vector3
 
 
@@ -60,8 +59,7 @@ class WheelsModel:
     scale_sigma : standard deviation of each wheel's scale error, drawn once (tire pressure, load)
     speed_sigma : noise of the speed
     travel_step : travel per pulse, 0 for continuous
-    slip : share of excess rotation at a traction of 1 g and the mean load
-    loads : loads of the wheels, on which the slip depends; None for the mean load on all
+    slip : share of excess rotation at a traction of 1 g
     stationary_speed : speed below which an encoder measures none
     steered : names of the wheels that steer into the direction of motion of their contact points
     unstated_latency : age of a sample at its utime, s
@@ -77,7 +75,6 @@ class WheelsModel:
     steered: frozenset[str] = frozenset()
     unstated_latency: float = 0.0
     encoder: EncoderModel = field(default_factory=EncoderModel)
-    loads: WheelLoads | None = None
 
     @classmethod
     def noise_free(cls, timing: Timing = _PROMPT, steered: frozenset[str] = frozenset()) -> WheelsModel:
@@ -149,7 +146,6 @@ def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3
         t -= model.unstated_latency
         motion, distances = rolling.advance(t)
         slip = model.slip * _traction(motion) / _GRAVITY
-        factors = dict.fromkeys(contacts, 1.0) if model.loads is None else model.loads.compute_slip_factors(motion)
         wheels = []
         for name, contact in contacts.items():
             if name in model.steered:
@@ -158,7 +154,7 @@ def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3
             else:
                 forward, turn, pitch = _rates(motion)
                 speed, steering = forward - contact[1] * turn + contact[2] * pitch, 0.0
-            wheels.append(encoders[name].sample(t, distances[name], speed, 1.0 + slip * factors[name], steering))
+            wheels.append(encoders[name].sample(t, distances[name], speed, 1.0 + slip, steering))
         yield WheelsSample(header, tuple(wheels))
 
 

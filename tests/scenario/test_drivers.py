@@ -20,12 +20,11 @@ from typing import Any
 import lcm
 import pytest
 from support_command import run_command
-from support_lcm import MODELSERVER, TIMEOUT_S, invoke, reserved_url, wait_until
+from support_lcm import TIMEOUT_S, invoke, reserved_url, wait_until
 
 from modelserver.messages import DriverHealth, DriverPhase, FixType, GpsSample, SensorHeader, VehicleCommand
 from modelserver.wire.codec import decode, encode
 from msdrivers.links.can_bus import CanLink
-from msdrivers.protocol.gx1 import EepromAddress
 
 ROOT = Path(__file__).parents[2]
 
@@ -452,37 +451,6 @@ def test_given_a_log_then_the_emulated_device_measures_what_is_stationary_in_it(
     check_steps("gps", bench.samples)
 
 
-def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_the_device_stores_it(
-    bench: Bench,
-) -> None:
-    state = bench.folder / "imu.eeprom"
-    device = ("imu", "--scenario", "circle", "--iron", "12,-7,5", "--state", str(state))
-    with bench.device(*device):
-        done = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "12")
-    assert done.returncode == 0, done.stderr
-    assert "turn the vehicle on level ground" in done.stderr
-    assert "5 of 12 s, field spans" in done.stderr
-    offsets = [float(word) for word in done.stdout.splitlines()[0].split()[1:3]]
-    assert offsets == pytest.approx([12.0, -7.0], abs=0.5)
-    assert "are stored and were read back" in done.stdout
-    stored = dict(tuple(map(int, line.split())) for line in state.read_text().splitlines())
-    counts = [(stored[address] + 32768) % 65536 - 32768 for address in EepromAddress.HARD_IRON]
-    assert counts[:2] == pytest.approx([axis * 1e-6 / 1e-4 * 16384 for axis in offsets], abs=1)
-    # after a power cycle it still has them; a stationary vehicle cannot change them
-    with bench.device("imu", "--scenario", "stand", "--state", str(state)):
-        vain = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "1")
-    assert vain.returncode == 1
-    before = [(stored[address] + 32768) % 65536 - 32768 for address in EepromAddress.HARD_IRON]
-    assert f"offsets before {before} counts" in vain.stderr
-    assert "turn the vehicle further" in vain.stderr
-    assert dict(tuple(map(int, line.split())) for line in state.read_text().splitlines()) == stored
-
-
-def run(bench: Bench, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [*MODELSERVER, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-
-
 def test_given_mistyped_names_then_the_nearest_is_reported(bench: Bench) -> None:
     wrong = invoke(bench.url, "driver", "gsp", "-c", bench.vehicle)
     assert wrong.returncode == 2
@@ -490,9 +458,6 @@ def test_given_mistyped_names_then_the_nearest_is_reported(bench: Bench) -> None
     fault = invoke(bench.url, "emulate", "gps", "-c", bench.vehicle, "--pty", "--fault", "stal@1")
     assert fault.returncode == 2
     assert "did you mean stall?" in fault.stderr
-    axes = invoke(bench.url, "driver", "imu", "-c", bench.vehicle, "--all-axes")
-    assert axes.returncode == 2
-    assert "--hard-iron" in axes.stderr
     text = bench.vehicle.read_text().replace("bauds: [38400]", "buads: [38400]")
     bench.vehicle.write_text(text)
     for command in (("driver", "gps", "-c"), ("check",)):

@@ -49,7 +49,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
     "core": CORE,
-    "simulation": GEOMETRY | {"messages", "dynamics", "earth"},
+    "simulation": GEOMETRY | {"messages", "earth"},
     "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
     "config.reader": {"errors"},
     "wire": WIRE,

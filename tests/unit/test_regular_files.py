@@ -29,7 +29,6 @@ from modelserver.server.persistence.directory import write_atomically
 from modelserver.signing.key_files import read_keys
 from modelserver.wire.eventlog import LogFile
 from msdrivers.factory import make_driver
-from msdrivers.gx1_eeprom_file import read_eeprom
 from msdrivers.raw_log import open_for_reading, open_for_writing
 from msdrivers.settings import SourceMap, read_driver
 from mstools.commands.import_bag import import_bag
@@ -77,7 +76,6 @@ READERS = [
     read_dbc,
     open_for_reading,
     record,
-    read_eeprom,
     files_of,
     read_times,
 ]
@@ -111,7 +109,7 @@ def test_given_a_directory_when_it_is_to_be_read_then_it_is_rejected(
         read(tmp_path)
 
 
-@pytest.mark.parametrize("read", [load_model, load_config, read_keys, read_dbc, read_eeprom, read_times])
+@pytest.mark.parametrize("read", [load_model, load_config, read_keys, read_dbc, read_times])
 def test_given_a_file_beyond_its_limit_when_it_is_to_be_read_then_it_is_rejected_unread(
     tmp_path: Path, read: Callable[[Path], object]
 ) -> None:

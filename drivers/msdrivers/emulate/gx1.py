@@ -7,7 +7,7 @@ captures its gyro biases, and reads its timer words at start.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -53,11 +53,10 @@ class Gx1Unit:
 
     cycle_ticks: ticks from one streamed reply to the next. tick_offset: its ticks when it starts. drift: how much
     faster its clock runs than the host's, as a fraction. delay: from a measurement until it is sent. boot_time: how
-    long it is silent after a restart. field_offset: its own magnetic field, which its hard-iron offsets are to remove.
-    gyro_bias: bias of its gyros. force_sign: 1 if it reports specific force, -1 for its opposite.
-    celsius: its temperature. streamed_at_start: the command that it streams when the line is opened, 0 for none.
-    faults: `drop` or `corrupt` the next `amount` replies, `stall` for `amount` seconds, `restart`, `jump` by `amount`
-    ticks.
+    long it is silent after a restart. gyro_bias: bias of its gyros. force_sign: 1 if it reports
+    specific force, -1 for its opposite. celsius: its temperature. streamed_at_start: the command that it streams when
+    the line is opened, 0 for none. faults: `drop` or `corrupt` the next `amount` replies, `stall` for `amount`
+    seconds, `restart`, `jump` by `amount` ticks.
     """
 
     serial: int = 1234
@@ -68,7 +67,6 @@ class Gx1Unit:
     delay: float = 0.003
     boot_time: float = 1.0
     bias_capture: float = 3.0
-    field_offset: Vector3 = (0.0, 0.0, 0.0)
     gyro_bias: Vector3 = (0.0, 0.0, 0.0)
     force_sign: int = 1
     celsius: float = 23.0
@@ -179,14 +177,11 @@ class Gx1Emulator:
         samples: Iterable[ImuSample],
         eeprom: Eeprom | None = None,
         unit: Gx1Unit | None = None,
-        save_eeprom: Callable[[Eeprom], object] = lambda eeprom: None,
     ):
-        """`save_eeprom` is called with the memory after each change."""
         self.eeprom = Eeprom.make_factory() if eeprom is None else eeprom
         self.unit = Gx1Unit() if unit is None else unit
         self.streamed = self.unit.streamed_at_start
         """The command that is streamed now, 0 for none."""
-        self._save_eeprom = save_eeprom
         self._samples = SampleInterpolator(samples)
         self._requests = RequestParser()
         self._outbox: deque[tuple[int, bytes]] = deque()
@@ -199,7 +194,6 @@ class Gx1Emulator:
         self._gains = GAINS
         self._bias: Vector3 = (0.0, 0.0, 0.0)
         self._capture: tuple[int, list[Vector3]] | None = None
-        self._extremes: tuple[list[int], list[int]] = ([scaling.MAX_WORD] * 3, [scaling.MIN_WORD] * 3)
         self._utime_offset_us = 0
         self.counts: Counter[str] = Counter()
 
@@ -286,9 +280,7 @@ class Gx1Emulator:
             return
         unit, gains = self.unit, self._gains
         words: tuple[int, ...]
-        field = self._get_field_words(
-            instant, scaling.vector_from_words(self._get_offset_words(), gains.magnetometer, scaling.TESLA)
-        )
+        field = scaling.vector_to_words(instant.field, gains.magnetometer, scaling.TESLA)
         force = scaling.vector_to_words(so3.scale(unit.force_sign, instant.force), gains.accelerometer, scaling.G0)
         rate = scaling.vector_to_words(_subtract(so3.add(instant.rate, unit.gyro_bias), self._bias), gains.gyro)
         if command == CommandByte.EULER_VECTORS:
@@ -300,13 +292,6 @@ class Gx1Emulator:
             if command == CommandByte.QUATERNION_VECTORS:
                 words = (*scaling.quaternion_to_words(instant.orientation), *words)
         self._queue_reply(command, words, at_ns)
-
-    def _get_field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
-        field = _subtract(so3.add(instant.field, self.unit.field_offset), offsets)
-        return scaling.vector_to_words(field, self._gains.magnetometer, scaling.TESLA)
-
-    def _get_offset_words(self) -> tuple[int, ...]:
-        return tuple(_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON)
 
     def _capture_bias(self, at_ns: int) -> None:
         assert self._capture is not None
@@ -340,40 +325,8 @@ class Gx1Emulator:
             if data[0] == 0 or data[0] in MEASUREMENTS:
                 self.streamed = data[0]
                 self._queue_reply(command, (data[0], self._clock.ticks_at(at_ns)), at_ns)
-        elif command in (CommandByte.READ_EEPROM, CommandByte.WRITE_EEPROM):
-            address = int.from_bytes(data[:2], "big")
-            if command == CommandByte.WRITE_EEPROM and address % 2 == 0 and address < 256:
-                self._write({address: int.from_bytes(data[2:], "big")})
-            self._queue_reply(command, (self.eeprom.read_word(address),), at_ns)
         else:
-            self._on_hard_iron(command, data, at_ns)
-
-    def _on_hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
-        if command == CommandByte.HARD_IRON_START:
-            self._extremes = ([scaling.MAX_WORD] * 3, [scaling.MIN_WORD] * 3)
-            self._write(dict.fromkeys(EepromAddress.HARD_IRON, 0))
-            self._queue_reply(command, (), at_ns)
-            return
-        low, high = self._extremes
-        if command == CommandByte.HARD_IRON_COLLECT:
-            instant = self._sense(at_ns)
-            if instant is None:
-                return
-            words = self._get_field_words(instant, (0.0, 0.0, 0.0))
-            low = [min(pair) for pair in zip(low, words, strict=True)]
-            high = [max(pair) for pair in zip(high, words, strict=True)]
-            self._extremes = (low, high)
-            self._queue_reply(command, (*words, *low, *high), at_ns)
-            return
-        two_dimensional, magnitude_z = data[0] == 1, _to_signed(int.from_bytes(data[1:], "big"))
-        x, y, z = ((a + b) // 2 for a, b in zip(low, high, strict=True))
-        offsets = (x, y, z - magnitude_z if two_dimensional else z)
-        self._write(dict(zip(EepromAddress.HARD_IRON, offsets, strict=True)))
-        self._queue_reply(command, self._get_offset_words(), at_ns)
-
-    def _write(self, changes: Mapping[int, int]) -> None:
-        self.eeprom = self.eeprom.write(changes)
-        self._save_eeprom(self.eeprom)
+            self._queue_reply(command, (self.eeprom.read_word(int.from_bytes(data, "big")),), at_ns)
 
     def _queue_reply(self, command: int, words: tuple[int, ...], at_ns: int) -> None:
         has_ticks = command not in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
@@ -393,10 +346,6 @@ class Gx1Emulator:
             self.counts["sent"] += 1
             outputs.append(Send(self._outbox.popleft()[1]))
         return outputs
-
-
-def _to_signed(word: int) -> int:
-    return (word + 32768) % 65536 - 32768
 
 
 def _subtract(value: Vector3, less: Vector3) -> Vector3:

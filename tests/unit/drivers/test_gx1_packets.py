@@ -61,8 +61,8 @@ def test_given_a_worked_reply_when_decoded_and_written_then_the_bytes_are_the_sa
 
 def test_given_the_table_of_replies_then_their_lengths_are_the_sheets():
     assert LENGTHS == {
-        0x02: 23, 0x03: 23, 0x06: 5, 0x07: 7, 0x0C: 31, 0x0D: 11, 0x0E: 11, 0x10: 7, 0x28: 7, 0x29: 7,
-        0x31: 23, 0x40: 5, 0x41: 23, 0x42: 11, 0xF0: 5, 0xF1: 5,
+        0x02: 23, 0x03: 23, 0x06: 5, 0x07: 7, 0x0C: 31, 0x0D: 11, 0x0E: 11, 0x10: 7, 0x28: 7,
+        0x31: 23, 0xF0: 5, 0xF1: 5,
     }  # fmt: skip
 
 
@@ -74,12 +74,6 @@ def test_given_a_quaternion_and_vectors_then_the_fields_stand_where_the_sheet_ha
     assert int.from_bytes(raw[15:17], "big") == packet.field("acceleration")[0] == 8
     assert int.from_bytes(raw[21:23], "big") == packet.field("rate")[0] == 11
     assert int.from_bytes(raw[27:29], "big") == packet.ticks == 77
-
-
-def test_given_extremes_then_minimum_stands_before_maximum_and_both_are_signed():
-    packet = only(Gx1Packet(0x41, (1, 2, 3, -4, -5, -6, 7, 8, 9), 5).to_bytes())
-    assert packet.field("minimum") == (-4, -5, -6)
-    assert packet.field("maximum") == (7, 8, 9)
 
 
 def test_given_words_of_a_wrong_number_when_written_then_it_is_rejected():
@@ -99,9 +93,6 @@ def test_given_requests_then_their_bytes_are_the_sheets():
     assert bytes.fromhex("100000") == requests.STOP
     assert requests.make_stream(0x31) == bytes.fromhex("100031")
     assert requests.make_read_eeprom(130) == bytes.fromhex("280082")
-    assert requests.make_write_eeprom(172, -2) == bytes.fromhex("297100acfffeaa")
-    assert requests.make_hard_iron_start() == bytes.fromhex("40713e")
-    assert requests.make_hard_iron_compute(two_dimensional=True, magnitude_z=259) == bytes.fromhex("42713e010103")
 
 
 @pytest.mark.parametrize("address", [-2, 131, 256])
@@ -112,20 +103,12 @@ def test_given_an_address_that_no_word_has_then_it_is_rejected(address):
 
 def test_given_noise_between_requests_when_the_device_reads_then_it_finds_each():
     parser = RequestParser()
-    data = (
-        b"\x55\x10"
-        + requests.STOP
-        + b"\x99"
-        + requests.make_read_eeprom(230)
-        + b"\x07"
-        + requests.make_write_eeprom(238, 4)
-    )
+    data = b"\x55\x10" + requests.STOP + b"\x99" + requests.make_read_eeprom(230) + b"\x07"
     found = [request for k in range(len(data)) for request in parser.feed(data[k : k + 1])]
     assert found == [
         Gx1Request(CommandByte.CONTINUOUS, b"\0"),
         Gx1Request(CommandByte.READ_EEPROM, b"\0\xe6"),
         Gx1Request(CommandByte.TEMPERATURE),
-        Gx1Request(CommandByte.WRITE_EEPROM, b"\0\xee\0\4"),
     ]
     assert parser.skipped == 3
 

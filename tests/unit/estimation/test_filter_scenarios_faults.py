@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import support_stream_faults as faults
 from support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
@@ -22,7 +23,6 @@ from modelserver.simulation import (
     Event,
     MagnetometerModel,
     WheelsModel,
-    faults,
     figure_eight,
     stationary,
 )

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import support_stream_faults as faults
 from support_filter import GPS_TIMING, ORIGIN, PLAIN_GPS, QUICK_IMU, RIG, RTK_LIKE, drive, rms, row, simulation
+from support_maneuvers import stop_and_go
 
 from modelserver.estimation.filter import heading_step, output
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
@@ -26,9 +28,7 @@ from modelserver.simulation import (
     GpsModel,
     RangeModel,
     RelativePoseModel,
-    faults,
     figure_eight,
-    stop_and_go,
 )
 
 pytestmark = pytest.mark.slow

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
+from support_maneuvers import reverse_eight
 
 from modelserver.messages import ImuSample, Invalid, Quality, Verdict
 from modelserver.simulation import (
@@ -19,7 +20,6 @@ from modelserver.simulation import (
     Timing,
     WheelsModel,
     figure_eight,
-    reverse_eight,
     stationary,
 )
 from modelserver.simulation.scenario import START_UTIME

@@ -3,9 +3,10 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
+import support_stream_faults as faults
 
 from modelserver.messages import RelativePoseSample
-from modelserver.simulation import GpsModel, ImuModel, WheelsModel, faults
+from modelserver.simulation import GpsModel, ImuModel, WheelsModel
 
 
 @pytest.fixture

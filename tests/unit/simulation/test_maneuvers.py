@@ -5,8 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support_maneuvers import reverse_eight, stop_and_go
 
-from modelserver.simulation import Trajectory, city, figure_eight, reverse_eight, stationary, stop_and_go
+from modelserver.simulation import Trajectory, city, figure_eight, stationary
 
 
 def motions(drive: Trajectory, step: float = 0.05):

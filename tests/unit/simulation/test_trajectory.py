@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from support_maneuvers import there_and_back
 
-from modelserver.simulation import DrivePhase, Trajectory, figure_eight, straight, there_and_back
+from modelserver.simulation import DrivePhase, Trajectory, figure_eight, straight
 
 DRIVES = {
     "straight": straight(),

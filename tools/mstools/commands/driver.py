@@ -98,13 +98,6 @@ def command(
     record_raw: Annotated[Path | None, option("--record-raw FILE", "Record the bytes of the connection.")] = None,
     record_limit: Annotated[float, option("--record-limit MB", "Largest size of the recording.", min=0.001)] = 1000.0,
     play_raw: Annotated[Path | None, option("--play-raw FILE", "Read a recording instead of the device.")] = None,
-    hard_iron: Annotated[
-        bool, option("--hard-iron", "Turn the vehicle: calibrate hard iron, store it in the device, exit.")
-    ] = False,
-    seconds: Annotated[float, option("--seconds N", "With --hard-iron: duration of turning.", min=1.0)] = 60.0,
-    all_axes: Annotated[
-        bool, option("--all-axes", "With --hard-iron: turned about all axes, not on level ground.")
-    ] = False,
     url: UrlOption = "",
     log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
     log_format: FormatOption = "auto",
@@ -120,7 +113,6 @@ def command(
       modelserver driver --list
       modelserver driver gps -c config/raptor/vehicle.yaml
       modelserver driver imu -c vehicle.yaml --record-raw imu.raw
-      modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
     """
     from modelserver.server.supervision.systemd import Notifier
     from mstools.deployment.service_start import ServiceStart
@@ -135,22 +127,13 @@ def command(
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
     if record_raw is not None and play_raw is not None:
         raise typer.BadParameter("a replayed recording is not recorded again", param_hint="--record-raw")
-    if all_axes and not hard_iron:
-        raise typer.BadParameter("needs --hard-iron", param_hint="--all-axes")
     start = ServiceStart(config, Notifier.from_environment())
     with start.wait_on_error():
         vehicle, settings = load_driver(name, config)
-    if hard_iron and not settings.kind.has_hard_iron:
-        raise typer.BadParameter(f"a {settings.kind.name} has no hard-iron calibration", param_hint="--hard-iron")
     set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
     warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
-        if hard_iron:
-            from mstools.calibration.hard_iron import run_hard_iron
-
-            run_hard_iron(settings, link, seconds, all_axes)
-            return
         run(vehicle, settings, link, config.parent, url, start)
 
 

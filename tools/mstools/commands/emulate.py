@@ -169,7 +169,6 @@ def command(
         list[str] | None,
         option("--fault KIND@SECONDS[:AMOUNT]", "drop, corrupt, stall, restart, jump; more by device."),
     ] = None,
-    state: Annotated[Path | None, option("--state FILE", "Store the device's non-volatile memory here.")] = None,
     iron: Annotated[str, option("--iron X,Y,Z", "Hard iron at an IMU, microtesla.")] = "0,0,0",
     seconds: Annotated[float | None, option("--seconds N", "Exit after this time. Default: never.", min=0.1)] = None,
     seed: Annotated[int, option("--seed N", "Seed of the simulation's noise.")] = 1,
@@ -205,8 +204,6 @@ def command(
         wanted = tuple(parse_fault(text, settings.kind.faults) for text in faults or ())
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--fault") from None
-    if state is not None and not settings.kind.has_memory:
-        raise typer.BadParameter(f"a {settings.kind.name} keeps nothing without power", param_hint="--state")
     if log is not None and not settings.kind.follows_samples:
         raise typer.BadParameter(
             f"device {settings.kind.name} follows its commands and cannot replay a log", param_hint="--from"
@@ -219,7 +216,7 @@ def command(
     from msdrivers.factory import make_emulator
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
 
-    station = make_emulator(settings, config.parent, samples, wanted, state)
+    station = make_emulator(settings, config.parent, samples, wanted)
     options = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen_timeout=math.inf)
     line.open()
     typer.echo(f"{name} ({settings.kind.name}) is on {line.description}")

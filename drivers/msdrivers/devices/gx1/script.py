@@ -417,12 +417,6 @@ def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
     return words
 
 
-def write_word(address: int, value: int) -> ScriptPart[None]:
-    """Write a word of the EEPROM; the next one 10 ms later."""
-    yield RequestStep(requests.make_write_eeprom(address, value))
-    yield PauseStep(0.01)
-
-
 def read_gains() -> ScriptPart[gx1.Gains]:
     """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have.
 

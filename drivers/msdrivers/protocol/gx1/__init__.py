@@ -45,11 +45,7 @@ class CommandByte(IntEnum):
     STABILIZED_EULER = 0x0E
     CONTINUOUS = 0x10
     READ_EEPROM = 0x28
-    WRITE_EEPROM = 0x29
     EULER_VECTORS = 0x31
-    HARD_IRON_START = 0x40
-    HARD_IRON_COLLECT = 0x41
-    HARD_IRON_COMPUTE = 0x42
     FIRMWARE = 0xF0
     SERIAL = 0xF1
 
@@ -84,11 +80,7 @@ LAYOUTS: dict[int, ReplyLayout] = {
     # a zero byte and the streamed command; the second word is zero or the ticks, sources differ: not read as ticks
     CommandByte.CONTINUOUS: ReplyLayout((("streamed", 1), ("unsettled", 1)), has_ticks=False),
     CommandByte.READ_EEPROM: ReplyLayout((("value", 1),)),
-    CommandByte.WRITE_EEPROM: ReplyLayout((("value", 1),)),
     CommandByte.EULER_VECTORS: ReplyLayout((("euler", 3), ("acceleration", 3), ("rate", 3))),
-    CommandByte.HARD_IRON_START: ReplyLayout(()),
-    CommandByte.HARD_IRON_COLLECT: ReplyLayout((("field", 3), ("minimum", 3), ("maximum", 3))),
-    CommandByte.HARD_IRON_COMPUTE: ReplyLayout((("offset", 3),)),
     CommandByte.FIRMWARE: ReplyLayout((("version", 1),), has_ticks=False),
     CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
 }
@@ -163,7 +155,6 @@ class EepromAddress:
     """Even addresses of the EEPROM's words."""
 
     GYRO_GAIN = 130
-    HARD_IRON = (172, 174, 176)
     ACCELEROMETER_GAIN = 230
     MAGNETOMETER_GAIN = 232
     GAINS = (GYRO_GAIN, ACCELEROMETER_GAIN, MAGNETOMETER_GAIN)

@@ -8,14 +8,11 @@ from msdrivers.protocol.gx1 import LAYOUTS, CommandByte
 
 LAST_ADDRESS = 254
 
-_FRAMES: dict[int, tuple[bytes, int, bytes]] = dict.fromkeys(LAYOUTS, (b"", 0, b"")) | {
-    CommandByte.CONTINUOUS: (b"\0", 1, b""),
-    CommandByte.READ_EEPROM: (b"", 2, b""),
-    CommandByte.WRITE_EEPROM: (b"\x71", 4, b"\xaa"),
-    CommandByte.HARD_IRON_START: (b"\x71\x3e", 0, b""),
-    CommandByte.HARD_IRON_COMPUTE: (b"\x71\x3e", 3, b""),
+_FRAMES: dict[int, tuple[bytes, int]] = dict.fromkeys(LAYOUTS, (b"", 0)) | {
+    CommandByte.CONTINUOUS: (b"\0", 1),
+    CommandByte.READ_EEPROM: (b"", 2),
 }
-"""Command -> the key between it and its data, the length of the data, and the bytes after them."""
+"""Command -> the key between it and its data, and the length of the data."""
 
 
 class Gx1Request(NamedTuple):
@@ -26,8 +23,8 @@ class Gx1Request(NamedTuple):
 
     def to_bytes(self) -> bytes:
         """Encode the request."""
-        key, _, end = _FRAMES[self.command]
-        return bytes((self.command,)) + key + self.data + end
+        key, _ = _FRAMES[self.command]
+        return bytes((self.command,)) + key + self.data
 
 
 def make_poll(command: int) -> bytes:
@@ -49,33 +46,10 @@ def make_read_eeprom(address: int) -> bytes:
     return Gx1Request(CommandByte.READ_EEPROM, _encode_address(address)).to_bytes()
 
 
-def make_write_eeprom(address: int, value: int) -> bytes:
-    """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
-    return Gx1Request(CommandByte.WRITE_EEPROM, _encode_address(address) + _encode_word(value)).to_bytes()
-
-
-def make_hard_iron_start() -> bytes:
-    """Return the request to begin the collection of the magnetic field's extremes."""
-    return Gx1Request(CommandByte.HARD_IRON_START).to_bytes()
-
-
-def make_hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
-    """Return the request to compute and store the hard-iron offsets.
-
-    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the raw value of the vertical
-    field, which only the procedure in two dimensions uses.
-    """
-    return Gx1Request(CommandByte.HARD_IRON_COMPUTE, bytes((two_dimensional,)) + _encode_word(magnitude_z)).to_bytes()
-
-
-def _encode_word(value: int) -> bytes:
-    return (value & 0xFFFF).to_bytes(2, "big")
-
-
 def _encode_address(address: int) -> bytes:
     if not 0 <= address <= LAST_ADDRESS or address % 2:
         raise ValueError(f"an address of the EEPROM is even and 0..{LAST_ADDRESS}, got {address}")
-    return _encode_word(address)
+    return address.to_bytes(2, "big")
 
 
 class RequestParser:
@@ -86,18 +60,18 @@ class RequestParser:
         self.skipped = 0
 
     def feed(self, data: bytes) -> list[Gx1Request]:
-        """Return the requests that are complete; at most 6 bytes wait for more."""
+        """Return the requests that are complete; at most 2 bytes wait for more."""
         self._buffer += data
         buffer, at, found = self._buffer, 0, []
         while at < len(buffer):
             command = buffer[at]
-            key, length, end = _FRAMES.get(command, (b"", 0, b""))
+            key, length = _FRAMES.get(command, (b"", 0))
             begin = at + 1 + len(key)
-            after = begin + length + len(end)
+            after = begin + length
             if after > len(buffer):
                 break
-            if command in _FRAMES and buffer.startswith(key, at + 1) and buffer.startswith(end, begin + length):
-                found.append(Gx1Request(command, bytes(buffer[begin : begin + length])))
+            if command in _FRAMES and buffer.startswith(key, at + 1):
+                found.append(Gx1Request(command, bytes(buffer[begin:after])))
                 at = after
             else:
                 at += 1
