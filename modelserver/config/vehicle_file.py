@@ -496,7 +496,7 @@ NOT_A_VEHICLE_FILE = "not a vehicle file"
 """End of the message for a file of another type."""
 
 _START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
-_MODEL_HINT = "query, bodies and frames take it with --model"
+_MODEL_HINT = "modelserver query takes it with --model"
 _GEOMETRY_HINT = f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}"
 _FIXES: dict[FileKind, str] = {
     FileKind.EMPTY: _START_HINT,
