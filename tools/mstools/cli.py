@@ -46,8 +46,7 @@ COMMANDS = {
     "status": "Show the health of the running daemon.",
     "spy": "Show all channels decoded: with lcm-spy, or in the terminal.",
     "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
-    "install": "Install the service and its drivers under systemd.",
-    "uninstall": "Remove what install wrote.",
+    "install": "Install the service and its drivers under systemd, or remove them.",
 }
 """Subcommands with their summary. `import-bag` is function `command` of module `mstools.commands.import_bag`; a command
 with subcommands of its own has a Typer application there instead."""
@@ -70,8 +69,7 @@ _ALIASES = {
     "spy": "listen echo",
     "tree": "graph draw bodies frames",
     "reload": "hup",
-    "install": "setup",
-    "uninstall": "remove",
+    "install": "setup uninstall remove",
     "query": "explain motion",
     "dynamics": "mass inertia stability tip payload",
     "view": "viewer gui show3d rviz",
