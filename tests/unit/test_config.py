@@ -477,6 +477,12 @@ def test_given_bytes_that_are_no_vehicle_file_then_one_clear_problem(text: bytes
             "geometry: r.urdf",
         ),
         ("m.xml", b"<config><section/></config>", "this is XML, not a vehicle file", "takes it with --model"),
+        (
+            "process.xml",
+            b'<config><section name="ModelServer"><parameter name="UpdateRateHz" value="10"/></section></config>',
+            "this is a process file of the original ModelServer (2005), not a vehicle file",
+            "publish.rate_hz",
+        ),
         ("drive.lcm", b"\xed\xa1\xda\x01" + bytes(40), "this is an LCM event log, not", "modelserver replay"),
         ("photo.png", b"\x89PNG\r\n\x1a\n\0\0\0", "this is not text, not a vehicle file", "which is YAML"),
         ("empty.yaml", b"", "the file is empty", "start with: vehicle, geometry, base_frame"),

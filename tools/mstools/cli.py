@@ -26,7 +26,7 @@ COMMANDS = {
     "up": "Run the service and all drivers of a vehicle, or emulate them.",
     "run": "Run the service for a vehicle file.",
     "check": "Report every problem of a geometry or vehicle file.",
-    "convert": "Convert a geometry file to another format, or Miro's process configuration to a vehicle file.",
+    "convert": "Convert a geometry file to another format.",
     "query": "Where is one frame in another?",
     "dynamics": "Mass, center of mass, equations of motion, tip-over margin and wheel loads.",
     "tree": "Draw the kinematic tree: constraints, joints, loops, orphans.",
