@@ -44,7 +44,7 @@ COMMANDS = {
     "emulate": "Emulate a device for its driver.",
     "view": "Show a geometry file, a log, or the running service in the browser.",
     "status": "Show the health of the running daemon.",
-    "spy": "Show all channels decoded: with lcm-spy, or in the terminal.",
+    "spy": "Show all channels decoded, in lcm-spy.",
     "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
     "install": "Install the service and its drivers under systemd, or remove them.",
 }
