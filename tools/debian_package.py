@@ -70,7 +70,7 @@ PRERM: Final = f"""\
 set -e
 # the units would start a program that is gone; edited files and the state stay
 if [ "$1" = remove ] && [ -f /etc/modelserver/installed.json ]; then
-  /{PREFIX}/bin/modelserver uninstall
+  /{PREFIX}/bin/modelserver install --remove
 fi
 find /{PREFIX}/lib -name __pycache__ -type d -prune -exec rm -rf {{}} +
 """

@@ -20,7 +20,7 @@ from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.files.kinds import FileKind, detect_file_kind, format_conversion_command
+from modelserver.files.kinds import PROCESS_FIX, FileKind, detect_file_kind
 from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.messages import Mode
 
@@ -496,14 +496,14 @@ NOT_A_VEHICLE_FILE = "not a vehicle file"
 """End of the message for a file of another type."""
 
 _START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
-_MODEL_HINT = "query, bodies and frames take it with --model"
+_MODEL_HINT = "modelserver query takes it with --model"
 _GEOMETRY_HINT = f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}"
 _FIXES: dict[FileKind, str] = {
     FileKind.EMPTY: _START_HINT,
     FileKind.COMMENTS: _START_HINT,
     FileKind.GEOMETRY: _GEOMETRY_HINT,
     FileKind.URDF: _GEOMETRY_HINT,
-    FileKind.MIRO_PROCESS: "convert it to a vehicle file: {command}",
+    FileKind.MIRO_PROCESS: PROCESS_FIX,
     FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
     FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
     FileKind.BINARY: "give the vehicle file, which is YAML",
@@ -522,8 +522,7 @@ def _read_bytes(path: Path) -> bytes:
     kind = detect_file_kind(raw)
     if kind in _FIXES:
         what = kind.value if kind.is_empty else f"{kind.value}, {NOT_A_VEHICLE_FILE}"
-        command = format_conversion_command(str(path)) if kind is FileKind.MIRO_PROCESS else ""
-        raise reader.make_error(str(path), 0, what, _FIXES[kind].format(name=path.name, command=command))
+        raise reader.make_error(str(path), 0, what, _FIXES[kind].format(name=path.name))
     return raw
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from enum import Enum
 from typing import Final
 
@@ -19,7 +18,7 @@ class FileKind(Enum):
     VEHICLE = "this is a vehicle file"
     GEOMETRY = "this is a geometry file"
     URDF = "this is a URDF, a geometry file format"
-    MIRO_PROCESS = "this is a Miro process configuration"
+    MIRO_PROCESS = "this is a process file of the original ModelServer (2005)"
     XML = "this is XML"
     LOG = "this is an LCM event log"
     BINARY = "this is not text"
@@ -30,6 +29,12 @@ class FileKind(Enum):
         """Whether the file has no content."""
         return self in (FileKind.EMPTY, FileKind.COMMENTS)
 
+
+PROCESS_FIX: Final = (
+    "write a vehicle file (docs/vehicle-file.md); these keys replace its parameters: vehicle, geometry, base_frame, "
+    "rolling_frame, publish.rate_hz, publish.mode, localization.mode, origin, sensors"
+)
+"""Fix for a process file, wherever it is given."""
 
 _KEY: Final = re.compile(rb"^([A-Za-z_]+)[ \t]*:(?=\s|$)", re.MULTILINE)
 _VEHICLE: Final = frozenset(
@@ -42,7 +47,7 @@ _PROCESS: Final = (b"<config", b"<section", b"<parameter")
 _MIRO_GEOMETRY: Final = re.compile(
     rb"BodyName|ConstraintName|FrameName|HTransform|FrameRpyParameters|FrameList|<config_group\b|<!ENTITY"
 )
-"""In Miro's geometry files and compile-time files, but not in a process configuration; entities neither."""
+"""In Miro's geometry files and compile-time files, but not in a process file; entities neither."""
 _URDF: Final = re.compile(rb"<(\w+:)?robot[\s>]")
 _GEOMETRY_PATH: Final = re.compile(rb"^geometry[ \t]*:[ \t]*[\"']?([^\s\"'#]+)", re.MULTILINE)
 
@@ -81,12 +86,6 @@ def detect_file_kind(content: bytes) -> FileKind:
     ):
         return FileKind.COMMENTS
     return FileKind.OTHER
-
-
-def format_conversion_command(path: str) -> str:
-    """Return the command that converts the Miro process configuration at a path to a vehicle file beside it."""
-    stem = path[:-4] if path.lower().endswith(".xml") else path
-    return shlex.join(["modelserver", "convert", path, f"{stem}.yaml"])
 
 
 def find_geometry_path(content: bytes) -> str:

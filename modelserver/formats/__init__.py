@@ -17,7 +17,7 @@ from pathlib import PurePath
 from typing import NamedTuple
 
 from modelserver.errors import GeometryError, Location, Problem, Severity, quote
-from modelserver.files.kinds import FileKind, detect_file_kind, find_geometry_path, format_conversion_command
+from modelserver.files.kinds import PROCESS_FIX, FileKind, detect_file_kind, find_geometry_path
 from modelserver.files.regular import FileTooLargeError, NotRegularFileError, read_regular
 from modelserver.formats.writing import SavedModel
 from modelserver.geometry.builder import ModelBuilder
@@ -59,7 +59,7 @@ _FIXES = {
     FileKind.COMMENTS: _EXAMPLE_HINT,
     FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
     FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
-    FileKind.MIRO_PROCESS: "convert it to a vehicle file, which names the geometry file: {command}",
+    FileKind.MIRO_PROCESS: PROCESS_FIX,
 }
 """Fix for a file that is not a geometry file."""
 
@@ -101,8 +101,7 @@ def parse_content(
     if kind in _FIXES:
         named = find_geometry_path(text) if kind is FileKind.VEHICLE else ""
         what = kind.value if kind.is_empty else f"{kind.value}, not a geometry file"
-        fix = _FIXES[kind].replace("{command}", format_conversion_command(file or "FILE.xml"))
-        builder.add_error(what, Location(file), fix + (f", {quote(named, 100)}" if named else ""))
+        builder.add_error(what, Location(file), _FIXES[kind] + (f", {quote(named, 100)}" if named else ""))
         return builder
     from modelserver.formats import bot_frames
 

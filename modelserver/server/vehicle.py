@@ -338,7 +338,7 @@ def find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole
     named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None else []
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
-    see = f"see: modelserver bodies --model {config.geometry}"
+    see = f"see: modelserver tree --frames {config.geometry}"
     problems: list[errors.Problem] = []
     unknown: set[str] = set()
     for key, frame in named:

@@ -1,4 +1,4 @@
-"""Looking at the running daemon: status, spy and doctor as processes of their own on its bus."""
+"""Looking at the running daemon: status and doctor as processes of their own on its bus."""
 
 from __future__ import annotations
 
@@ -121,33 +121,11 @@ def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_i
     assert all("STARTING; pose not valid" in line for line in lines)
 
 
-# --- spy ----------------------------------------------------------------------------------------------------
-
-
-def test_given_no_screen_then_spy_prints_every_channel_once_and_the_fields_of_one(start_daemon: StartDaemon) -> None:
-    daemon = start_daemon()
-    done = invoke(daemon.url, "spy", "--seconds", "1", "--channel", "MODELSERVER_HEALTH")
-    assert done.returncode == 0, done.stderr
-    rows = {row[0]: row for row in map(str.split, done.stdout.splitlines()) if row}
-    assert {"POSE", "POSE_VECTOR", "POSE_ODOM", "MODELSERVER_HEALTH"} <= rows.keys()
-    assert rows["POSE"][1] == "pose_transform_t"
-    assert 10.0 < float(rows["POSE"][3]) < 75.0
-    assert rows["invalid_reasons"][2] == "(no"
-    assert rows["state"] == ["state", "0", "STARTING"]
-
-
-def test_given_a_mistyped_channel_then_spy_offers_the_nearest_that_is_received(start_daemon: StartDaemon) -> None:
-    done = invoke(start_daemon().url, "spy", "--seconds", "1", "--channel", "POSE_ODON")
-    assert done.returncode == 1
-    assert "no message on 'POSE_ODON'; nearest: 'POSE_ODOM'" in done.stderr
-
-
 class Screen:
     """A terminal with a program in it."""
 
     def __init__(self, arguments: Sequence[str], url: str):
         self.main, self.end = pty.openpty()
-        self.before = termios.tcgetattr(self.end)
         termios.tcsetwinsize(self.end, (40, 140))
         left_out = ("DISPLAY", "COLUMNS", "LINES")
         environment = {key: value for key, value in os.environ.items() if key not in left_out}
@@ -177,9 +155,6 @@ class Screen:
         self.output = seen
         return False
 
-    def press(self, keys: bytes) -> None:
-        os.write(self.main, keys)
-
     def close(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
@@ -200,31 +175,6 @@ def screen(start_daemon: StartDaemon) -> Iterator[Callable[..., Screen]]:
     yield show
     for each in opened:
         each.close()
-
-
-def test_given_a_terminal_then_spy_shows_the_channels_and_keys_open_the_fields(
-    screen: Callable[..., Screen],
-) -> None:
-    spy = screen("spy")
-    assert spy.shows(r"POSE_VECTOR +pose_vector_t"), spy.output
-    spy.press(b"\x1b[H\x1b[F\r")
-    # the last channel by its name; before it may be LCM's own self-test
-    assert spy.shows(r"\bvec\b"), spy.output
-    spy.press(b"q")
-    assert spy.process.wait(TIMEOUT_S) == 0
-    # echo and line editing are as they were
-    assert termios.tcgetattr(spy.end)[3] == spy.before[3]
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_given_a_channel_in_a_terminal_then_its_fields_are_open_and_a_signal_ends_it_cleanly(
-    screen: Callable[..., Screen], number: signal.Signals
-) -> None:
-    spy = screen("spy", "--channel", "POSE")
-    assert spy.shows(r"frame_of_reference +'World:UTM'"), spy.output
-    spy.process.send_signal(number)
-    assert spy.process.wait(TIMEOUT_S) == 0
-    assert termios.tcgetattr(spy.end)[3] == spy.before[3]
 
 
 def test_given_a_terminal_then_status_watch_shows_the_report_until_ctrl_c(screen: Callable[..., Screen]) -> None:

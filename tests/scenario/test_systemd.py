@@ -278,7 +278,7 @@ def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, 
     again = site.machine.run(*install, "gps")
     assert f"leave   {GEOMETRY}: edited" in again.stdout
     site.machine.run("rm", "-rf", f"/run/systemd/system/{DRIVER}.d")
-    output = site.machine.run(site.program, "uninstall").stdout
+    output = site.machine.run(site.program, "install", "--remove").stdout
     assert f"leave   {GEOMETRY}: edited since" in output
     assert site.machine.get_property(SERVICE, "LoadState") == "not-found"
     assert [line for line in site.list_files() if "modelserver" in line and "/var" not in line] == [
@@ -287,10 +287,10 @@ def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, 
     site.machine.run("rm", GEOMETRY)
     site.machine.run("rmdir", "/etc/modelserver")
     site.machine.run(*install, "none")
-    site.machine.run(site.program, "uninstall", "--purge")
+    site.machine.run(site.program, "install", "--remove", "--purge")
     assert site.list_files() == before
-    nothing = site.machine.run(site.program, "uninstall", check=False)
-    assert (nothing.returncode, "nothing to uninstall" in nothing.stderr) == (1, True)
+    nothing = site.machine.run(site.program, "install", "--remove", check=False)
+    assert (nothing.returncode, "nothing to remove" in nothing.stderr) == (1, True)
 
 
 def test_given_the_package_removed_then_the_service_ends_and_nothing_of_it_stays(site: Site, before: list[str]) -> None:

@@ -41,6 +41,11 @@ def test_given_the_geometry_files_of_this_project_then_they_are_known(path: Path
         (b"a: 1\n  vehicle: 2\n  base_frame: 3\n", FileKind.OTHER),
         (b"  <a/>", FileKind.XML),
         (b"<!-- x --><robot name='r'>", FileKind.URDF),
+        (b"<config><section><parameter name='UpdateRateHz' value='1'/></section></config>", FileKind.MIRO_PROCESS),
+        (b"<config><section><parameter name='BodyName' value='A'/></section></config>", FileKind.XML),
+        # a geometry with mistyped names is left to its reader, which reports them
+        (b"<config><section><parameter name='FrameName'/></section></config>", FileKind.XML),
+        (b"<config><section><config_group/><parameter/></section></config>", FileKind.XML),
         (b"\xed\xa1\xda\x01rest", FileKind.LOG),
         (b"PK\3\4\0\0", FileKind.BINARY),
         ("vehicle: x".encode("utf-16"), FileKind.OTHER),

@@ -89,6 +89,14 @@ def test_several_files_are_checked_though_one_is_missing(check):
     assert "nowhere: error: the file cannot be read: No such file or directory" in out
 
 
+def test_a_process_file_of_2005_is_one_error_with_the_keys_that_replace_it(check):
+    text = '<config><section name="ModelServer"><parameter name="UpdateRateHz" value="10"/></section></config>'
+    code, out, _ = check(process=text)
+    assert (code, out.count("error:")) == (1, 1)
+    assert "this is a process file of the original ModelServer (2005)" in out
+    assert "these keys replace its parameters: vehicle, geometry, base_frame" in " ".join(out.split())
+
+
 def test_set_fills_variables(check):
     text = tree(tree_frame("$MRN"), tree_frame("Mast", "$MRN"), tree_frame("Camera", "Mast"))
     code, out, _ = check(rover=text)

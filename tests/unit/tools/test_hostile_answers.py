@@ -20,8 +20,6 @@ from modelserver.messages import (
     EdgeReport,
     Explanation,
     ExplanationReply,
-    GetBodyFrameList,
-    GetBodyList,
     GetDynamics,
     GetExplanation,
     GetMotion,
@@ -29,7 +27,6 @@ from modelserver.messages import (
     Invalid,
     MotionAnswer,
     MotionReply,
-    NameListReply,
     PoseAnswer,
     ReloadModel,
     ReloadReply,
@@ -47,8 +44,6 @@ THREE = (0.0, 0.0, 0.0)
 ANSWER = PoseAnswer(Transformation(EVIL, EVIL, Pose(), model_revision=EVIL))
 EDGE = EdgeReport("joint", EVIL, True, (EVIL, EVIL), Pose(), "predicted", source=EVIL)
 GOOD: dict[type, Any] = {
-    GetBodyList: lambda header: NameListReply(header, (EVIL, EVIL), (EVIL, EVIL)),
-    GetBodyFrameList: lambda header: NameListReply(header, (EVIL,), (EVIL,)),
     GetTransformation: lambda header: TransformReply(header, ANSWER, Unmet.AGE, EVIL),
     GetExplanation: lambda header: ExplanationReply(header, Explanation(ANSWER, (EDGE, EDGE))),
     GetMotion: lambda header: MotionReply(header, MotionAnswer(ANSWER, EVIL, THREE, THREE, THREE, THREE)),
@@ -109,10 +104,10 @@ def false_daemon(status: Status) -> Iterator[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("status", [Status.OK, Status.UNKNOWN_FRAME, Status.FORBIDDEN, Status.REJECTED])
 @pytest.mark.parametrize("arguments", [
-    ["bodies"], ["frames", "A"], ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],
+    ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],
     ["query", "A:A", "B:B", "--motion"], ["reload"], ["tree", "--live"],
     ["dynamics", "--equations"], ["dynamics", "--json"],
-    ["bodies", "--json"], ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
+    ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
     ["query", "A:A", "B:B", "--max-age", "1"],
 ])  # fmt: skip
 def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(

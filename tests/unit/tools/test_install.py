@@ -1,4 +1,4 @@
-"""`modelserver install` and `uninstall` on a system of their own: a folder."""
+"""`modelserver install` on a system of their own: a folder."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_given_an_installation_then_a_removal_leaves_nothing_of_it(
     unit = there["etc/systemd/system/modelserver.service"] or b""
     assert b"ExecStart=/opt/modelserver/bin/modelserver run" in unit
     assert not re.search(rb"@[A-Z]+@", unit)
-    assert run("uninstall")[0] == 0
+    assert run("install", "--remove")[0] == 0
     assert tree(tmp_path / "root") == {"etc": None}
 
 
@@ -127,7 +127,7 @@ def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
     if copied.exists():
         assert stat.S_IMODE(copied.stat().st_mode) == 0o600
         assert secret in copied.read_text()
-    assert run("uninstall")[0] == 0
+    assert run("install", "--remove")[0] == 0
     assert tree(root) == {"etc": None}
 
 
@@ -188,10 +188,18 @@ def test_given_a_user_without_rights_then_the_command_with_sudo_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    for command in ("install", "uninstall"):
+    for command in (["install"], ["install", "--remove", "--purge"]):
         with pytest.raises(SystemExit):
-            main([command])
-        assert f"needs root: sudo {install_steps.get_command_path()} {command}" in capsys.readouterr().err
+            main(command)
+        assert f"needs root: sudo {install_steps.get_command_path()} {' '.join(command)}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--purge"], ["--remove", "--vehicle", "x.yaml"], ["--remove", "--no-start"]])
+def test_given_options_that_exclude_each_other_then_it_is_wrong_usage(
+    run: Callable[..., Output], tmp_path: Path, words: list[str]
+) -> None:
+    assert run("install", *words)[0] == 2
+    assert tree(tmp_path / "root") == {"etc": None}
 
 
 def test_given_a_command_that_fails_then_it_is_reported_which_and_what_it_reported(
@@ -314,17 +322,20 @@ def test_given_another_root_then_paths_are_reported_within_it(
     run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "root"
-    code, _, err = run("uninstall")
-    assert f"nothing to uninstall: {root}/etc/modelserver/installed.json" in err
+    code, _, err = run("install", "--remove")
+    assert f"nothing to remove: {root}/etc/modelserver/installed.json" in err
     run("install", "--vehicle", str(vehicle))
-    code, out, _ = run("uninstall", "--dry-run")
+    code, out, _ = run("install", "--remove", "--dry-run")
     assert code == 0
     assert f"the service's state is still in {root}/var/lib/modelserver" in out
     reported = [line.split()[1].rstrip(":") for line in out.splitlines() if line.startswith(("remove", "leave"))]
     assert reported
     assert all(path.startswith(f"{root}/etc") for path in reported)
     (root / "etc/modelserver/installed.json").write_text("{")
-    assert f"{root}/etc/modelserver/installed.json: the record of the installation is damaged" in run("uninstall")[2]
+    assert (
+        f"{root}/etc/modelserver/installed.json: the record of the installation is damaged"
+        in run("install", "--remove")[2]
+    )
 
 
 def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is_closed(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from mstools.deployment.plan import (
     digest,
     parent_folders,
     plan_install,
-    plan_uninstall,
+    plan_removal,
 )
 
 SERVICE = f"{UNITS}/modelserver.service"
@@ -74,8 +74,8 @@ class Disk:
         self.execute(plan)
         return plan
 
-    def uninstall(self, purge: bool = False) -> Plan:
-        plan = plan_uninstall(self.facts(), purge=purge)
+    def remove(self, purge: bool = False) -> Plan:
+        plan = plan_removal(self.facts(), purge=purge)
         self.execute(plan)
         return plan
 
@@ -117,7 +117,7 @@ def test_given_an_upgrade_then_what_was_not_edited_is_replaced() -> None:
     disk.files[VEHICLE] = b"edited"
     plan = disk.install({VEHICLE: b"new", SERVICE: b"new"})
     assert (disk.files[VEHICLE], disk.files[SERVICE], list_unchanged(plan)) == (b"edited", b"new", [VEHICLE])
-    assert list_unchanged(disk.uninstall()) == [VEHICLE]
+    assert list_unchanged(disk.remove()) == [VEHICLE]
     assert disk.files == {VEHICLE: b"edited"}
 
 
@@ -135,7 +135,7 @@ def test_given_a_file_that_is_not_wanted_any_more_then_it_goes_unless_it_was_edi
     disk.files[RULES] = b"edited"
     disk.install({SERVICE: b"x"})
     assert set(disk.files) == {SERVICE, RULES, MANIFEST, *(path for path in PATHS if path.startswith(CONFIGURATION))}
-    disk.uninstall()
+    disk.remove()
     assert disk.files == {RULES: b"edited"}
 
 
@@ -145,7 +145,7 @@ def test_given_an_interrupted_installation_then_it_can_be_undone() -> None:
     plan = plan_install(writes, ("modelserver.service",), disk.facts(), start=True, notes=())
     disk.execute(replace(plan, steps=plan.steps[:3]))
     assert len(disk.files) == 3
-    disk.uninstall()
+    disk.remove()
     assert (disk.files, disk.folders) == ({}, {"/etc"})
 
 
@@ -153,7 +153,7 @@ def test_given_a_purge_then_what_was_edited_and_the_state_go_too() -> None:
     disk = Disk()
     disk.install({VEHICLE: b"x"})
     disk.files |= {VEHICLE: b"edited", f"{STATE[1]}/origin.json": b"{}"}
-    plan = disk.uninstall(purge=True)
+    plan = disk.remove(purge=True)
     assert VEHICLE not in disk.files
     assert [step.path for step in plan.steps if isinstance(step, RemovePath) and step.is_recursive] == list(STATE)
 
@@ -165,9 +165,9 @@ def test_given_another_system_then_nothing_is_started_and_systemctl_works_on_it(
     assert commands == ["/usr/bin/systemctl --root=/mnt/image enable modelserver.service"]
 
 
-def test_given_nothing_installed_then_there_is_nothing_to_uninstall() -> None:
-    with pytest.raises(ModelServerError, match="nothing to uninstall"):
-        plan_uninstall(SystemFacts(), purge=True)
+def test_given_nothing_installed_then_there_is_nothing_to_remove() -> None:
+    with pytest.raises(ModelServerError, match="nothing to remove"):
+        plan_removal(SystemFacts(), purge=True)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_given_any_course_then_what_is_not_ours_is_as_it_was_and_what_is_ours_is
     disk.files |= dict.fromkeys(edited, b"edited")
     if not ours:
         return
-    disk.uninstall(purge)
+    disk.remove(purge)
     expected = before | dict.fromkeys(edited, b"edited")
     if purge:
         expected = {path: content for path, content in expected.items() if path not in ours}

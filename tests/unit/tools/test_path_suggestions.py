@@ -36,7 +36,7 @@ def test_given_commands_with_a_mistyped_file_then_they_offer_the_nearest(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["bodies", "--model", str(folder / "vehicl.yaml")])
+        main(["tree", str(folder / "vehicl.yaml")])
     assert ended.value.code == 1
     assert f"did you mean {folder / 'vehicle.yaml'}?" in capsys.readouterr().err
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""`modelserver query`, `bodies` and `frames` on a file, and the manners that all commands share."""
+"""`modelserver query` on a file, and the manners that all commands share."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def test_given_a_file_of_another_kind_for_a_model_then_one_error_reports_what_it
 ) -> None:
     path = tmp_path / "file.yaml"
     path.write_bytes(content)
-    code, out, err = run("bodies", "--model", path)
+    code, out, err = run("query", *PAIR, "--model", path)
     assert (code, out) == (1, "")
     assert words in err
     assert err.count("error:") == 1
@@ -224,25 +224,11 @@ def test_given_a_file_of_another_kind_for_a_model_then_one_error_reports_what_it
 
 
 def test_given_no_daemon_then_one_line_reports_it_and_exit_is_1(run: Command, lcm_url: str) -> None:
-    for command in (("query", *PAIR), ("bodies",), ("frames", "Digiclops")):
-        code, out, err = run(*command, "--url", lcm_url, "--timeout", "0.02")
-        assert (code, out) == (1, "")
-        assert "no reply" in err
-        assert lcm_url in err
-        assert len(err.splitlines()) == 1
-
-
-# --- bodies and frames --------------------------------------------------------------------------------------
-
-
-def test_given_a_file_then_bodies_and_frames_list_it(run: Command, annex: Path) -> None:
-    assert run("bodies", "--model", annex) == (0, "FrontNoddingSICK\nDigiclops\n", "")
-    assert json.loads(run("bodies", "--model", annex, "--json")[1]) == ["FrontNoddingSICK", "Digiclops"]
-    assert run("frames", "Digiclops", "--model", annex) == (0, "Digiclops:ImagePlane\n", "")
-    assert json.loads(run("frames", "Digiclops", "--model", annex, "--json")[1]) == ["Digiclops:ImagePlane"]
-    code, out, err = run("frames", "Digiclop", "--model", annex)
+    code, out, err = run("query", *PAIR, "--url", lcm_url, "--timeout", "0.02")
     assert (code, out) == (1, "")
-    assert "Digiclops" in err
+    assert "no reply" in err
+    assert lcm_url in err
+    assert len(err.splitlines()) == 1
 
 
 # --- usage --------------------------------------------------------------------------------------------------
@@ -262,8 +248,6 @@ def test_given_a_file_then_bodies_and_frames_list_it(run: Command, annex: Path) 
         ["query", "A:B", "C:D", "--wait-ms", "-1"],
         ["query", "A:B", "C:D", "--timeout", "0"],
         ["query", "A:B", "C:D", "--timeout", "nan"],
-        ["bodies", "A"],
-        ["frames"],
         ["run"],
         ["run", "-c", "x.yaml", "--log-level", "loud"],
         ["check"],

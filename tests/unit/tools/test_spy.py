@@ -12,12 +12,10 @@ from pathlib import Path
 import pytest
 from support_lcm import MODELSERVER
 
-from modelserver.wire import provider
 from modelserver.wire.channels import DEFAULT_URL
 from mstools.cli import main
 from mstools.commands import spy
-from mstools.spy import terminal as spy_terminal
-from mstools.spy.lcm_wheel import MissingToolError, find_type_files
+from mstools.lcm_wheel import MissingToolError, find_type_files
 
 needs_javac = pytest.mark.skipif(shutil.which("javac") is None, reason="no Java compiler (default-jdk-headless)")
 
@@ -112,13 +110,13 @@ def test_given_a_compiler_that_fails_when_built_then_it_reports_it_and_leaves_no
     assert [path for path in cache.rglob("*") if path.is_file()] == []
 
 
-def test_given_no_java_when_a_window_is_wanted_then_it_reports_what_to_install(
+def test_given_no_java_when_run_then_it_reports_what_to_install(
     cache: Path, only: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "sudo apt install default-jre default-jdk-headless" in _failure(capsys, "--window")
+    assert "sudo apt install default-jre default-jdk-headless" in _failure(capsys)
 
 
-def test_given_a_java_without_windows_when_one_is_wanted_then_it_reports_what_to_install(
+def test_given_a_java_without_windows_when_run_then_it_reports_what_to_install(
     only: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
@@ -126,79 +124,15 @@ def test_given_a_java_without_windows_when_one_is_wanted_then_it_reports_what_to
     (tmp_path / "jvm" / "lib").mkdir()
     (tmp_path / "jvm" / "lib" / "libjava.so").touch()
     (only / "java").symlink_to(tmp_path / "jvm" / "bin" / "java")
-    assert "this Java is headless: sudo apt install default-jre" in _failure(capsys, "--window")
+    assert "this Java is headless: sudo apt install default-jre" in _failure(capsys)
 
 
-def test_given_no_display_when_a_window_is_wanted_then_it_reports_it(
+def test_given_no_display_when_run_then_it_reports_it(
     only: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     _program(only / "java")
-    assert "DISPLAY is empty" in _failure(capsys, "--window")
-
-
-@pytest.fixture
-def shown_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
-    """What the table in the terminal was asked for: the channel, and for how many seconds."""
-    asked: list[tuple[str, float]] = []
-    monkeypatch.setattr(provider, "open_lcm", lambda url: None)
-    monkeypatch.setattr(spy_terminal, "show", lambda bus, channel, seconds: asked.append((channel, seconds)))
-    return asked
-
-
-def _run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(["spy", *arguments])
-    return int(ended.value.code or 0)
-
-
-def test_given_no_display_when_run_then_it_is_the_terminal_and_nothing_is_missed(
-    only: Path,
-    shown_calls: list[tuple[str, float]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    assert _run() == 0
-    assert shown_calls == [("", 0.0)]
-    assert capsys.readouterr().err == ""
-
-
-def test_given_a_display_and_no_java_when_run_then_it_reports_what_to_install_and_is_the_terminal(
-    only: Path,
-    shown_calls: list[tuple[str, float]],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("DISPLAY", ":1")
-    assert _run() == 0
-    assert shown_calls == [("", 0.0)]
-    assert "sudo apt install default-jre" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "asked"),
-    [
-        (("--terminal",), ("", 0.0)),
-        (("--once",), ("", spy_terminal.LISTEN_S)),
-        (("--seconds", "5"), ("", 5.0)),
-        (("--channel", "POSE"), ("POSE", 0.0)),
-        (("--channel", "POSE", "--once", "--seconds", "1"), ("POSE", 1.0)),
-    ],
-)
-def test_given_options_of_the_terminal_when_run_then_there_is_no_window_even_with_a_display(
-    shown_calls: list[tuple[str, float]],
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[str, ...],
-    asked: tuple[str, float],
-) -> None:
-    monkeypatch.setenv("DISPLAY", ":1")
-    assert _run(*arguments) == 0
-    assert shown_calls == [asked]
-
-
-def test_given_a_window_and_options_of_the_terminal_then_it_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert _run("--window", "--once") == 2
+    assert "DISPLAY is empty" in _failure(capsys)
 
 
 @pytest.mark.slow

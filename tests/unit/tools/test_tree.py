@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -89,6 +90,14 @@ def test_given_frames_then_they_stand_below_their_bodies(run: Run, arm: Path) ->
     _, out, _ = run(arm, "--frames")
     assert out.splitlines()[1:6] == ["Base", "│  · Mount", "│  · Rail", *TREE.splitlines()[1:3]]
     assert out.splitlines()[-2:] == ["Lamp", "   · Origin"]
+
+
+def test_given_json_then_it_lists_the_frames_of_each_body_root_first(run: Run, arm: Path) -> None:
+    code, out, _ = run(arm, "--json")
+    bodies = json.loads(out)
+    assert (code, list(bodies)) == (0, ["Base", "Turret", "Lift", "Grip", "Strut", "Lamp"])
+    assert bodies["Strut"] == ["Strut:Low", "Strut:High"]
+    assert run(arm, "--json", "--svg", "-")[0] == 2
 
 
 def test_given_a_vehicle_file_then_its_geometry_is_drawn(run: Run, tmp_path: Path) -> None:

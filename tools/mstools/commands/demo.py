@@ -161,7 +161,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
             platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
         except QueryError as error:
             typer.echo(f"{error}. Nearest: {', '.join(error.nearest)}")
-    typer.echo(f"\nDone. Next: modelserver run -c {find_vehicle_file()}, and in another shell: modelserver bodies")
+    typer.echo(f"\nDone. Next: modelserver run -c {find_vehicle_file()}, and in another shell: modelserver tree --live")
 
 
 def format_usage(service: Health | None) -> list[str]:

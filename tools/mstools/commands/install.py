@@ -1,4 +1,4 @@
-"""`modelserver install`: install the service and its drivers under systemd."""
+"""`modelserver install`: install the service and its drivers under systemd, or remove them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.settings import DriverSettings
 
-RootOption = Annotated[Path, option("--root DIR", "Root of another system, e.g. an image; nothing is started.")]
-DryRunOption = Annotated[bool, option("--dry-run", "Only print what would be done.")]
-
 
 def command(
     vehicle: Annotated[
@@ -46,24 +43,39 @@ def command(
         list[str] | None, option("--serial NAME=ID", "A driver's device below /dev/serial/by-id. May be repeated.")
     ] = None,
     start: Annotated[bool, option("--start/--no-start", "Start the installed units.")] = True,
-    dry_run: DryRunOption = False,
-    root: RootOption = Path("/"),
+    remove: Annotated[bool, option("--remove", "Stop the units, and remove what an installation wrote.")] = False,
+    purge: Annotated[bool, option("--purge", "With --remove: also edited files and the service's state.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Only print what would be done.")] = False,
+    root: Annotated[Path, option("--root DIR", "Root of another system, e.g. an image; nothing is started.")] = Path(
+        "/"
+    ),
 ) -> None:
     """Install the service and its drivers under systemd, and start them.
 
     Copies the vehicle file and the files it names to /etc/modelserver, writes units, udev rules for serial devices by
     their ids and the kernel's limit for receive buffers, and enables the units at boot. An edited file is not replaced,
-    and is listed. Repeat it after an upgrade. `modelserver uninstall` removes it.
+    and is listed. Repeat it after an upgrade. --remove leaves edited files, which it lists, and
+    the state of the service in /var/lib/modelserver.
 
     \b
     Examples:
       modelserver install --vehicle vehicle.yaml --dry-run
       sudo /opt/modelserver/bin/modelserver install --vehicle vehicle.yaml --drivers gps,imu
+      modelserver install --remove --dry-run
     """
+    if purge and not remove:
+        raise typer.BadParameter("needs --remove", param_hint="--purge")
+    if remove and (vehicle is not None or drivers != "all" or serial or not start):
+        raise typer.BadParameter("excludes --vehicle, --drivers, --serial and --no-start", param_hint="--remove")
     root = root.resolve()
     if not dry_run:
-        check_root_user(root, f"{get_command_path()} install ...")
-    execute_plan(make_plan(vehicle, drivers, parse_serial(serial), start, root), root, dry_run)
+        words = f"--remove{' --purge' if purge else ''}" if remove else "..."
+        check_root_user(root, f"{get_command_path()} install {words}")
+    if remove:
+        plan = planning.plan_removal(read_facts((), root), purge=purge)
+    else:
+        plan = make_plan(vehicle, drivers, parse_serial(serial), start, root)
+    execute_plan(plan, root, dry_run)
 
 
 def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:

@@ -1,4 +1,4 @@
-"""Sources of poses for `query`, `bodies` and `frames`: the running daemon, a geometry file, or a log."""
+"""Sources of poses for `query`: the running daemon, a geometry file, or a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`modelserver spy`: all channels decoded, in lcm-spy with this project's types or in the terminal."""
+"""`modelserver spy`: all channels decoded, in lcm-spy with this project's types."""
 
 from __future__ import annotations
 
@@ -17,72 +17,35 @@ from typing import Annotated
 import typer
 
 from modelserver.wire.channels import DEFAULT_URL
-from mstools.spy.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
+from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
 from mstools.terminal.options import UrlOption, option
 
 
 def command(
-    terminal: Annotated[bool, option("--terminal -t", "A table in the terminal, even with a display.")] = False,
-    window: Annotated[bool, option("--window", "lcm-spy's window; an error if it cannot open.")] = False,
-    channel: Annotated[str, option("--channel NAME", "In the terminal: show this channel's fields.")] = "",
-    once: Annotated[bool, option("--once", "In the terminal: listen for 2 s, print, and exit.")] = False,
-    seconds: Annotated[float, option("--seconds N", "As --once, for this time.", min=0.0, max=86400.0)] = 0.0,
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, for its bus.")] = None,
     url: UrlOption = "",
     build_only: Annotated[
         bool, option("--build-only", "Compile the types for Java, print the jar's path, and exit.")
     ] = False,
 ) -> None:
-    """Show all channels decoded.
+    """Show all channels decoded, in lcm-spy with this project's types; double-click a channel to see its fields.
 
-    With a display and Java this starts lcm-spy; double-click a channel there to see its fields. The first run also
-    needs a Java compiler (default-jdk-headless): the types are compiled once for each version of the wire contract, and
-    stored in the user's cache.
+    It needs a display and Java (default-jre), and at the first run a Java compiler (default-jdk-headless): the types
+    are compiled once for each version of the wire contract, and stored in the user's cache. In a terminal,
+    `modelserver status --watch` shows the channels of the service.
 
-    Otherwise, as over ssh, or with --terminal, it is a table in the terminal: every received channel with its type,
-    rate, jitter, size and age; bad counts damaged messages. Up and down select a channel, enter shows the fields of its
-    last message, q quits. If the output is no terminal, the table is printed once.
-
-    \b
-    Examples:
-      modelserver spy
-      modelserver spy --terminal --channel POSE
-      modelserver spy --once --channel MODELSERVER_HEALTH
+    Example: modelserver spy -c vehicle.yaml
     """
     if build_only:
         typer.echo(str(get_types_jar()))
         return
-    plain = terminal or bool(channel) or once or bool(seconds)
-    if window and plain:
-        raise typer.BadParameter("excludes --terminal, --channel, --once and --seconds", param_hint="--window")
     if config is not None and not url:
         from modelserver.config.vehicle_file import load_config
 
         url = load_config(config).lcm.url
-    if not plain:
-        start_window(url, window)
-    from modelserver.wire.provider import open_lcm, resolve_url
-    from mstools.spy.terminal import LISTEN_S, show
-
-    show(open_lcm(resolve_url(url)), channel, seconds or (LISTEN_S if once else 0.0))
-
-
-def start_window(url: str, is_wanted: bool) -> None:
-    """Replace this process by lcm-spy. Return if it cannot start, with a message unless there is no display.
-
-    Raises MissingToolError instead if the window is required.
-    """
-    if not (is_wanted or os.environ.get("DISPLAY")):
-        return
-    try:
-        check_java()
-        jar = get_types_jar()
-        spy = find_binary("lcm-spy")
-    except MissingToolError as error:
-        if is_wanted:
-            raise
-        typer.echo(f"modelserver: {error}. Using the terminal instead:", err=True)
-        return
+    check_java()
+    jar = get_types_jar()
+    spy = find_binary("lcm-spy")
     environment = dict(os.environ)
     environment["CLASSPATH"] = os.pathsep.join(filter(None, (str(jar), environment.get("CLASSPATH", ""))))
     provider = url or environment.get("LCM_DEFAULT_URL", "") or DEFAULT_URL
@@ -101,7 +64,7 @@ def check_java() -> None:
     elif (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
         wrong = "opens a window, but this Java is headless: sudo apt install default-jre"
     elif not os.environ.get("DISPLAY"):
-        ways = "Over ssh use ssh -X, or modelserver spy --terminal"
+        ways = "Over ssh use ssh -X, or modelserver status --watch"
         wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
     if wrong:
         raise MissingToolError(f"lcm-spy {wrong}")

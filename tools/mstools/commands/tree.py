@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -34,6 +35,7 @@ def command(
     file: Annotated[str, argument("FILE", "A geometry file or a vehicle file.")] = "",
     live: Annotated[bool, option("--live", "Draw the running daemon's geometry instead of a file's.")] = False,
     frames: Annotated[bool, option("--frames", "Draw the frames of each body too.")] = False,
+    as_json: Annotated[bool, option("--json", "Print the frames of each body as JSON, root first.")] = False,
     svg: Annotated[str, option("--svg OUT", "Write an SVG image instead; - for stdout.")] = "",
     force: Annotated[bool, option("--force", "Replace OUT where it exists.")] = False,
     variables: Variables = None,
@@ -46,12 +48,20 @@ def command(
     The parent of each body is on its shortest path from the root; `from here` marks a constraint that points to the
     parent. --live draws the geometry of the daemon, which publishes it every few seconds.
 
-    Example: modelserver tree config/raptor/geometry.yaml
+    \b
+    Examples:
+      modelserver tree config/raptor/geometry.yaml --frames
+      modelserver tree --live --json
     """
     if live == bool(file):
         raise typer.BadParameter("give a FILE, or --live for the running daemon", param_hint="FILE")
+    if as_json and svg:
+        raise typer.BadParameter("excludes --svg", param_hint="--json")
     check_writable(svg)
     model = receive_geometry(url, prefix, wait).model if live else load_geometry(file, parse_variables(variables))
+    if as_json:
+        typer.echo(json.dumps({body.name: [frame.full_name for frame in body.frames] for body in model.bodies}))
+        return
     title = f"{model.name or 'unnamed'}: {describe_size(model)}, revision {model.revision}"
     assemblies = build_nodes(model)
     if not svg:

@@ -1,4 +1,4 @@
-"""Plan of `install` and `uninstall`: a list of steps, before anything is executed. Pure.
+"""Plan of `install` and `install --remove`: a list of steps, before anything is executed. Pure.
 
 The state of the system comes in as `SystemFacts`, the steps go out as a `Plan`, and steps.py executes it. A file is
 replaced or removed only if its hash is one that `install` wrote (manifest); edited files are kept. The manifest is
@@ -184,7 +184,7 @@ def plan_install(
     for write in writes:
         there, new = facts.files.get(write.path), digest(write.content)
         if there == new:
-            # a file that was there before is not owned: uninstall leaves it
+            # a file that was there before is not owned: a removal leaves it
             if write.path in owned:
                 owned[write.path] = (new,)
             steps.append(KeepFile(write.path, f"unchanged ({write.description})"))
@@ -208,7 +208,7 @@ def plan_install(
     made = {folder for path in (*changed, MANIFEST) for folder in parent_folders(path)} & facts.absent
     manifest = Manifest(owned, units, tuple(sorted({*facts.manifest.folders, *made})))
     # first, so that an interrupted installation can be undone
-    steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver uninstall`"))
+    steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver install --remove`"))
     steps += _plan_reloads(facts, changed)
     if obsolete:
         steps.append(_systemctl(facts, "units that are no longer needed", "disable", *obsolete))
@@ -218,14 +218,14 @@ def plan_install(
     return Plan(tuple(steps), tuple(notes))
 
 
-def plan_uninstall(facts: SystemFacts, *, purge: bool) -> Plan:
+def plan_removal(facts: SystemFacts, *, purge: bool) -> Plan:
     """Return the steps that undo an installation; with `purge` also edited files and the state.
 
     Raises ModelServerError where nothing was installed.
     """
     manifest = facts.manifest
     if not manifest.files:
-        raise ModelServerError(f"nothing to uninstall: {path_in_root(facts.root, MANIFEST)} has no installation")
+        raise ModelServerError(f"nothing to remove: {path_in_root(facts.root, MANIFEST)} has no installation")
     steps: list[Step] = []
     if manifest.units:
         stop = _systemctl(facts, "stop, and do not start again", "disable", *manifest.units)

@@ -1,4 +1,4 @@
-"""I/O of `install` and `uninstall`: this installation, the state of the system, and the execution of a plan."""
+"""I/O of `install`: this installation, the state of the system, and the execution of a plan."""
 
 from __future__ import annotations
 

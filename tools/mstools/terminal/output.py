@@ -155,14 +155,12 @@ def _make_exists_error(path: str) -> ModelServerError:
 _ASCII = str.maketrans({"→": ">", "├": "|", "└": "`", "─": "-", "│": "|", "·": ".", "⟲": "@"})
 
 
-def format_table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ", numbers: Sequence[int] = ()
-) -> str:
+def format_table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
     """Format rows as aligned columns; the columns in `numbers` are right-aligned."""
     lines = [[escape(cell) for cell in row] for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
-        indent
+        "  "
         + "  ".join(
             cell.rjust(width) if number in numbers else cell.ljust(width)
             for number, (cell, width) in enumerate(zip(line, widths, strict=True))

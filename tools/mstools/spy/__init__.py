@@ -1,1 +1,0 @@
-"""Decoded traffic of all channels: in the terminal, or for lcm-spy."""
