@@ -39,14 +39,12 @@ def delay(
     for number, event in enumerate(events):
         arrival = event.header.host_utime
         # no later event can arrive before this one
-        while waiting and waiting[0][0] <= arrival:
-            yield heapq.heappop(waiting)[2]
+        yield from _release(waiting, arrival)
         at = arrival
         if _is_from(event, source) and chance.random() < share:
             at += round(chance.uniform(min_delay, max_delay) * 1e6)
         heapq.heappush(waiting, (at, number, event if at == arrival else _replace_header(event, host_utime=at)))
-    while waiting:
-        yield heapq.heappop(waiting)[2]
+    yield from _release(waiting, math.inf)
 
 
 def duplicate(
@@ -57,14 +55,12 @@ def duplicate(
     waiting: list[tuple[int, int, Event]] = []
     for number, event in enumerate(events):
         arrival = event.header.host_utime
-        while waiting and waiting[0][0] <= arrival:
-            yield heapq.heappop(waiting)[2]
+        yield from _release(waiting, arrival)
         yield event
         if _is_from(event, source) and chance.random() < share:
             at = arrival + round(chance.uniform(0.0, max_delay) * 1e6)
             heapq.heappush(waiting, (at, number, _replace_header(event, host_utime=at)))
-    while waiting:
-        yield heapq.heappop(waiting)[2]
+    yield from _release(waiting, math.inf)
 
 
 def step_clock_back(
@@ -90,6 +86,12 @@ def step_clock_back(
         if isinstance(changed, RelativePoseSample):
             changed = replace(changed, since_utime=step_utime(changed.since_utime))
         yield changed
+
+
+def _release(waiting: list[tuple[int, int, Event]], until: float) -> Iterator[Event]:
+    """Yield what has arrived until an instant, and remove it from the heap."""
+    while waiting and waiting[0][0] <= until:
+        yield heapq.heappop(waiting)[2]
 
 
 def _is_from(event: Event, source: str | None) -> bool:

@@ -220,29 +220,37 @@ def _correct(setup: Setup, state: Aligned, before: HypothesisBank) -> tuple[Alig
 
     `before`: the bank before the fix.
     """
-    bank, limits = state.bank, output.get_limits(setup, state)
-    assert bank is not None
     state = _judge(setup, state)
-    assert state.bounds is not None
-    text = _describe(bank)
-    ends = before.excludes_fixes and not bank.excludes_fixes and _has_moved(setup, state)
+    reason = _find_reason(setup, state, before)
+    if not reason:
+        return state, ()
+    bank, (limit, _) = state.bank, output.get_limits(setup, state)
+    assert bank is not None
+    # fixes that are off by the hypothesis that the state is set to would move it away again
+    bank = bank.judge_fixes(limit, least=0.0, is_outage=_ends_outage(state))
+    state = _judge(setup, _follow(setup, state._replace(bank=bank)))
+    return state, (report_event(state, KIND, Verdict.RESET, reason),)
+
+
+def _find_reason(setup: Setup, state: Aligned, before: HypothesisBank) -> str:
+    """Return in words why the state must be set to the published hypothesis; empty: it need not."""
+    bank, bounds, limits = state.bank, state.bounds, output.get_limits(setup, state)
+    assert bank is not None
+    assert bounds is not None
     if bank.excludes_fixes and not before.excludes_fixes:
         what = "they jumped" if bank.jumped[bank.published] else "they drift"
-        text = f"fixes are {abs(bank.offset):.1f} m off dead reckoning: {what}"
-    elif not text and _is_turned(setup, state):
-        text = "the heading is not that of dead reckoning which fixes agree with"
-    elif not text and bank.excludes_fixes and _get_distance(setup, state) > SHARE_OF_LIMIT * limits[0]:
-        text = "fixes that drift show another path than dead reckoning"
-    elif not text and (ends or state.bounds.risk > LIMIT_RISK):
+        return f"fixes are {abs(bank.offset):.1f} m off dead reckoning: {what}"
+    if settled := _describe(bank):
+        return settled
+    if _is_turned(setup, state):
+        return "the heading is not that of dead reckoning which fixes agree with"
+    if bank.excludes_fixes and _get_distance(setup, state) > SHARE_OF_LIMIT * limits[0]:
+        return "fixes that drift show another path than dead reckoning"
+    is_other = before.excludes_fixes and not bank.excludes_fixes and _has_moved(setup, state)
+    if not is_other and bounds.risk > LIMIT_RISK:
         own = bank.compute_bounds(bank.pose, limits, setup.settings)
-        if ends or own.risk < CLEARLY_LESS * state.bounds.risk:
-            text = "fixes agree with dead reckoning, the pose does not"
-    if not text:
-        return state, ()
-    # fixes that are off by the hypothesis that the state is set to would move it away again
-    bank = bank.judge_fixes(limits[0], least=0.0, is_outage=_ends_outage(state))
-    state = _judge(setup, _follow(setup, state._replace(bank=bank)))
-    return state, (report_event(state, KIND, Verdict.RESET, text),)
+        is_other = own.risk < CLEARLY_LESS * bounds.risk
+    return "fixes agree with dead reckoning, the pose does not" if is_other else ""
 
 
 def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:

@@ -20,6 +20,9 @@ which one of them begins or ends, with the rate of `FAULTS` as prior. The weight
 of the fix, with shares of outliers and of fixes that show nothing, so that no single fix settles a cause. Hypotheses of
 one kind that began at about the same time are merged by their moments.
 
+Dead reckoning may have been lost itself, in an outage or by a turn that no gyro measured: where fixes that are off have
+the shape of its path, another hypothesis begins at the pose that they show (`suspect_path`).
+
 One of them is published: the likeliest, once those near it weigh `CERTAIN` together. The error of a pose is then the
 mixture sum_h w_h N(p_h - p, P_h): its tails are the levels, and the risk of a limit (`compute_bounds`). The protection
 level covers each hypothesis at an equal share of the risk, so also a fault that cannot be seen yet.
@@ -88,7 +91,7 @@ NOISE_CLASSES: Final = (
 state half or a quarter of what they wander by."""
 
 LARGEST_JUMP: Final = 1e4
-"""Largest standard deviation of a jump, m: beyond, the precision of the covariance ends."""
+"""Largest standard deviation of a jump, m: a variance of 1e8 m2 leaves 1e-8 m2 of sixteen digits."""
 
 DRIFT_RATE: Final = 0.3
 JUMP_SIZE: Final = 20.0
@@ -131,7 +134,8 @@ START_BIAS: Final = 0.003
 """
 
 REST_TURN_TIME: Final = 60.0
-"""Seconds in which a turn at rest fades: by then the bias is off by a tenth of what matters."""
+"""Seconds in which a turn at rest fades: that of a bias off by RATE_FLOOR stays below 0.02 rad, a fifth of a turn that
+shows a carrier."""
 
 TURNING_RATE: Final = 0.03
 CONSTANT_RATE: Final = 0.005
@@ -164,12 +168,13 @@ PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
 LOST_SHARE, LOST_AFTER_OUTAGE = 1e-3, 0.1
-"""Probability that dead reckoning was lost where fixes that are off have the shape of its path, turned, and after an
-outage: gyro and wheels fail as often as fixes jump in ten outages of a minute."""
+"""Probability that dead reckoning was lost where fixes that are off have the shape of its path, turned: a tenth of the
+risk with which a pose is valid, so that it alone makes none invalid. And after an outage: gyro and wheels fail at a
+tenth of the rate at which fixes jump (`FAULTS`)."""
 
 OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
-"""Meters that a vehicle has driven by itself, and standard deviations of a rate at which fixes go on to drift then, so
-that it is not transported."""
+"""Meters that a vehicle has driven by itself, four lengths of a car, and standard deviations of a rate at which
+fixes go on to drift then (6e-7 by chance), so that it is not transported."""
 
 NEVER: Final = np.iinfo(np.int64).min // 2
 GRID: Final = np.linspace(0.0, 1.0, 33)[:, None, None]
@@ -337,15 +342,9 @@ class HypothesisBank(NamedTuple):
         variances[BIAS] += (0.5 * settings.gyro_bias_step) ** 2
         variances[ERROR_RATE:] = 0.0
         P[np.diag_indices(SIZE)] = variances
-        return self._replace(
-            means=np.concatenate((self.means, mean[None])),
-            covariances=np.concatenate((self.covariances, P[None])),
-            weights=np.append(self.weights * (1.0 - share), share),
-            faults=np.append(self.faults, Fault.GYRO),
-            jumped=np.append(self.jumped, 0),
-            noises=np.append(self.noises, 0),
-            onsets=np.append(self.onsets, utime),
-        )
+        labels = np.array(((Fault.GYRO, 0, 0),))
+        bank = self._replace(weights=self.weights * (1.0 - share))
+        return bank._append(mean[None], P[None], np.array((share,)), labels, np.array((utime,)))
 
     @property
     def offset(self) -> complex:
@@ -574,16 +573,22 @@ class HypothesisBank(NamedTuple):
                 covariances[n, :, closes] = 0.0
             for at, sigma in opens:
                 covariances[n, at, at] += sigma * sigma
-        rates = np.array([each[1] for each in children])
+        weights = self.weights[parents] * np.array([each[1] for each in children]) * (seconds / 3600.0)
         labels = np.array([each[2:5] for each in children])
+        return self._append(means, covariances, weights, labels, np.array([each[5] for each in children], np.int64))
+
+    def _append(
+        self, means: Array, covariances: Array, weights: Array, labels: Labels, onsets: Labels
+    ) -> HypothesisBank:
+        """Return the bank with m hypotheses more; `labels` (m, 3) are fault, jump and noise class of each."""
         return self._replace(
             means=np.concatenate((self.means, means)),
             covariances=np.concatenate((self.covariances, covariances)),
-            weights=np.concatenate((self.weights, self.weights[parents] * rates * (seconds / 3600.0))),
+            weights=np.concatenate((self.weights, weights)),
             faults=np.concatenate((self.faults, labels[:, 0])),
             jumped=np.concatenate((self.jumped, labels[:, 1])),
             noises=np.concatenate((self.noises, labels[:, 2])),
-            onsets=np.concatenate((self.onsets, np.array([each[5] for each in children], np.int64))),
+            onsets=np.concatenate((self.onsets, onsets)),
         )
 
     def _reduce(self, utime: int) -> HypothesisBank:
@@ -611,23 +616,17 @@ class HypothesisBank(NamedTuple):
         spread = self.covariances[left] + apart[:, :, None] * apart[:, None, :]
         covariances = (shares @ spread.reshape(len(left), -1)).reshape(len(sums), SIZE, SIZE)
         first = left[np.argmax(shares, axis=1)]
-        bank = HypothesisBank(
-            utime,
-            means,
-            0.5 * (covariances + covariances.transpose(0, 2, 1)),
-            sums / sums.sum(),
-            self.faults[first],
-            self.jumped[first],
-            self.noises[first],
-            self.onsets[first],
-            int(group[np.searchsorted(left, self.published)]),
-            self.inflation,
-            self.rest_rate,
-            sigma=self.sigma,
-            excludes_fixes=self.excludes_fixes,
-            may_be_transported=self.may_be_transported,
-            may_be_lost=self.may_be_lost,
-            reckoning=self.reckoning,
+        bank = self._replace(
+            utime=utime,
+            means=means,
+            covariances=0.5 * (covariances + covariances.transpose(0, 2, 1)),
+            weights=sums / sums.sum(),
+            faults=self.faults[first],
+            jumped=self.jumped[first],
+            noises=self.noises[first],
+            onsets=self.onsets[first],
+            published=int(group[np.searchsorted(left, self.published)]),
+            settled=Fault.NONE,
         )
         return bank._select()
 

@@ -34,8 +34,9 @@ INTERPOLATED_SAMPLES: Final = 3
 
 DEAD_SAMPLES: Final = 10
 DEAD_CHANCE: Final = 1e-12
-"""Samples in a row in which a gyro's axis is dead, at least, and the chance that a healthy one repeats its rate: once
-in three hundred years at 100 Hz."""
+"""Samples in a row in which a gyro's axis is dead, at least: a driver that joins axes of different rates repeats the
+slower ones, up to ten times; and the chance that a healthy one repeats its rate: once in three hundred years at 100 Hz.
+"""
 
 
 class GyroAxes(NamedTuple):

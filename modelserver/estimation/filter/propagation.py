@@ -40,7 +40,7 @@ def is_outage(state: Aligned, utime: int) -> bool:
 def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise:
     """Return the process noise at an instant of the state."""
     if setup.uses_imu(state.common.mode):
-        if (nav.utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold:
+        if is_imu_fresh(setup, state, nav.utime):
             return _select_imu_noise(setup, state)
     elif state.is_stationary:
         return setup.stationary
@@ -71,6 +71,11 @@ def measures_turn_rate(setup: Setup, state: Navigating, utime: int) -> bool:
     """Return whether a gyro of the turn rate alone measures it at an instant."""
     if setup.yaw_gyro is None or state.common.mode is Mode.NO_IMU:
         return False
+    return is_imu_fresh(setup, state, utime)
+
+
+def is_imu_fresh(setup: Setup, state: Navigating, utime: int) -> bool:
+    """Return whether the last sample of the IMU, or of a gyro of the turn rate alone, holds at an instant."""
     return (utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold
 
 
@@ -79,7 +84,7 @@ def propagate_imu(
 ) -> N:
     """Return the state at an IMU sample (`rate`, `force`: body axes); `stationary` and `imu` are those after it."""
     nav = state.nav
-    if (utime - state.imu.used_utime) * 1e-6 > setup.settings.rate_hold:
+    if not is_imu_fresh(setup, state, utime):
         state = predict(setup, state, utime)
         nav = state.nav
         noise = select_noise(setup, state, nav)
@@ -122,7 +127,7 @@ def follow_gyro(
 def follow_wheels(setup: Setup, state: Navigating, utime: int, turn: TurnRate) -> DeadReckoning:
     """Return dead reckoning after the turn rate by wheels in place of a gyro that has gone silent."""
     reckoning, settings = state.reckoning, setup.settings
-    if not reckoning.gyro_utime or (utime - state.imu.used_utime) * 1e-6 <= settings.rate_hold:
+    if not reckoning.gyro_utime or is_imu_fresh(setup, state, utime):
         return reckoning
     # what a gyro with the present bias would measure; an error lasts `slip_time`
     rate, gap = turn.value + state.nav.gyro_bias[2], (utime - reckoning.gyro_utime) * 1e-6

@@ -39,7 +39,7 @@ from modelserver.estimation.filter.measurements.wheels import (
 )
 from modelserver.estimation.filter.mount_monitor import MountMonitor
 from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, Navigating, PreviousSample, Unaligned
+from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, N, PreviousSample, Unaligned
 from modelserver.estimation.filter.wheel_monitor import RECEIVED, SteeringAngle
 from modelserver.messages import Decision, Mode, VehicleStatusSample, Verdict, WheelsSample
 from modelserver.transforms import so3
@@ -95,7 +95,7 @@ def fuse_wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         state = state._replace(reckoning=bank_step.predict_path(setup, state))
     nav = state.nav._replace(travel=ZERO, rotation=ZERO)
     state = state._replace(nav=nav, common=remember(state.common, (item.source, item.kind), item))
-    if not (has_imu and _has_gyro(setup, state, item.utime)):
+    if not (has_imu and propagation.is_imu_fresh(setup, state, item.utime)):
         state, more = _fuse_stationary(setup, state, item.utime, are_stationary is True)
         decisions += more
     # the first wheels that measure a speed leave the sideways speed to the constraint
@@ -150,7 +150,7 @@ def _fuse_speed(
             innovation = innovation._replace(jacobian=again.jacobian)
     nav, decision = eskf.update(context.nav, innovation, settings, item.utime, item.source, item.seq, item.kind)
     nav = hold_latency(context.nav, nav, setup.layout)
-    has_gyro = _has_gyro(setup, state, item.utime)
+    has_gyro = setup.uses_imu(state.common.mode) and propagation.is_imu_fresh(setup, state, item.utime)
     if has_gyro and not are_stationary and len(innovation.residual) > 1:
         # two sides roll differently for good, by more than a gyro's bias
         nav = hold_bias(context.nav, nav)
@@ -254,11 +254,6 @@ def _has_speed_sigma(nav: NavState, sigma: float) -> bool:
     """Return whether the standard deviation of the horizontal velocity is larger, m/s."""
     P = nav.covariance
     return float(P[3, 3] + P[4, 4]) > sigma**2
-
-
-def _has_gyro(setup: Setup, state: Navigating, utime: int) -> bool:
-    """Return whether the IMU propagates the state at an instant."""
-    return setup.uses_imu(state.common.mode) and (utime - state.imu.used_utime) * 1e-6 <= setup.settings.rate_hold
 
 
 def _get_wheels(previous: PreviousSample | None) -> WheelsSample | None:
