@@ -101,7 +101,6 @@ class Suggestion(tuple[str, ...]):
 
     @classmethod
     def of(cls, replaced: str, *names: str) -> Suggestion:
-        """Return the suggestion of `names` for `replaced`."""
         found = cls(name for name in names if name)
         found.replaced = replaced
         return found
@@ -156,7 +155,6 @@ class Problem:
 
 
 def has_error(problems: Iterable[Problem]) -> bool:
-    """Return whether one of the problems is an error."""
     return any(each.severity is Severity.ERROR for each in problems)
 
 
@@ -388,5 +386,4 @@ class OutOfDateError(NoServerError):
 
 
 def make_status_error(status: int, message: str, nearest: Iterable[str] = ()) -> QueryError:
-    """Return the exception for the status of a reply."""
     return QueryError.by_status.get(status, ServerError)(message, nearest)

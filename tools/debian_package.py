@@ -157,7 +157,6 @@ def read_output(*command: str, environment: Mapping[str, str] = MappingProxyType
 
 
 def write_script(path: Path, text: str) -> None:
-    """Write a program."""
     path.write_text(text)
     path.chmod(0o755)
 

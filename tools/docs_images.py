@@ -36,7 +36,6 @@ def format_points(points: Iterable[tuple[float, float]]) -> str:
 
 
 def render_text(x: float, y: float, words: str, **attributes: str | float) -> str:
-    """Return words at a baseline."""
     return element("text", html.escape(words), x=x, y=y, **attributes)
 
 
@@ -63,7 +62,6 @@ class Drawing:
             self.text(x + width / 2, top + 16 * number, line, 11 if number else 13)
 
     def line(self, *points: tuple[float, float], color: str = LINE, width: float = 1.6, dash: str = "none") -> None:
-        """Draw a polyline."""
         style = {"points": format_points(points), "fill": "none", "stroke": color, "stroke_dasharray": dash}
         self.parts.append(element("polyline", **style, stroke_width=width))
 
@@ -79,12 +77,10 @@ class Drawing:
             self.text((points[0][0] + x2) / 2, (points[0][1] + y2) / 2 - 6, words, 11)
 
     def polygon(self, points: Iterable[tuple[float, float]], fill: str, color: str = "none") -> None:
-        """Draw a closed shape."""
         style = {"points": format_points(points), "fill": fill, "stroke": color}
         self.parts.append(element("polygon", **style, stroke_width=1.2))
 
     def dot(self, x: float, y: float, radius: float, fill: str, color: str = "none") -> None:
-        """Draw a disk, with an outline in `color`."""
         self.parts.append(element("circle", cx=x, cy=y, r=radius, fill=fill, stroke=color))
 
     def svg(self) -> str:

@@ -77,7 +77,6 @@ def help_text(*command: str) -> str:
 
 
 def _children(text: str) -> list[str]:
-    """Return the subcommands that a help text lists."""
     return re.findall(r"^  ([a-z-]+)  ", text.partition("\nCommands:\n")[2], re.MULTILINE)
 
 
@@ -237,7 +236,6 @@ def types_page() -> str:
 
 
 def constants_of(struct: Struct) -> list[Constant]:
-    """Return the constants of a struct."""
     return [constant for each in struct.fields for constant in each.constants]
 
 

@@ -52,7 +52,6 @@ def read_fingerprints(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def format_lock(fingerprints: Mapping[str, str]) -> str:
-    """Return the text of contract.lock."""
     return LOCK_HEADER + "".join(f"{name} 0x{fingerprints[name]}\n" for name in sorted(fingerprints))
 
 

@@ -83,7 +83,6 @@ class Field:
 
     @property
     def value_name(self) -> str:
-        """Its name in the value."""
         return self.options.get("if_ok") or self.options.get("as") or re.split(r"\W", self.of)[0] or self.name
 
     @property
@@ -98,7 +97,6 @@ class Field:
 
     @property
     def words(self) -> str:
-        """The name of the constant with the words of a field that is a word."""
         return f"{self.name.upper()}_WORDS"
 
     @property
@@ -152,7 +150,6 @@ class Struct:
         return [values[name] for name in order] if order else list(values.values())
 
     def count_of(self, name: str) -> Field | None:
-        """Return the field of that name if it counts the entries of an array."""
         is_counted = any(name in each.dimensions for each in self.fields)
         return next((each for each in self.fields if is_counted and each.name == name), None)
 
@@ -167,7 +164,6 @@ class Struct:
         return Struct(self.name, about, {"value": f"{name} tuple"}, self.fields[1:]) if name else None
 
     def columns(self, count: Field) -> list[Field]:
-        """Return the arrays whose length is `count`."""
         return [each for each in self.fields if count.name in each.dimensions]
 
 
@@ -177,7 +173,6 @@ _OPTION = re.compile(r"@(\w+)([^@]*)")
 
 
 def _read_comments(lines: Iterable[str]) -> tuple[str, dict[str, str]]:
-    """Return the text and the options of comment lines."""
     text, options = [], {}
     for line in lines:
         if line.startswith("@"):
@@ -236,7 +231,6 @@ class _Values:
         self.names: list[str] = []
 
     def write(self) -> str:
-        """Return the body of the module."""
         parts: list[str] = []
         for struct in self._structs.values():
             parts += self._write_struct(struct)
@@ -369,7 +363,6 @@ class _Codecs:
         self._formats: dict[str, str] = {}
 
     def struct_of(self, code: str) -> str:
-        """Return the name of the struct.Struct of a format."""
         return self._formats.setdefault(code, f"_S{len(self._formats)}")
 
     def formats(self) -> str:
@@ -433,7 +426,6 @@ class _Codecs:
             atoms.append((CODES[each.type], counted))
 
     def _length(self, struct: Struct, count: Field, value: str) -> str:
-        """Return the expression of a count."""
         if "triangle" in count.options:
             rows = self._triangle_rows(struct, count, value)
             return f"{rows} * ({rows} + 1) // 2"

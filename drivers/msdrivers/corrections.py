@@ -50,11 +50,9 @@ class CorrectionsClient:
         self._thread = threading.Thread(target=self._run, name=f"corrections of {name}", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread."""
         self._is_stopping.set()
         if self._thread.is_alive():
             self._thread.join()

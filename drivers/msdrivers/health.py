@@ -24,12 +24,10 @@ class DriverPublisher:
     prefix: str = ""
 
     def publish_sample(self, sample: Sample) -> None:
-        """Publish a sample on the channel of its type."""
         kind = type(sample)
         self.send(f"{self.prefix}{self.channels.get(kind) or CHANNELS[kind]}", encode(sample))
 
     def publish_health(self, health: DriverHealth) -> None:
-        """Publish a health report."""
         self.send(f"{self.prefix}{HEALTH_CHANNEL}", encode(health))
 
 
@@ -87,7 +85,6 @@ class HealthReporter:
         return NAN if self._sample_ns is None else (now.monotonic_ns - self._sample_ns) * 1e-9
 
     def count_sample(self, now: HostTime) -> None:
-        """Count a sample."""
         self.samples += 1
         self._sample_ns = now.monotonic_ns
 

@@ -114,7 +114,6 @@ LineSettings: TypeAlias = SerialSettings | TcpSettings | CanSettings | ModbusSet
 
 
 def get_line_key(kind: type[LineSettings]) -> str:
-    """Return the key by which a section names this kind of line."""
     return dataclasses.fields(kind)[0].name
 
 

@@ -52,7 +52,6 @@ class ReconnectBackoff:
         self._failing_since_ns = 0
 
     def on_open(self, at_ns: int) -> None:
-        """Record that the line was opened."""
         self._opened_ns = at_ns
         if not self._failures:
             self._failing_since_ns = at_ns
@@ -116,7 +115,6 @@ class SystemTimeSource:
         return HostTime(monotonic_ns, time_ns // 1000)
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
         time.sleep(seconds)
 
 
@@ -173,12 +171,10 @@ class Runner(Generic[U]):
 
     @property
     def samples(self) -> int:
-        """Number of published samples."""
         return self._reporter.samples
 
     @property
     def state(self) -> tuple[DriverPhase, str]:
-        """Phase and status text."""
         return self._reporter.state
 
     def run(self, before_pass: Callable[[], object] = lambda: None) -> None:

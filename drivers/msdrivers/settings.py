@@ -73,7 +73,6 @@ _NUMBER = re.compile(r"-?\d+(\.\d*)?")
 
 
 def format_value(value: str | float) -> str:
-    """Format a value as in a vehicle file."""
     if isinstance(value, str):
         return quote(value)
     return str(value).lower() if isinstance(value, bool) else f"{value}"
@@ -94,7 +93,6 @@ class SectionReader(SettingsReader):
         self._has_line = True
 
     def locate(self, at: Path_) -> Location:
-        """Return the location of a key path of the section."""
         return self._locate_key("drivers", self.name, *at)
 
     def read_kind(self, kinds: Mapping[str, DeviceKind]) -> DeviceKind:
@@ -174,7 +172,6 @@ class SectionReader(SettingsReader):
             self.section = {near[0] if name == key else name: value for name, value in self.section.items()}
 
     def report(self, key: str, message: str, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
-        """Report a problem of a key."""
         self.problems.append(Problem(Severity.ERROR, message, self.locate((key,)), fix, nearest))
 
     def read_values(self, kind: type, given: Mapping[str, Any] | None = None) -> Any:

@@ -6,8 +6,6 @@ explains how to run it on a real port.
     python examples/python/own_device.py
 """
 
-# ruff: noqa: D102 - the methods are documented in msdrivers.endpoint
-
 import re
 from collections import Counter
 from dataclasses import dataclass

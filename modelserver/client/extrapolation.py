@@ -183,11 +183,9 @@ class PoseExtrapolator:
         return max(POSE_TIMEOUT_S, POSE_TIMEOUT_PERIODS * self.period)
 
     def process(self, sample: Sample | SwitchMode) -> tuple[PoseExtrapolator, tuple[()]]:
-        """Return self: clients process no samples."""
         return self, ()
 
     def defer_estimate(self, utime: int) -> Estimate:
-        """Return `estimate`."""
         return self.estimate(utime)
 
     def navigation(self, utime: int) -> NavigationState | None:

@@ -190,7 +190,6 @@ class PlatformMirror(LocalPlatform):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The subscribed channels."""
         return self._receiver.channels
 
 

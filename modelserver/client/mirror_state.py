@@ -240,7 +240,6 @@ class MirrorReceiver:
         )
 
     def _process_pose_pair(self, world: PoseAnswer, odom: PoseAnswer, now: int) -> None:
-        """Process a POSE and a POSE_ODOM of the same time."""
         state, transformation, utime = self.state, world.transformation, world.transformation.utime
         history = state.history
         sample = OdomSample(utime, odom.transformation.pose)

@@ -186,7 +186,6 @@ class SettingsReader:
         return values
 
     def add_problem(self, at: Path_, message: str, fix: str) -> None:
-        """Record a problem at a path."""
         self.problems.append(Problem(Severity.ERROR, message, self.locate(at), fix))
 
     def rename(self, values: Any, at: Path_, meant: str) -> bool:

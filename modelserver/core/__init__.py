@@ -37,7 +37,6 @@ from modelserver.core.ticks import get_state_to_persist, handle_tick
 
 
 def step(state: CoreState, event: messages.Event | commands.ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
-    """Return the state after an event, and the outputs to send."""
     return _HANDLERS[type(event)](state, event, now)
 
 

@@ -126,7 +126,6 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
 
 
 def _set_pose(state: CoreState, request: messages.SetStateVector | messages.SetHTransform, now: Instant) -> StepResult:
-    """Fuse a pose that a client sets."""
     given, view = request.pose.transformation, state.view
     state = state._replace(requests_answered=state.requests_answered + 1)
     origin = None if view.localizer is None else view.localizer.estimate(now.utime).origin

@@ -36,7 +36,6 @@ class HostClock(NamedTuple):
 
     @classmethod
     def start(cls, now: Instant) -> HostClock:
-        """Return the first reading."""
         monotonic_ns, utime = now
         offset = utime - monotonic_ns // 1000
         return cls(monotonic_ns, utime, offset, offset)

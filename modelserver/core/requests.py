@@ -100,7 +100,6 @@ def _make_replies(state: CoreState, request: Request, now: Instant) -> tuple[Sen
 
 
 def reply_overloaded(state: CoreState, request: Request, now: Instant) -> Outputs:
-    """Reply to a request that is dropped because of overload."""
     message = "the server is overloaded and dropped the request; try again later"
     return reply_error(state, type(request), request.header, Status.OVERLOADED, message, now)
 

@@ -194,7 +194,6 @@ class CoreState(NamedTuple):
 
     @property
     def model(self) -> Model:
-        """The current geometry."""
         return self.view.model
 
     @property
@@ -252,7 +251,6 @@ def check_rigid(model: Model, base_frame: str, rolling_frame: str) -> None:
 
 
 def handle_rejected(state: CoreState, rejected: messages.Rejected, now: Instant) -> StepResult:
-    """Count a rejected message."""
     return count_rejection(state, rejected.channel, rejected.reason, rejected.count), ()
 
 

@@ -192,7 +192,6 @@ class Dynamics:
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The bodies that count as massless."""
         return self.tree.massless
 
     @property

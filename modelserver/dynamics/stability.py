@@ -114,7 +114,6 @@ def _dot(a: Vector3, b: Vector3) -> float:
 
 
 def _reject(v: Vector3, unit: Vector3) -> Vector3:
-    """Return the part of a vector that is normal to a unit vector."""
     return so3.add(v, so3.scale(-_dot(v, unit), unit))
 
 

@@ -131,7 +131,6 @@ class LocalFrame:
         return so3.rotate_back(self.rotation, (ecef[0] - a, ecef[1] - b, ecef[2] - c))
 
     def rotation_of(self, other: LocalFrame) -> Quaternion:
-        """Return the rotation from the axes of `other` to those of this frame."""
         return so3.multiply(so3.conjugate(self.rotation), other.rotation)
 
 

@@ -40,9 +40,7 @@ class DeferredEstimate(Protocol):
     """An estimate for `utime` that is computed when it is first read."""
 
     @property
-    def utime(self) -> int:
-        """The instant that it is for."""
-        ...
+    def utime(self) -> int: ...
 
     def resolve(self) -> Estimate:
         """Return the estimate, the same each time."""
@@ -68,7 +66,6 @@ class _EstimateBlock:
         self.estimates = []
 
     def copy(self, count: int) -> _EstimateBlock:
-        """Return a block with the first estimates."""
         other = _EstimateBlock()
         other.times, other.estimates = self.times[:count], self.estimates[:count]
         return other

@@ -36,9 +36,7 @@ class PersistentLocalizer(Protocol):
 class Localizer(Protocol):
     """An immutable localizer state. No clock: time comes in samples."""
 
-    def process(self, sample: Sample | SwitchMode) -> tuple[Self, tuple[LocalizerEvent, ...]]:
-        """Return the state after a sample, and the events."""
-        ...
+    def process(self, sample: Sample | SwitchMode) -> tuple[Self, tuple[LocalizerEvent, ...]]: ...
 
     def estimate(self, utime: int) -> Estimate:
         """Return the base frame's pose predicted to `utime` from the samples processed."""
@@ -56,9 +54,7 @@ class Localizer(Protocol):
         """Return the bits of STALE_SENSORS of an estimate at `utime`, at a fraction of its cost."""
         ...
 
-    def summary(self, utime: int) -> LocalizerSummary:
-        """Return the status at `utime`."""
-        ...
+    def summary(self, utime: int) -> LocalizerSummary: ...
 
     @property
     def utime(self) -> int:

@@ -128,7 +128,6 @@ class ModeLocalizer(NamedTuple):
         return self.active.get_state_to_persist() if isinstance(self.active, FilterLocalizer) else None
 
     def find_stale_sensors(self, utime: int) -> Invalid:
-        """Return the bits of STALE_SENSORS of an estimate at `utime`."""
         return self.active.find_stale_sensors(utime)
 
     def summary(self, utime: int) -> LocalizerSummary:

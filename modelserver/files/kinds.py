@@ -26,7 +26,6 @@ class FileKind(Enum):
 
     @property
     def is_empty(self) -> bool:
-        """Whether the file has no content."""
         return self in (FileKind.EMPTY, FileKind.COMMENTS)
 
 

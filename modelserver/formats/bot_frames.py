@@ -61,11 +61,9 @@ class ParamBlock:
     entries: list[tuple[str, ParamValue | ParamBlock]] = field(default_factory=list)
 
     def values(self) -> Iterator[tuple[str, ParamValue]]:
-        """Yield the assignments."""
         return ((name, entry) for name, entry in self.entries if isinstance(entry, ParamValue))
 
     def blocks(self) -> Iterator[tuple[str, ParamBlock]]:
-        """Yield the blocks inside."""
         return ((name, entry) for name, entry in self.entries if isinstance(entry, ParamBlock))
 
 

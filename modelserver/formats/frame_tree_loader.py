@@ -61,7 +61,6 @@ class FramePath:
 
     @property
     def name(self) -> str:
-        """Name of the frame, without its ancestors."""
         return self.parts[-1] if self.parts else ""
 
     @property
@@ -134,7 +133,6 @@ class Ancestry:
 
 
 def find_instances(root: Element) -> Iterator[Element]:
-    """Yield the elements of this format."""
     for element in root.iter("{*}instance"):
         if (element.get("type") or "").strip().endswith("FrameRpyParameters"):
             yield element
@@ -272,7 +270,6 @@ class _FrameTreeReader(ElementReader):
             )
 
     def report_other_types(self, root: Element) -> None:
-        """Report instances of other types, which are not read."""
         passed: defaultdict[str, list[int]] = defaultdict(list)
         for element in root.iter("{*}instance"):
             kind = (element.get("type") or "").strip()

@@ -108,11 +108,9 @@ class ElementReader:
         self.builder.add_error(message, self.locate(at), fix, nearest)
 
     def warning(self, message: str, fix: str, at: int | str = 0, nearest: tuple[str, ...] = ()) -> None:
-        """Report a warning, as `error`."""
         self.builder.add_warning(message, self.locate(at), fix, nearest)
 
     def note(self, message: str, fix: str = "", at: int | str = 0) -> None:
-        """Report a note, as `error`."""
         self.builder.add_problem(Severity.NOTE, message, self.locate(at), fix)
 
     def check_position(self, position: Sequence[float], line: int = 0) -> bool:

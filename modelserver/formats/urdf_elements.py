@@ -33,11 +33,9 @@ class UrdfElement(ElementReader):
         self.name = get_name(element)
 
     def enter(self, element: Element, place: str) -> UrdfElement:
-        """Return another element of the file."""
         return UrdfElement(self.builder, self.file, element, place)
 
     def children(self) -> Iterator[UrdfElement]:
-        """Yield the elements inside, at the place of this one."""
         return (self.enter(child, self.place) for child in iterate_children(self.element))
 
     def get(self, key: str) -> str:
@@ -85,7 +83,6 @@ class UrdfElement(ElementReader):
             return None
 
     def read_number(self, key: str, default: float | None = None) -> float | None:
-        """Read the number of an attribute, as `read_numbers`."""
         values = self.read_numbers(key, 1, None if default is None else (default,))
         return None if values is None else values[0]
 

@@ -238,7 +238,6 @@ class _UrdfReader:
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=at.locate())
 
     def suggest(self, name: str, known: Iterable[str]) -> Suggestion:
-        """Return the known name that an unknown one misspells."""
         self.suggestion_count += 1
         return suggest_name(name, known) if self.suggestion_count <= MAX_SUGGESTIONS else Suggestion()
 

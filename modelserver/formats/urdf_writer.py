@@ -217,7 +217,6 @@ class _UrdfWriter:
         return name
 
     def add_fixed_joint(self, name: str, parent: str, child: str, pose: Pose) -> None:
-        """Add a fixed joint that is not a constraint of the model."""
         while name in self.joint_names:
             name += "_"
         self.joint_names.add(name)

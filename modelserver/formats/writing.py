@@ -47,7 +47,6 @@ def format_element(
 
 
 def format_names(names: list[str], limit: int = 5) -> str:
-    """Return the names as one phrase, truncated to `limit` names."""
     rest = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 

@@ -390,7 +390,6 @@ class _YamlJointReader:
         return None if value is None else (value,)
 
     def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
-        """Read one number that is not too large."""
         value = self.at.read_number(node, key, fix)
         if value is not None and abs(value) > MAX_POSITION:
             self.at.error(f"{key}: {value:g} is out of reach; the limit is {MAX_POSITION:g}", fix, node.line)

@@ -219,11 +219,9 @@ class YamlMapping(ElementReader):
                 self.fields[name] = value
 
     def enter(self, node: YamlNode, place: str, known: tuple[str, ...] = ()) -> YamlMapping:
-        """Return another mapping of the file."""
         return YamlMapping(self.builder, self.file, node, place, known)
 
     def line_of(self, key: str) -> int:
-        """Return the line of the value of a key; 0 if it is absent."""
         return self.fields[key].line if key in self.fields else 0
 
     def read_text(self, key: str) -> str:

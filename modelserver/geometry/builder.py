@@ -70,7 +70,6 @@ class BodyBuilder:
         sigma: Sigma | None = None,
         source: Location = NO_LOCATION,
     ) -> BodyBuilder:
-        """Add a frame at `pose` in body coordinates; return this body."""
         self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
         return self
 

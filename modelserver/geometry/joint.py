@@ -231,7 +231,6 @@ class Joint:
 
 
 def coordinate_names(constraint: str, joint: Joint) -> tuple[str, ...]:
-    """Return the names of the coordinates of a constraint's joint."""
     return tuple([constraint + suffix for suffix in SUFFIXES[joint.type]])
 
 

@@ -122,7 +122,6 @@ class KinematicPath:
 
     @property
     def default_positions(self) -> tuple[Coordinates, ...]:
-        """The default positions of the joints."""
         return tuple([item.joint.default_position for item in self.joints])
 
     def compute_joint_poses(self, positions: Sequence[Coordinates]) -> list[PlainPose]:

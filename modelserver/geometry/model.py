@@ -92,7 +92,6 @@ class Model:
 
     @property
     def root(self) -> Body:
-        """The first body in the file."""
         return self.bodies[0]
 
     @property
@@ -413,7 +412,6 @@ def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> 
 
 
 def _get_content(value: Pose | Sigma | Joint | Mimic) -> object:
-    """Return the numbers of a value in the revision."""
     if isinstance(value, Pose):
         return value.xyz, value.wxyz
     if not isinstance(value, Joint):

@@ -18,7 +18,6 @@ RESERVED_BODIES = ("World", "Odom")
 
 
 def join(body: str, frame: str) -> str:
-    """Return the full name of a frame."""
     return f"{body}:{frame}"
 
 

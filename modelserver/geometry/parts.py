@@ -63,7 +63,6 @@ class BodyFrame:
 
     @property
     def full_name(self) -> str:
-        """The name `Body:Frame`; the plain name while it is on no body."""
         return names.join(self.body, self.name) if self.body else self.name
 
 

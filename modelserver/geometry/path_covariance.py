@@ -71,7 +71,6 @@ class JointJacobian(NamedTuple):
 
     @classmethod
     def at(cls, joint: Joint, X_BF: Pose) -> JointJacobian:
-        """Return the Jacobian of a joint at a pose."""
         found = cls(joint, X_BF, [])
         return found._replace(twists=found.compute_twists((0.0,) * joint.count))
 

@@ -46,12 +46,10 @@ class Crossing:
 
     @property
     def near_body(self) -> str:
-        """The body that the path leaves."""
         return self.near_frame.partition(":")[0]
 
     @property
     def far_body(self) -> str:
-        """The body that the path enters."""
         return self.far_frame.partition(":")[0]
 
     @property
@@ -68,12 +66,10 @@ class LoopClosure(NamedTuple):
 
     @property
     def constraint(self) -> str:
-        """The name of the constraint."""
         return self.path[0].constraint.name
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """The bodies of the loop."""
         return tuple([crossing.far_body for crossing in reversed(self.path)])
 
 

@@ -70,5 +70,4 @@ class PoseBatch(NamedTuple):
     model_revision: str = ""
 
     def slice_instants(self, first: int, end: int) -> PoseBatch:
-        """Return the poses at the instants `first:end`."""
         return PoseBatch._make([each[first:end] if isinstance(each, np.ndarray) else each for each in self])

@@ -17,9 +17,7 @@ class MotionCovariance(Protocol):
     A value with fields, not a function, so that the journal can store it.
     """
 
-    def __call__(self) -> tuple[float, ...]:
-        """Return the 36 numbers."""
-        ...
+    def __call__(self) -> tuple[float, ...]: ...
 
 
 class VehicleMotion(NamedTuple):

@@ -145,7 +145,6 @@ def make_error_reply(
     utime: int,
     nearest: tuple[str, ...] = (),
 ) -> Reply:
-    """Return an error reply of the type that belongs to a type of request."""
     return _REPLY_TYPES[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
 
 

@@ -59,7 +59,6 @@ class BatchState:
         return replace(self, utimes=np.clip(self.utimes, first, last), status=status.astype(np.int32))
 
     def add_flags(self, invalid: Flags | int, quality: Flags | int) -> BatchState:
-        """Return the state with more reasons and flags."""
         return replace(self, invalid=self.invalid | invalid, quality=self.quality | quality)
 
 

@@ -82,7 +82,6 @@ def compute_motion(
 
 
 def _compose(steps: Sequence[PathStep], motions: list[RigidMotion]) -> RigidMotion:
-    """Return the motion along a path."""
     moved = RigidMotion(Pose.identity())
     for step, each in zip(steps, motions, strict=True):
         moved = moved.compose(each if step.edge.forward else each.inverse())

@@ -42,7 +42,6 @@ class PathStep(NamedTuple):
 
     @property
     def link(self) -> ChainLink:
-        """The step as a link of a chain."""
         is_large_angle = self.edge.kind is EdgeKind.VEHICLE
         return ChainLink(self.X_FT, self.edge.forward, self.factor, self.source, is_large_angle)
 
@@ -57,7 +56,6 @@ class PathState(NamedTuple):
 
     @property
     def links(self) -> list[ChainLink]:
-        """The steps as links of a chain."""
         return [step.link for step in self.steps]
 
 

@@ -148,7 +148,6 @@ class PlatformView(NamedTuple):
     def _lookup_within_vehicle(
         self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int
     ) -> PoseAnswer:
-        """Return a relation within the vehicle."""
         model = self.model
         try:
             rigid = model.rigid_transformation(frame_of_interest, frame_of_reference)

@@ -77,7 +77,6 @@ class MulticastMembership:
         return True
 
     def close(self) -> None:
-        """Leave the group."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

@@ -36,7 +36,6 @@ class Clock:
         return new_tuple(Instant, (time.monotonic_ns(), time.time_ns() // 1000))
 
     def sleep(self, seconds: float) -> None:
-        """Sleep."""
         time.sleep(seconds)
 
 
@@ -48,7 +47,6 @@ class FakeClock(Clock):
         self._monotonic_ns = monotonic_ns
 
     def set(self, now: Instant) -> None:
-        """Set both clocks."""
         self._monotonic_ns, self._utime_ns = now.monotonic_ns, now.utime * 1000
 
     def monotonic_ns(self) -> int:
@@ -60,16 +58,13 @@ class FakeClock(Clock):
         return self._utime_ns // 1000
 
     def now(self) -> Instant:
-        """Return both times."""
         return Instant(self._monotonic_ns, self._utime_ns // 1000)
 
     def advance(self, seconds: float) -> None:
-        """Advance both clocks."""
         self._monotonic_ns += round(seconds * 1e9)
         self._utime_ns += round(seconds * 1e9)
 
     def sleep(self, seconds: float) -> None:
-        """Sleep."""
         self.advance(seconds)
 
     def step_utime(self, seconds: float) -> None:

@@ -70,5 +70,4 @@ class FakeBus:
             self._clock.advance(max(seconds, 0.0))
 
     def get_published(self, channel: str) -> list[bytes]:
-        """Return the messages that were published on a channel."""
         return [data for name, data in self.published if name == channel]

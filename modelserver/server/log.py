@@ -41,7 +41,6 @@ class RateLimitedLog:
         self._suppressed: dict[str, int] = {}
 
     def warning(self, cause: str, message: str, *values: object) -> None:
-        """Log a warning."""
         self._log(logging.WARNING, cause, message, values, trace=False)
 
     def exception(self, cause: str, message: str, *values: object) -> None:
@@ -71,7 +70,6 @@ def escape_lines(text: str) -> str:
 
 
 def escape_text(text: str) -> str:
-    """Escape all characters of `text` that are not printable."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
@@ -140,7 +138,6 @@ class PlainFormatter(logging.Formatter):
     """Formats as `LEVEL name: message`, further lines indented."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record's lines."""
         first, *rest = lines_of(record)
         return "\n".join((f"{record.levelname} {record.name}: {first}", *rest))
 
@@ -187,7 +184,6 @@ class JournalHandler(logging.StreamHandler[TextIO]):
             self.handleError(record)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
         super().close()
 

@@ -376,7 +376,6 @@ class Loop:
             self.send(outputs)
 
     def publish(self, channel: str, data: bytes) -> None:
-        """Record and publish a message."""
         self._journal.record_published(channel, data)
         self._transmit(channel, data)
 

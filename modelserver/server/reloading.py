@@ -87,7 +87,6 @@ class GeometryReader:
             self._process.kill()
 
     def _finish(self, command: LoadModel, found: NewGeometry, state: CoreState) -> ModelLoaded:
-        """Return the event with the localizer for the new geometry."""
         if found.vehicle is None:
             return ModelLoaded(command.request, why=found.why)
         self._snapshot = (found.vehicle.model, found.snapshot)

@@ -167,7 +167,6 @@ class Vehicle:
         return publish.rate_hz * self.ticks_per_pose() if publish.mode == "timer" else HOUSEKEEPING_HZ
 
     def ticks_per_state(self) -> int:
-        """Return the ticks per LOCALIZATION_STATE; 0 if it is not configured."""
         state_hz = self.config.publish.state_hz
         return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
 

@@ -84,7 +84,6 @@ def figure_eight(
 
 
 def stationary(seconds: float) -> tuple[DrivePhase, ...]:
-    """Return: stationary."""
     return (DrivePhase(seconds),)
 
 

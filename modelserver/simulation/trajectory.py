@@ -222,7 +222,6 @@ class _Piece:
             self.knots.append(self._integrate(self.knots[-1], step / steps, 1.0 / steps))
 
     def continue_with(self, phase: DrivePhase) -> _Piece:
-        """Return the next phase."""
         # values at u = 1
         return _Piece(phase, self.last, self.knots[-1], sum(self.yaw), sum(self.distance))
 

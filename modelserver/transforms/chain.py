@@ -53,7 +53,6 @@ class ChainLink(NamedTuple):
 
 
 def frame_poses(links: Sequence[ChainLink]) -> list[Pose]:
-    """Return the poses of all frames of a chain in its first frame, the first included."""
     steps = (link.X_FT if link.forward else link.X_FT.inverse() for link in links)
     return list(itertools.accumulate(steps, operator.matmul, initial=Pose.identity()))
 

@@ -90,7 +90,6 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Self:
-        """Return the pose of a frame in itself."""
         return cls._of((0.0, 0.0, 0.0), so3.IDENTITY)
 
     @classmethod
@@ -120,7 +119,6 @@ class Pose:
 
     @classmethod
     def from_scipy(cls, position: Iterable[float], rotation: SupportsAsQuaternion) -> Self:
-        """Return the pose of a position and a scipy.spatial.transform.Rotation."""
         return cls.from_xyzw(position, rotation.as_quat())
 
     @classmethod

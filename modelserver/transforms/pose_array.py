@@ -33,7 +33,6 @@ class PoseArray(NamedTuple):
         return PoseArray(self.p + rotate(self.q, other.p), multiply(self.q, other.q))
 
     def inverse(self) -> PoseArray:
-        """Return X_BA."""
         q = conjugate(self.q)
         return PoseArray(-rotate(q, self.p), q)
 
@@ -44,7 +43,6 @@ class PoseArray(NamedTuple):
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Return the products a b."""
     return _by_row(so3.multiply(_by_column(a), _by_column(b)))
 
 
@@ -58,12 +56,10 @@ def _by_row(columns: Sequence[Any]) -> Array:
 
 
 def conjugate(q: Array) -> Array:
-    """Return the inverse rotations."""
     return q * (1.0, -1.0, -1.0, -1.0)
 
 
 def rotate(q: Array, v: Array) -> Array:
-    """Return R(q) v."""
     return _by_row(so3.rotate(_by_column(q), _by_column(v)))
 
 
@@ -117,5 +113,4 @@ def slerp(a: Array, b: Array, fraction: Array) -> Array:
 
 
 def to_matrices(q: Array) -> Array:
-    """Return the rotation matrices (n, 3, 3)."""
     return np.moveaxis(np.array(so3.matrix_rows(_by_column(q))), 2, 0)

@@ -70,7 +70,6 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """Return the inverse rotation."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
@@ -103,7 +102,6 @@ def rotate_back(q: Quaternion, v: Vector3) -> Vector3:
 
 
 def cross(a: Vector3, b: Vector3) -> Vector3:
-    """Return a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -116,7 +114,6 @@ def add(*vectors: Vector3) -> Vector3:
 
 
 def scale(factor: float, v: Vector3) -> Vector3:
-    """Return factor v."""
     return (factor * v[0], factor * v[1], factor * v[2])
 
 

@@ -177,7 +177,6 @@ class StaticReplyCache:
         self._capacity = min(max(frames, 1) ** 2, MAX_ENTRIES)
 
     def is_of(self, model: object) -> bool:
-        """Return whether the cache is for this model."""
         return model is self._model
 
     def find(self, request: bytes, client: bytes, utime: int) -> bytes | None:

@@ -158,17 +158,14 @@ def _encode_section(part: SectionType, utime: int, body: bytes, before: int = 0)
 
 
 def encode_head(facts: dict[str, Any], utime: int) -> bytes:
-    """Encode the head of a segment."""
     return _encode_section(SectionType.HEAD, utime, json.dumps(facts).encode())
 
 
 def encode_file(name: str, data: bytes, utime: int) -> bytes:
-    """Encode a file that the service was started with."""
     return _encode_section(SectionType.FILE, utime, name.encode() + b"\0" + data)
 
 
 def encode_state(data: bytes, utime: int) -> bytes:
-    """Encode the state section."""
     return _encode_section(SectionType.STATE, utime, data)
 
 

@@ -206,7 +206,6 @@ class UdpReceiver:
         self._receive = self._socket.recvfrom
 
     def subscribe(self, channel: str) -> None:
-        """See `Receiver`."""
         self._assembler.channels.add(channel.encode())
         set_channel_filter(self._socket, self._assembler.channels)
 
@@ -230,7 +229,6 @@ class UdpReceiver:
         return None
 
     def close(self) -> None:
-        """See `Receiver`."""
         self._socket.close()
 
 
@@ -305,13 +303,11 @@ class LcmReceiver:
         self._subscriptions.append(subscription)
 
     def receive(self) -> Message | None:
-        """See `Receiver`."""
         if not self._received and not handle_message(self._bus):
             return None
         return self._received.popleft() if self._received else None
 
     def close(self) -> None:
-        """See `Receiver`."""
         # the subscriptions' handlers keep the instance in memory
         for each in self._subscriptions:
             self._bus.unsubscribe(each)

@@ -134,7 +134,6 @@ class NodSetup:
         self._warning = ""
 
     def start(self, nod: NodSettings) -> None:
-        """Start from the beginning."""
         self._steps = self._run(nod)
         self._step = next(self._steps, None)
 
@@ -221,7 +220,6 @@ class ReadingValidator:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the previous readings."""
         self._last: _TimedAngle | None = None
         self._suspect: _TimedAngle | None = None
         self._number: int | None = None

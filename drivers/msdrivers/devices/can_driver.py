@@ -101,7 +101,6 @@ class CanDriver(ABC):
         return min((each for each in deadlines if each is not None), default=None)
 
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send nothing."""
         return []
 
     @abstractmethod

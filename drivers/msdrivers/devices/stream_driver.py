@@ -169,7 +169,6 @@ class StreamDriver(ABC, Generic[M]):
         return deadline if extra is None else min(deadline, extra)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Leave the device as it is."""
         return []
 
     # --- for the device ---
@@ -185,7 +184,6 @@ class StreamDriver(ABC, Generic[M]):
 
     @property
     def _step(self) -> SetupStep | None:
-        """The step that waits for its acknowledgement."""
         is_waiting = not self._is_identifying and self._answer_deadline_ns is not None
         return self._steps[self._index] if is_waiting and self._index < len(self._steps) else None
 
@@ -204,12 +202,10 @@ class StreamDriver(ABC, Generic[M]):
         return [*out, *self._send_step(now)]
 
     def _make_header(self, host_utime: int, device_utime: int) -> SensorHeader:
-        """Return the header of the next sample."""
         self._seq += 1
         return SensorHeader(0, self._settings.source, self._seq - 1, host_utime, device_utime)
 
     def _publish(self, sample: Sample, now: HostTime, tick: float = 1e-6) -> list[Output[bytes]]:
-        """Publish a sample."""
         self._counts["samples"] += 1
         self._tried = []
         self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * SECOND_NS)

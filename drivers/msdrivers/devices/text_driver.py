@@ -107,7 +107,6 @@ class TextDriver(ABC):
         return self._silence_deadline_ns
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Leave the unit as it is."""
         return []
 
     def _set_status(self, phase: EndpointPhase, text: str) -> list[Output[bytes]]:

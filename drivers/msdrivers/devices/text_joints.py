@@ -63,7 +63,6 @@ class TextJointsSettings(Strict):
 
     @property
     def fields(self) -> Mapping[str, ColumnMap]:
-        """The columns by joint, and that of the time."""
         return {**self.joints, **({} if self.time is None else {TIME: self.time})}
 
 

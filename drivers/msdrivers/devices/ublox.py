@@ -201,7 +201,6 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         return out
 
     def _publish_epoch(self, now: HostTime) -> list[Output[bytes]]:
-        """Publish the pending epoch, if it has a position."""
         epoch, self._epoch = self._epoch, None
         assert epoch is not None
         self._last_itow = epoch.itow

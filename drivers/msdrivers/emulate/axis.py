@@ -85,7 +85,6 @@ class AxisEmulator:
         return None
 
     def on_close(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
-        """Send nothing."""
         return []
 
     def _switch_on(self, at_ns: int) -> None:

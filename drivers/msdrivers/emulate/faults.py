@@ -135,7 +135,6 @@ class FaultInjector(Generic[U]):
         self._clock_jump_ns = 0
 
     def on_open(self, now: HostTime) -> Sequence[Output[U]]:
-        """Power on."""
         self._faults.start(now.monotonic_ns)
         return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
 
@@ -166,7 +165,6 @@ class FaultInjector(Generic[U]):
         return min((due for due in dues if due is not None), default=None)
 
     def on_close(self, now: HostTime) -> Sequence[Output[U]]:
-        """Close the device."""
         return self._filter_outputs(self._inner.on_close(self._to_device_time(now)), now)
 
     @property
@@ -234,7 +232,6 @@ class CanEmulator(ABC, Generic[S]):
         return [EndpointStatus(EndpointPhase.STREAMING, self._text), *self.on_timer(now)]
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Ignore received frames."""
         return []
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
@@ -257,7 +254,6 @@ class CanEmulator(ABC, Generic[S]):
         return min((each for each in deadlines if each is not None), default=None)
 
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send nothing."""
         return []
 
     def _get_sample_ns(self) -> int | None:

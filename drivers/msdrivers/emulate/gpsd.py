@@ -31,7 +31,6 @@ class GpsdEmulator(SampleEmulator[GpsSample]):
         self._is_watched = False
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Greet a client."""
         self._now, self._line = now, b""
         return [self._report(**{"class": "VERSION", "release": "3.25", "proto_major": 3, "proto_minor": 15})]
 

@@ -36,7 +36,6 @@ class Eeprom:
         return cls().write(words | dict(zip(EepromAddress.GAINS, gains, strict=True)))
 
     def read_word(self, address: int) -> int:
-        """Return a word; 0 at an invalid address."""
         return self.words[address // 2] if 0 <= address < 256 and address % 2 == 0 else 0
 
     def write(self, changes: Mapping[int, int]) -> Eeprom:
@@ -98,7 +97,6 @@ class UnitClock:
         return self.started_ns + round(tick * self.tick_s / (1.0 + self.drift) * 1e9)
 
     def ticks_at(self, at_ns: int) -> int:
-        """Return the counter at an instant."""
         # a nanosecond more, lest the instant of a tick rounds to the one before
         seconds = ((at_ns - self.started_ns) * 1e-9 + 1e-9) * (1.0 + self.drift)
         return (int(seconds / self.tick_s) + self.offset) % 65536
@@ -125,7 +123,6 @@ class SampleInterpolator:
     """
 
     def __init__(self, samples: Iterable[ImuSample]):
-        """`samples` have increasing stamps."""
         self._remaining: Iterator[ImuSample] = iter(samples)
         self._before: tuple[int, SensedState] | None = None
         self._after = self._next()
@@ -238,7 +235,6 @@ class Gx1Emulator:
         return min(instants)
 
     def on_close(self, now: HostTime) -> list[Output[bytes]]:
-        """Send nothing."""
         return []
 
     def apply_fault(self, fault: InjectedFault, now: HostTime) -> None:
@@ -258,7 +254,6 @@ class Gx1Emulator:
         self._gains = Gains(*(self.eeprom.read_word(address) or 1000 for address in EepromAddress.GAINS))
 
     def _run_cycles(self, now_ns: int) -> None:
-        """Run the calculation cycles up to now."""
         clock, step = self._clock, self.unit.cycle_ticks
         period_ns = clock.instant_of(step) - clock.instant_of(0)
         behind = (now_ns - clock.instant_of(self._tick)) // period_ns - MAX_BACKLOG_CYCLES
@@ -274,7 +269,6 @@ class Gx1Emulator:
         return self._samples.sense_at(at_ns // 1000 + self._utime_offset_us)
 
     def _send_measurement(self, command: int, at_ns: int) -> None:
-        """Send a measurement made at an instant."""
         instant = self._sense(at_ns)
         if instant is None:
             return

@@ -37,7 +37,6 @@ class SampleEmulator(ABC, Generic[S]):
         return []
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Ignore what the host sends."""
         self._now = now
         return []
 
@@ -57,5 +56,4 @@ class SampleEmulator(ABC, Generic[S]):
         return self._now.monotonic_ns + (self._next.header.utime + self._latency_us - self._now.utime) * 1000
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
         return []

@@ -31,12 +31,10 @@ class TextJointsEmulator:
         """Lines sent."""
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Begin to sweep."""
         self._first = self._first or now
         return []
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Ignore what the host sends."""
         return []
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
@@ -54,7 +52,6 @@ class TextJointsEmulator:
         return None if self._first is None else self._first.monotonic_ns + self._sent * PERIOD_US * 1000
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send nothing."""
         return []
 
     def get_values(self, seconds: float) -> dict[str, float]:

@@ -77,7 +77,6 @@ class UbloxEmulator(SampleEmulator[GpsSample]):
         return frozenset(self._messages)
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process commands."""
         self._now = now
         return [output for frame in self._scanner.feed(unit) for output in self._execute(frame)]
 
@@ -150,7 +149,6 @@ class UbloxEmulator(SampleEmulator[GpsSample]):
 
 
 def encode_sample(name: str, sample: GpsSample) -> bytes:
-    """Encode a sample as the message of a name."""
     return _encode(name, **_FIELDS[name](sample))
 
 

@@ -45,7 +45,6 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         self._sent: dict[int, int] = {}
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process commands."""
         self._now = now
         return [Send(each) for message in self._stream.feed(unit) if (each := self._execute(message))]
 

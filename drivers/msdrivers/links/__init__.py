@@ -38,9 +38,7 @@ class Link(Protocol[U]):
         ...
 
     @property
-    def baud(self) -> int:
-        """Baud rate, 0 without one."""
-        ...
+    def baud(self) -> int: ...
 
     def open(self, baud: int | None = None) -> None:
         """Open the line, at another baud rate if one is given. Raises LinkError."""
@@ -72,7 +70,6 @@ class LinkWrapper(Generic[U]):
 
     @property
     def baud(self) -> int:
-        """Baud rate of the wrapped link."""
         return self._link.baud
 
     def open(self, baud: int | None = None) -> None:
@@ -80,7 +77,6 @@ class LinkWrapper(Generic[U]):
         self._link.open(baud)
 
     def close(self) -> None:
-        """Close the wrapped link."""
         self._link.close()
 
 

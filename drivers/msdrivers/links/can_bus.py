@@ -44,7 +44,6 @@ class CanLink:
     """
 
     def __init__(self, channel: str, interface: str = "socketcan", bitrate: int = 0):
-        """bitrate 0: the interface is already configured."""
         self.description = f"can {channel} ({interface})"
         self.baud = bitrate
         self._channel, self._interface = channel, interface

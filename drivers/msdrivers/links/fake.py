@@ -19,11 +19,9 @@ class FakeTimeSource:
         self.utime_ns, self.monotonic_ns = utime * 1000, monotonic_ns
 
     def now(self) -> HostTime:
-        """Return the instant."""
         return HostTime(self.monotonic_ns, self.utime_ns // 1000)
 
     def sleep(self, seconds: float) -> None:
-        """Advance the clock."""
         self.monotonic_ns += round(seconds * 1e9)
         self.utime_ns += round(seconds * 1e9)
 
@@ -55,7 +53,6 @@ class FakeLink(Generic[U]):
         self.is_open = True
 
     def close(self) -> None:
-        """Close it."""
         self.is_open = False
 
     def poll(self, timeout: float) -> Sequence[U]:
@@ -73,7 +70,6 @@ class FakeLink(Generic[U]):
         return ()
 
     def send(self, unit: U) -> None:
-        """Remember what was sent."""
         self._check()
         self.sent.append((self.time.monotonic_ns, unit))
 

@@ -172,7 +172,6 @@ class ModbusServerLink(LinkWrapper[bytes]):
 
     @property
     def description(self) -> str:
-        """The address to call."""
         return f"modbus {self._link.description.removeprefix('tcp ')}"
 
     def poll(self, timeout: float) -> Sequence[ModbusUnit]:

@@ -44,7 +44,6 @@ class TcpLink(DescriptorLink):
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def close(self) -> None:
-        """Disconnect."""
         connection, self._socket = self._socket, None
         if connection is not None:
             connection.close()
@@ -129,7 +128,6 @@ class TcpServerLink(DescriptorLink):
             self.disconnect_client()
 
     def disconnect_client(self) -> None:
-        """Disconnect the client."""
         if self._client is not None:
             self._client.close()
             self._client = None

@@ -102,7 +102,6 @@ class NtripSession:
         return body
 
     def _read_chunks(self, data: bytes) -> bytes:
-        """Return the content of the chunks in `data` (RFC 9112, 7.1)."""
         content = b""
         self._buffer += data
         while self._buffer:

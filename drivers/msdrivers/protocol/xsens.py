@@ -120,7 +120,6 @@ class XbusStream(FrameScanner[XbusMessage]):
 
 
 def encode(identifier: int, data: bytes = b"") -> bytes:
-    """Return a message."""
     size = bytes((len(data),)) if len(data) < 0xFF else b"\xff" + len(data).to_bytes(2, "big")
     body = bytes((BUS_IDS[0], identifier)) + size + data
     return bytes((PREAMBLE,)) + body + bytes((-sum(body) & 0xFF,))
@@ -185,7 +184,6 @@ _READERS: Final = (_read_float, _read_fixed_12_20, _read_fixed_16_32, _read_doub
 
 
 def encode_items(items: Iterable[tuple[int, bytes]]) -> bytes:
-    """Return an MTData2 message of items."""
     data = b"".join(identifier.to_bytes(2, "big") + bytes((len(each),)) + each for identifier, each in items)
     return encode(MessageId.MT_DATA_2, data)
 

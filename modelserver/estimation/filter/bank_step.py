@@ -254,7 +254,6 @@ def _find_reason(setup: Setup, state: Aligned, before: HypothesisBank) -> str:
 
 
 def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
-    """Return the state with a bank at its pose."""
     nav, settings = state.nav, setup.settings
     values, rows = _share(setup, nav, newest)
     covariance = rows @ nav.covariance @ rows.T
@@ -266,7 +265,6 @@ def _start(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
 
 
 def _read_fix(setup: Setup, state: Aligned, newest: PathFix) -> PlanarFix:
-    """Return a fix as the bank has it."""
     nav = state.nav
     back = cmath.rect(1.0, -nav.yaw)
     velocity = to_horizontal(nav.point_velocity(setup.rig.lever_arm(setup.rig.gps_frame)))

@@ -157,7 +157,6 @@ class ClockMonitor(NamedTuple):
 
 
 def _set_back(name: SourceKey, rank: int, utime: int, seq: int) -> ClockMonitor:
-    """Return the monitor after the lead was set back to `utime`."""
     return ClockMonitor(utime, rank, utime, {name: SourceClock(utime, seq, recent=(utime,))})
 
 

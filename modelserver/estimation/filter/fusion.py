@@ -118,17 +118,14 @@ def split_sample(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
 
 
 def reject(item: Item, reason: str) -> Decision:
-    """Return the decision on an item that is rejected before it is compared."""
     return Decision(item.utime, item.source, item.seq, item.kind, Verdict.REJECTED, reason)
 
 
 def report_reset(item: Item, reason: str) -> Decision:
-    """Return the decision that an item led to: a reset of the state."""
     return Decision(item.utime, item.source, item.seq, item.kind, Verdict.RESET, reason)
 
 
 def report_event(state: Navigating, kind: str, verdict: Verdict, text: str) -> Decision:
-    """Return a decision of the filter itself."""
     return Decision(state.nav.utime, "filter", 0, kind, verdict, text)
 
 

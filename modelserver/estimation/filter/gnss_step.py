@@ -221,7 +221,6 @@ def _fuse_aligned(
 def _compare_with_path(
     setup: Setup, state: Navigating, site: LocalFrame, fix: AcceptedFix, fix_type: FixType
 ) -> PathFix:
-    """Return a fix beside the state at its instant."""
     settings, rig, nav = setup.settings, setup.rig, state.nav
     lever = rig.lever_arm(rig.gps_frame)
     x, y, z = nav.point(lever)

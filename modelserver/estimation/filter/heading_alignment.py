@@ -264,7 +264,6 @@ def _rotation_per_latency(segment: tuple[PathFix, ...], paths: list[complex], sp
 
 
 def compute_velocities(segment: tuple[PathFix, ...], paths: list[complex]) -> list[complex]:
-    """Return the velocity of the path at each fix, from its neighbors."""
     last = len(paths) - 1
     pairs = [(max(k - 1, 0), min(k + 1, last)) for k in range(len(paths))]
     return [(paths[b] - paths[a]) / ((segment[b].utime - segment[a].utime) * 1e-6) for a, b in pairs]

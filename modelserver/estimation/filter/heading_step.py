@@ -157,7 +157,6 @@ def initialize(setup: Setup, state: Navigating, nav: NavState, rotation: Rotatio
 
 
 def place(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
-    """Return the state at a fix, in a new epoch."""
     nav = heading_alignment.place(state.nav, newest, 0j, setup.rig.lever_arm(setup.rig.gps_frame), setup.layout)
     return start_epoch(state._replace(nav=nav, gnss=state.gnss.place(newest.utime)))
 

@@ -293,7 +293,6 @@ class HypothesisBank(NamedTuple):
 
     @property
     def fault(self) -> Fault:
-        """The fault of the published hypothesis."""
         return Fault(int(self.faults[self.published]))
 
     @property

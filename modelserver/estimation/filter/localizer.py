@@ -64,7 +64,6 @@ class Deferred(NamedTuple):
     newest: int
 
     def resolve(self) -> Estimate:
-        """Return the estimate."""
         return output.estimate(self.setup, self.state, self.odom, self.utime, self.newest)
 
 
@@ -131,7 +130,6 @@ class FilterLocalizer(NamedTuple):
 
     @property
     def mode(self) -> Mode:
-        """Which sources are used."""
         return self.head.common.mode
 
     def process(self, sample: Sample | SwitchMode) -> tuple[FilterLocalizer, tuple[LocalizerEvent, ...]]:

@@ -53,7 +53,6 @@ def select_noise(setup: Setup, state: Navigating, nav: NavState) -> ProcessNoise
 
 
 def _select_imu_noise(setup: Setup, state: Navigating) -> ProcessNoise:
-    """Return the process noise while the IMU measures."""
     if state.is_stationary:
         return setup.stationary
     noise = setup.interpolated if state.imu.is_interpolated else setup.driving
@@ -102,7 +101,6 @@ def propagate_imu(
 def _follow_gyros(
     setup: Setup, state: Navigating, nav: NavState, utime: int, rate: Vector3, imu: ImuMonitor
 ) -> DeadReckoning:
-    """Return dead reckoning after a sample of the gyros; `nav` is the state after it."""
     w, x, y, z = nav.attitude
     a, b, c = rate
     # the last row of the rotation: the rate about the vertical

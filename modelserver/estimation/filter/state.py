@@ -174,7 +174,6 @@ class Leveling(NamedTuple):
 
     @property
     def phase(self) -> Phase:
-        """LEVELING."""
         return Phase.LEVELING
 
 
@@ -198,12 +197,10 @@ class Unaligned(NamedTuple):
 
     @property
     def phase(self) -> Phase:
-        """UNALIGNED."""
         return Phase.UNALIGNED
 
     @property
     def is_stationary(self) -> bool:
-        """Whether the vehicle is stationary."""
         return self.constraints.is_stationary
 
     def with_imu(
@@ -243,12 +240,10 @@ class Aligned(NamedTuple):
 
     @property
     def phase(self) -> Phase:
-        """ALIGNED."""
         return Phase.ALIGNED
 
     @property
     def is_stationary(self) -> bool:
-        """Whether the vehicle is stationary."""
         return self.constraints.is_stationary
 
     def with_imu(

@@ -129,7 +129,6 @@ class StationaryDetector(NamedTuple):
         return StationaryDetector(*self[:5], 0, False, utime)
 
     def restart_mean(self) -> StationaryDetector:
-        """Return the detector with the integral of the rate restarted."""
         return self._replace(rate_sum=ZERO, sum_time=0.0)
 
     @property
@@ -139,7 +138,6 @@ class StationaryDetector(NamedTuple):
         return (x / self.sum_time, y / self.sum_time, z / self.sum_time)
 
     def is_confirmed_by_wheels(self, utime: int) -> bool:
-        """Return whether the wheels are stationary at an instant."""
         return self.wheels_stationary is True and (utime - self.wheels_utime) * 1e-6 < WHEELS_TIMEOUT
 
     def get_quiet_time(self, utime: int) -> float:

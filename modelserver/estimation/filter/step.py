@@ -67,7 +67,6 @@ def _apply_pending(setup: Setup, state: FilterState, utime: int) -> Fused:
 
 
 def _switch_mode(setup: Setup, state: FilterState, item: Item) -> Fused:
-    """Return the state in another mode."""
     sample = item.sample
     assert isinstance(sample, SwitchMode)
     if not isinstance(state, Leveling):

@@ -51,7 +51,6 @@ class Timeline(NamedTuple):
 
     @property
     def newest(self) -> FilterState:
-        """The state after all that is fused."""
         state = self.entries[self.num_fused - 1].state if self.num_fused else self.base
         assert state is not None
         return state

@@ -105,7 +105,6 @@ def advance(setup: Setup, state: FilterState, utime: int) -> Fused:
 def _restore_biases(
     setup: Setup, state: Navigating, waiting: WarmStart, persisted: PersistedState, age: float
 ) -> Fused:
-    """Return a state that was just leveled, with the persisted biases."""
     nav = state.nav
     if nav.utime < persisted.sensor_utime:
         reason = "the sensors' clock is before the stored time"

@@ -76,9 +76,7 @@ class WheelMonitor(NamedTuple):
         return self._replace(mean_ratio=mean, is_suspect=mean > SUSPECT_MEAN, has_held=has_held)
 
     def suspect(self) -> WheelMonitor:
-        """Return the monitor of wheels that are known to be stuck."""
         return self._replace(mean_ratio=max(self.mean_ratio, SUSPECT_MEAN), is_suspect=True)
 
     def measures_speed(self, utime: int) -> bool:
-        """Return whether the wheels measure the speed at an instant."""
         return not self.is_suspect and self.used_utime > 0 and utime - self.used_utime < SPEED_TIMEOUT_US

@@ -124,7 +124,6 @@ class Heading(NamedTuple):
         )
 
     def inflate(self, variance: float) -> Heading:
-        """Return the heading with a larger variance."""
         return self._replace(variance=min(self.variance + variance, UNKNOWN_VARIANCE))
 
     def update_course(self, offset: float, variance: float, settings: RawSettings) -> tuple[Heading, CourseResult]:

@@ -55,7 +55,6 @@ class StationaryPlace(NamedTuple):
 
     @classmethod
     def at(cls, fix: TrackFix, heading: Heading, is_creeping: bool = False) -> StationaryPlace:
-        """Return the place of a fix."""
         return cls(fix.utime, fix.position, fix.sigma, heading.bias, heading.bias_variance, is_creeping)
 
     def has_left(self, fix: TrackFix, velocity_sigma: float, settings: RawSettings) -> bool:

@@ -54,7 +54,6 @@ def get_worst_level(findings: Iterable[Diagnosis]) -> DiagnosisLevel:
 def filter_by_level(
     findings: Iterable[Diagnosis], min_level: DiagnosisLevel = DiagnosisLevel.WARNING
 ) -> tuple[Diagnosis, ...]:
-    """Return the findings of a level or higher."""
     return tuple(each for each in findings if each.level >= min_level)
 
 

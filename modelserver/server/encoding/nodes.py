@@ -12,7 +12,6 @@
 Safe against hostile input: the bytes name no class, an index selects among the classes that the declared type allows.
 Work is bounded: a count by the remaining tokens, objects by the tokens (one each at most).
 """
-# ruff: noqa: D102 - the methods of the nodes are described once, in TypeNode
 
 from __future__ import annotations
 
@@ -64,7 +63,6 @@ class TypeNode(ABC):
         """
 
     def describe_mismatch(self, value: object) -> str:
-        """Describe a value of another type."""
         return f"{_type_name_of(value)}, declared as {self.text}"
 
 

@@ -73,7 +73,6 @@ class TokenWriter:
         self._pause()
 
     def close(self) -> bytes:
-        """Return the encoded stream."""
         self.flush()
         return b"".join(self._blocks)
 

@@ -39,7 +39,6 @@ class Deviation(NamedTuple):
         return max(self) <= TOLERANCE
 
     def elementwise_max(self, other: Deviation) -> Deviation:
-        """Return the elementwise maximum."""
         return Deviation(*map(max, self, other))
 
 

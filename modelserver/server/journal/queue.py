@@ -87,7 +87,6 @@ class JournalQueue:
         self._put(kind, now, *received)
 
     def record_published(self, channel: str, data: bytes) -> None:
-        """Record a message before it is published."""
         self._put(RecordKind.PUBLISHED, self._last, channel, data)
 
     def poll_warnings(self) -> Sequence[HealthWarning]:

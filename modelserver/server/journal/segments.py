@@ -88,7 +88,6 @@ class Segment:
         os.fdatasync(self._file)
 
     def close(self) -> None:
-        """Close the file."""
         with contextlib.suppress(OSError):
             os.close(self._file)
 
@@ -142,7 +141,6 @@ class Ring:
         return True
 
     def release(self) -> None:
-        """Release the directory."""
         self._lock.release()
 
     def _sync_directory(self) -> None:
@@ -232,7 +230,6 @@ class NewestMarker(NamedTuple):
     seal: str = ""
 
     def encode(self, key: Key | None) -> bytes:
-        """Encode the file with its seal."""
         line = json.dumps({"key": "" if key is None else key.name, **self._asdict()}).encode() + b"\n"
         return line + _seal_newest(key, line).encode() + b"\n"
 

@@ -114,7 +114,6 @@ class VerificationReport:
 
     @property
     def reproduced_poses(self) -> int:
-        """Number of reproduced poses."""
         return sum(self.reproduced[name] for name in POSES)
 
     @property
@@ -187,7 +186,6 @@ class _Verifier:
         self._is_closed = False
 
     def verify_segment(self, path: Path) -> None:
-        """Verify the next segment."""
         self._path, self._is_closed, continues = path, False, False
         end: journal.SegmentEnd | None = None
         report, before = self.report, self.report.bytes

@@ -129,7 +129,6 @@ class JournalWriter:
         queue.wants_state = True
 
     def start(self) -> None:
-        """Start the thread."""
         start_in_background(self._thread)
 
     def close(self) -> None:

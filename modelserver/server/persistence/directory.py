@@ -32,7 +32,6 @@ class LockHeldError(BlockingIOError):
 
     @property
     def holder(self) -> str:
-        """The holder in words."""
         return f"another service (process {self.pid})" if self.pid else "another service"
 
 
@@ -72,7 +71,6 @@ class FileLock:
             return
 
     def release(self) -> None:
-        """Release the lock."""
         with self._mutex:
             self._close_file()
 

@@ -385,7 +385,6 @@ class PersistentStores:
     warning: str = ""
 
     def close(self) -> None:
-        """Release the directory."""
         if self.lock is not None:
             self.lock.release()
 

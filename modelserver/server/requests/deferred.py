@@ -54,7 +54,6 @@ class DeferredReply:
         self._work = self._encode(answer)
 
     def step(self) -> None:
-        """Do one step of the work."""
         self.ready = next(self._work, self) is self
 
     def complete(self) -> None:

@@ -395,7 +395,6 @@ class RequestHandler:
         self._handle(queued, request)
 
     def _handle(self, queued: QueuedRequest, request: messages.Request) -> None:
-        """Pass a request to the core."""
         self._current = queued
         try:
             self._context.step(request, self._clock.now(), (queued.channel, queued.data))
@@ -428,7 +427,6 @@ class RequestHandler:
         return self._cache
 
     def _fail(self, queued: QueuedRequest, request: messages.Request, error: Exception) -> None:
-        """Reply to a request whose handling failed."""
         context, now = self._context, self._clock.now()
         context.handle_error(queued.channel, error)
         self._journal.record_message(RecordKind.FAILED, (queued.channel, queued.data), now)

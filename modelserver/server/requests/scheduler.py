@@ -367,7 +367,6 @@ class RequestScheduler:
         return "; ".join(texts)
 
     def _refill(self, client: ClientQueue, now_ns: int) -> float:
-        """Refill the bucket of requests; return its tokens."""
         tokens = client.tokens + (now_ns - client.charged_ns) * self._tokens_per_ns
         client.charged_ns = now_ns
         if tokens > self._burst:  # cheaper than min()

@@ -96,7 +96,6 @@ class Notifier:
         return self._send is not None
 
     def send(self, *lines: str) -> None:
-        """Send lines of the protocol."""
         if self._send is not None:
             self._send("\n".join(lines).encode("utf-8", "replace"))
 
@@ -107,7 +106,6 @@ class Notifier:
             self.send(f"STATUS={self._status}", f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
 
     def notify_ready(self, status: str) -> None:
-        """Report that the service is ready."""
         self.is_ready = True
         self._set_status(status)
         self.send("READY=1", f"STATUS={self._status}")
@@ -133,7 +131,6 @@ class Notifier:
         self.send("RELOADING=1", f"MONOTONIC_USEC={self._monotonic_ns() // 1000}", "STATUS=reloading the geometry")
 
     def notify_reloaded(self) -> None:
-        """Report that a reload has ended."""
         self.send("READY=1", f"STATUS={self._status}")
         self._status_due_ns = 0
 

@@ -63,7 +63,6 @@ def command(
 
 
 def print_line(name: str, text: str) -> None:
-    """Print a line of a child process."""
     typer.echo(f"{name}: {text}", err=True)
 
 

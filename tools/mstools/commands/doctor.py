@@ -130,7 +130,6 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
 
 
 def get_exit_code(findings: Sequence[Diagnosis]) -> int:
-    """Return the exit code of findings."""
     from modelserver.server.diagnostics.checks import get_worst_level
 
     return (0, 0, EXIT_WARNINGS, EXIT_ERRORS)[get_worst_level(findings)]

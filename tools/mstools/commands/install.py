@@ -228,7 +228,6 @@ class CheckedVehicle:
         return found
 
     def serial_of(self, names: Iterable[str]) -> list[install_files.SerialDriver]:
-        """Return the named drivers with serial ports."""
         ports = ((name, getattr(self.drivers[name].line, "port", "")) for name in names)
         return [install_files.SerialDriver(name, port) for name, port in ports if port]
 

@@ -138,13 +138,11 @@ class Questions:
         self._used: set[str] = set()
 
     def text(self, question: str, given: str, default: str) -> str:
-        """Return a text."""
         if given or not self._is_asking:
             return given or default
         return str(typer.prompt(question, default=default)).strip()
 
     def flag(self, question: str, given: bool | None) -> bool:
-        """Return yes or no; the default is no."""
         if given is not None or not self._is_asking:
             return bool(given)
         return typer.confirm(question, default=False)
@@ -255,7 +253,6 @@ def find_mounts(
 
 
 def list_frames(model: Model) -> list[str]:
-    """Return the full names of all frames."""
     return [frame.full_name for body in model.bodies for frame in body.frames]
 
 

@@ -77,7 +77,6 @@ def describe_edges(explanation: Explanation) -> str:
 
 
 def _format_shares(*shares: float) -> str:
-    """Format the sum of the known shares."""
     known = [share for share in shares if not math.isnan(share)]
     return f"{100.0 * sum(known):.1f} %" if known else "-"
 

@@ -293,7 +293,6 @@ class ReplayCounts:
             self.invalid[row.invalid] += 1
 
     def count_decision(self, decision: Decision) -> None:
-        """Count a rejected measurement."""
         if decision.verdict is Verdict.REJECTED:
             self.rejected[f"sensor:{decision.source}", decision.reason or "rejected"][decision.kind] += 1
 

@@ -156,7 +156,6 @@ def _build_assembly(model: Model, topology: Topology, root: str, loops: dict[str
 
 
 def _describe_loop(closing: LoopClosure, model: Model) -> str:
-    """Describe the constraint that closes a loop, and its misclosure."""
     crossing = closing.path[0]
     found = compute_misclosure(closing.path, model.frame)
     words = f"loop: {crossing.constraint.name} ({describe_joint(crossing.constraint)}) to {crossing.far_frame}, "

@@ -172,7 +172,6 @@ class Trials:
         return [self._score(self.results[key]) for key in keys]
 
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
-        """Return the results of evaluated settings, one for each part."""
         return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
 
     def list_attempts(self) -> list[tuning_report.Attempt]:

@@ -176,7 +176,6 @@ class LinePrinter:
         }
 
     def print(self, name: str, text: str) -> None:
-        """Print a line of a process."""
         with self._lock:
             typer.echo(f"{self._heads[name]} {escape(text)}")
             sys.stdout.flush()

@@ -204,7 +204,6 @@ def diagnose_keys(vehicle: VehicleConfig, unit: bool = False) -> Iterator[Diagno
 
 
 def _key_fix_command(path: str) -> str:
-    """Return the command that fixes an unusable key file."""
     quoted = quote(path)
     make = f"sudo modelserver key new {quoted}"
     try:

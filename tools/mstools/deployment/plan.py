@@ -103,7 +103,6 @@ class Manifest:
     folders: tuple[str, ...] = ()
 
     def encode(self) -> bytes:
-        """Return the content of the manifest file."""
         files = dict(sorted(self.files.items()))
         content = {"version": MANIFEST_VERSION, "files": files, "units": self.units, "folders": self.folders}
         return (json.dumps(content, indent=1) + "\n").encode()

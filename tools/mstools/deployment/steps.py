@@ -38,7 +38,6 @@ INSTALL_HINT: Final = (
 
 
 def get_command_path() -> str:
-    """Return the path of this installation's command."""
     return os.path.join(os.path.dirname(os.path.abspath(sys.executable)), "modelserver")
 
 

@@ -64,7 +64,6 @@ class GeometryDocument:
 
     @property
     def text(self) -> str:
-        """The content of the file."""
         return self._yaml.text
 
     # --- what is there
@@ -108,7 +107,6 @@ class GeometryDocument:
         return template if not own and self._yaml.has(("templates", template, "frames", frame)) else ""
 
     def list_users(self, template: str) -> list[str]:
-        """Return the bodies that name a template."""
         return [body for body in self._yaml.keys(("bodies",)) if self._get_template(body) == template]
 
     def get_yaml(self, item: GeometryItem) -> str:
@@ -211,7 +209,6 @@ class GeometryDocument:
     # --- items
 
     def add_body(self, name: str) -> GeometryDocument:
-        """Add a body with a frame at its origin."""
         self._make_new(ItemKind.BODY, name)
         entry = f"{_format_key(name)}:\n  frames:\n    Origin: {{}}"
         return GeometryDocument(self._yaml.add(("bodies",), entry, in_block=True))

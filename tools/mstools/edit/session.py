@@ -119,7 +119,6 @@ class EditSession:
 
     @property
     def document(self) -> GeometryDocument:
-        """The document as edited."""
         return self._steps[-1].document
 
     @property
@@ -154,7 +153,6 @@ class EditSession:
         return True
 
     def undo(self) -> None:
-        """Undo the last change."""
         if len(self._steps) > 1:
             self._undone.append(self._steps.pop())
             self._check()
@@ -180,7 +178,6 @@ class EditSession:
             return True
 
     def find_culprit(self, problem: Problem) -> GeometryItem | None:
-        """Return the item in which a problem of the geometry file is."""
         return self.document.find_item(problem.line) if problem.file == str(self.file.path) else None
 
     def make_diff(self) -> str:

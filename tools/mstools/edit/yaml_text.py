@@ -46,7 +46,6 @@ class TextEntry(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The text of the key."""
         return str(self.key.value).strip()
 
 
@@ -77,7 +76,6 @@ class YamlText:
         return [] if node is None else list(self._list_entries(node))
 
     def keys(self, path: Path = ()) -> list[str]:
-        """Return the keys of a mapping, in order."""
         return [each.name for each in self.entries(path)]
 
     def has(self, path: Path) -> bool:

@@ -77,7 +77,6 @@ class ChildProcess:
     restart_s: float = 0.0
 
     def describe_end(self, code: int) -> str:
-        """Describe how the process ended."""
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
 

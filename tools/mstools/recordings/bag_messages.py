@@ -283,7 +283,6 @@ class JointsConverter(Converter):
     """JointState: names, positions and rates; efforts are dropped."""
 
     def convert(self, header: SensorHeader, message: Any) -> JointsSample:
-        """Return the sample of a JointState."""
         # each of the other arrays may be empty
         columns = (message.name, chain(message.position, repeat(NAN)), chain(message.velocity, repeat(NAN)))
         rows = zip(*columns, strict=False)

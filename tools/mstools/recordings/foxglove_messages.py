@@ -190,7 +190,6 @@ class FoxgloveWriter:
     # --- frames
 
     def _log_geometry(self, model: Model, now: int) -> None:
-        """Log all frames and shapes."""
         if model is not self._model:
             if self._model is not None:
                 everything = SceneEntityDeletion(type=SceneEntityDeletionType.All)
@@ -341,7 +340,6 @@ def _make_fix(utime: int, frame: str, place: tuple[float, float, float], covaria
 
 
 def _make_entity(frame: str, X_body_frame: Pose, shapes: tuple[Shape, ...], now: int) -> SceneEntity:
-    """Return the shapes of a body, in its first frame."""
     to_frame = X_body_frame.inverse()
     cubes, cylinders, spheres, models = [], [], [], []
     for shape in shapes:

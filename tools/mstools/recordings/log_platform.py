@@ -113,7 +113,6 @@ class LogPlatform(LocalPlatform):
             return None
 
     def _wait_until_ready(self, time: TimeQuery, *ends: str) -> tuple[MirrorState, PlatformView, int]:
-        """Read what a query needs; at time 0 it is the latest in the log, with LATEST that as of the time."""
         self.read_for(time.at, time.policy, ends)
         return super()._wait_until_ready(time._replace(wait_ms=0), *ends)
 

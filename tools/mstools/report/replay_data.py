@@ -179,7 +179,6 @@ class ReplayData:
     axis: StampAxis = field(default_factory=StampAxis)
 
     def count_samples(self, source: str) -> int:
-        """Return the number of samples from a source."""
         return next((len(each.times) for each in self.sensors if each.name == source), 0)
 
     def to_seconds(self, utime: int) -> float:
@@ -236,7 +235,6 @@ class ReplayCollector:
         self._q_rolling_imu = self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None
 
     def on_decision(self, decision: Decision) -> None:
-        """Store a decision."""
         self._decisions.append(decision)
 
     def on_sample(self, sample: Event, localizer: Localizer) -> None:

@@ -117,7 +117,6 @@ class SensorMotion:
         return sum(left[second] * right[second] < 0.0 for second in moving), len(moving)
 
     def backward_wheels(self) -> list[str]:
-        """Return the wheels that roll backward on average."""
         moving = {name: [each for each in speeds.values() if abs(each) > 0.3] for name, speeds in self.wheels.items()}
         return sorted(name for name, speeds in moving.items() if sum(speeds) < 0.0)
 
@@ -194,12 +193,10 @@ class SecondMeans:
         self._sums: defaultdict[int, tuple[float, float]] = defaultdict(lambda: (0.0, 0.0))
 
     def add(self, second: int, value: float, weight: float = 1.0) -> None:
-        """Add a value."""
         total, weights = self._sums[second]
         self._sums[second] = (total + value * weight, weights + weight)
 
     def finish(self) -> dict[int, float]:
-        """Return the means."""
         return {second: total / weights for second, (total, weights) in sorted(self._sums.items())}
 
 
@@ -287,7 +284,6 @@ def _mean_between(series: Mapping[int, float], begin: float, end: float) -> floa
 
 
 def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float) -> list[tuple[float, float, float]]:
-    """Return the positions that are at least `least` from the one before."""
     found: list[tuple[float, float, float]] = []
     for each in places:
         if not found or math.dist(each[1:], found[-1][1:]) >= least:

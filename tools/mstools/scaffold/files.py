@@ -28,7 +28,6 @@ class Device:
 
     @property
     def line_key(self) -> str:
-        """The key of the line in the vehicle file."""
         return find_line_key(self.kind, self.line)
 
 
@@ -68,7 +67,6 @@ class NewVehicle:
 
     @property
     def body(self) -> str:
-        """Name of the vehicle's body."""
         words = "".join(character if character.isalnum() else " " for character in self.name).split()
         name = "".join(word[:1].upper() + word[1:] for word in words) or "Vehicle"
         return f"{name}Vehicle" if name in ("Camera", "Head") else name
@@ -262,5 +260,4 @@ def list_marks(folder: Path, files: Iterator[str] | tuple[str, ...]) -> Iterator
 
 
 def list_kinds(kinds: Mapping[str, DeviceKind], sample: type[GpsSample] | type[ImuSample]) -> dict[str, DeviceKind]:
-    """Return the kinds of devices with samples of a type, by name."""
     return {name: kind for name, kind in kinds.items() if kind.sample is sample}

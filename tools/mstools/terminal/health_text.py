@@ -152,7 +152,6 @@ def is_current(health: Health) -> bool:
 
 
 def _get_sensors(health: Health) -> list[ChannelHealth]:
-    """Return the sensors with samples."""
     return [each for each in health.channels if each.channel.startswith(SENSOR_PREFIX) and each.count]
 
 
@@ -272,7 +271,6 @@ def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, A
 
 
 def format_number(value: float, digits: int) -> str:
-    """Format a number, - if it is not finite."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 

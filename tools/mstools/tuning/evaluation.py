@@ -120,7 +120,6 @@ class UsableFixes:
 
     @property
     def seconds(self) -> float:
-        """Seconds from the first to the last fix."""
         return (self.samples[-1].header.utime - self.begin) * 1e-6
 
     @property
@@ -129,12 +128,10 @@ class UsableFixes:
         return min(GAP_S, 0.1 * self.seconds)
 
     def gap_of(self, sample: GpsSample) -> int | None:
-        """Return the number of the gap that contains a fix."""
         t = (sample.header.utime - self.begin) * 1e-6
         return next((n for n, s in enumerate(GAP_STARTS) if s * self.seconds < t <= s * self.seconds + self.gap), None)
 
     def withheld(self, part: Part) -> list[int]:
-        """Return the indices of the withheld fixes."""
         if part == "half":
             return list(range(1, len(self.samples), 2))
         return [n for n, sample in enumerate(self.samples) if self.gap_of(sample) is not None]
@@ -142,7 +139,6 @@ class UsableFixes:
 
 @lru_cache(maxsize=4)
 def load(config: Path) -> Vehicle:
-    """Return the vehicle of a vehicle file."""
     return load_vehicle(load_config(config), str(config))
 
 

@@ -138,7 +138,6 @@ class Table:
 
     @property
     def rows(self) -> Array:
-        """The rows (n, columns)."""
         return self._rows[: self.count]
 
     @property
@@ -356,7 +355,6 @@ class Drive:
         self._add_validity_events(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
 
     def _add_validity_events(self, utime: int, invalid: Invalid, epoch: int) -> None:
-        """Add events for a change of the validity and of the epoch."""
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
             self._add_event(utime, kind, invalid.explain() if invalid else "the pose is valid")

@@ -342,7 +342,6 @@ class Editor:
             self._add_button("Cancel", modal.close)
 
     def _write_file(self, shown: GeometryDocument) -> None:
-        """Save the document whose difference was shown."""
         if self._session.document is not shown:
             # in another tab
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
@@ -404,7 +403,6 @@ class Editor:
                 self._add_button("Cancel", modal.close)
 
     def close(self) -> None:
-        """End the thread."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 

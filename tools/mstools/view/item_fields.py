@@ -51,7 +51,6 @@ class Snap(StrEnum):
 
 
 def list_frames(document: GeometryDocument) -> list[str]:
-    """Return the full names of all frames."""
     return [each.name for each in document.list_items() if each.kind is ItemKind.FRAME]
 
 

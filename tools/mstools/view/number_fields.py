@@ -61,7 +61,6 @@ class NumberFields:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """What is typed."""
         return tuple([str(each.value) for each in self._texts])
 
     @texts.setter
@@ -80,7 +79,6 @@ class NumberFields:
         return ""
 
     def mark(self) -> None:
-        """Show in red what is no number."""
         problem = self.problem
         self._problem.content = _RED.format(html.escape(problem)) if problem else ""
 

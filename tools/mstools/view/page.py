@@ -116,7 +116,6 @@ class Page:
     link: str
 
     def close(self) -> None:
-        """Stop serving."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 

@@ -42,7 +42,6 @@ _SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|$~])")
 
 
 def escape_markdown(text: str) -> str:
-    """Return a text in which nothing is markup."""
     return _SPECIAL.sub(r"\\\1", text.replace("\n", " "))
 
 
@@ -86,11 +85,9 @@ class QueryPanel:
 
     @property
     def frames(self) -> tuple[str, str]:
-        """The two frames."""
         return self._interest.value, self._reference.value
 
     def set_frames(self, interest: str, reference: str) -> None:
-        """Choose the two frames."""
         self._interest.value, self._reference.value = interest, reference
 
     def pick(self, frame: str, is_reference: bool) -> None:
@@ -139,7 +136,6 @@ class QueryPanel:
         return text, format_code(interest, reference, utime, explanation.answer), (*frames, interest)
 
     def close(self) -> None:
-        """End the thread."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
@@ -226,12 +222,10 @@ def format_code(interest: str, reference: str, utime: int, answer: PoseAnswer | 
 
 
 def _quote(name: str) -> str:
-    """Return a name as a string of Python."""
     return json.dumps(name, ensure_ascii=False)
 
 
 def _quote_shell(name: str) -> str:
-    """Return a name as a word of a shell, always in quotes."""
     return f"'{name}'" if "'" not in name else shlex.quote(name)
 
 
@@ -274,7 +268,6 @@ class TimePanel:
 
     @property
     def utime(self) -> int:
-        """The shown time, 0 for the newest."""
         return 0 if self.is_following else self._begin + round(self._at * 1e6)
 
     def jump(self, seconds: float) -> None:
@@ -491,7 +484,6 @@ class DisplayPanel:
 
     @property
     def labels(self) -> NameLabels:
-        """The names that are shown."""
         return NameLabels(self._labels.value)
 
     @property
@@ -506,7 +498,6 @@ class DisplayPanel:
 
     @property
     def confidence(self) -> int:
-        """The confidence of the ellipsoid in percent."""
         return int(self._confidence.value.split()[0])
 
     @property

@@ -155,7 +155,6 @@ def _round(values: Any) -> Vector3:
 
 
 def _describe(fit: DistanceFit, frames: list[str], sigma: float) -> str:
-    """Format residuals and sigmas of a fit."""
     deviations = np.sqrt(np.diag(fit.covariance)).tolist()
     rows = [
         (frame, f"{1000.0 * residual:+.1f} mm", "too large" if abs(residual) > 3.0 * sigma else "")

@@ -176,7 +176,6 @@ class VehicleScene:
 
     @property
     def model(self) -> Model | None:
-        """The model that is drawn."""
         return self._model
 
     def set_model(self, model: Model, base_frame: str, labels: NameLabels) -> float:
@@ -239,7 +238,6 @@ class VehicleScene:
         self._labels.append((kind, text, label))
 
     def _add_pick(self, node: Any, find_frame: Callable[[Any], str]) -> None:
-        """Make a node clickable."""
         node.on_click(lambda event: self._pick(find_frame(event), False))
         node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
 
@@ -369,7 +367,6 @@ class VehicleScene:
         controls.on_update(follow)
 
     def hide_gizmo(self) -> None:
-        """Remove the gizmo."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -475,7 +472,6 @@ def _list_corners(body: Body) -> Array:
 
 
 def _make_box(body: Body) -> Shape:
-    """Return a box around the frames of a body that has no shapes."""
     corners = _list_corners(body)
     low, high = corners.min(axis=0), corners.max(axis=0)
     x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()

@@ -81,7 +81,6 @@ class FilePlatform(LocalPlatform):
         self._receiver = MirrorReceiver("", snapshot, True)
 
     def read_state(self) -> tuple[MirrorState, int]:
-        """Return the state and its time."""
         return self._receiver.state, self._utime
 
     def set_joints(self, positions: Mapping[str, float]) -> None:
@@ -163,7 +162,6 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
 
 
 def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], None]) -> Iterator[LogEvent]:
-    """Yield the events of a log after feeding them to a drive."""
     for number, event in enumerate(log):
         drive.feed(event.channel, event.data, event.utime)
         if number % PROGRESS_EVENTS == 0:

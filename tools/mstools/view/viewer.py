@@ -145,7 +145,6 @@ class Viewer:
             self._scene.highlight_path(self._query.path)
 
     def _show_title(self, note: str) -> None:
-        """Show the title over all tabs, with a note."""
         title = f"ModelServer: {self._source.title}{f' - {note}' if note else ''}"
         if title != self._title:
             self._title = title

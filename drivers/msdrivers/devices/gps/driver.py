@@ -164,7 +164,6 @@ class SetupDialogue:
         return b"\r\n" + self._send_command(now_ns)
 
     def stop(self) -> None:
-        """Stop waiting for responses."""
         self.progress, self.deadline_ns = SetupProgress.IDLE, None
 
     def on_response(self, answer: CommandResponse, now_ns: int) -> bytes:

@@ -138,7 +138,6 @@ class GpsFix:
     delay: float = 0.0
 
     def to_sample(self, header: SensorHeader) -> GpsSample:
-        """Convert to a sample."""
         if isinstance(self.solution, NmeaEpoch):
             return sample_from_nmea(header, self.solution)
         return sample_from_novatel(header, self.solution, self.velocity, self.heading)
@@ -172,7 +171,6 @@ class FixAssembler:
         self._last_log_ns = None
 
     def pop_problems(self) -> list[str]:
-        """Return new warnings."""
         found, self._problems = self._problems, []
         return found
 

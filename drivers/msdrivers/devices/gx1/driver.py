@@ -126,18 +126,15 @@ class PollSchedule:
         self._pending: dict[int, int] = {}
 
     def add(self, command: int, period_s: float, now_ns: int) -> None:
-        """Start to poll a command."""
         self._periods[command] = round(period_s * 1e9)
         self._next[command] = now_ns
 
     def remove(self, command: int) -> None:
-        """Stop to poll a command."""
         for table in (self._periods, self._next, self._pending):
             table.pop(command, None)
 
     @property
     def deadline_ns(self) -> int:
-        """Next poll or timeout."""
         return min((*self._next.values(), *self._pending.values()), default=NEVER)
 
     def pop_due(self, now_ns: int) -> list[int]:
@@ -158,7 +155,6 @@ class PollSchedule:
         return late
 
     def on_reply(self, command: int) -> None:
-        """Record a reply."""
         self._pending.pop(command, None)
 
 
@@ -174,7 +170,6 @@ class TickRateCheck:
     """
 
     def __init__(self, tick_s: float):
-        """`tick_s` is the configured tick."""
         self._tick_s = tick_s
         self._begin_ns: int | None = None
         self._before: tuple[int, int] | None = None

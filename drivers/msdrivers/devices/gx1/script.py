@@ -62,7 +62,6 @@ class Gx1Receiver:
         return replies
 
     def set_streamed(self, command: int) -> None:
-        """Set the streamed measurement; 0 for none."""
         self._streamed = command
         self.parser.set_streamed(*((command,) if command else ()))
 
@@ -75,7 +74,6 @@ class Gx1Receiver:
         self.reset_input()
 
     def reset_input(self) -> None:
-        """Start to record the input."""
         self._first_bytes, self.bytes_received = b"", 0
 
     def describe_input(self) -> str:
@@ -133,11 +131,9 @@ class RequestStep:
 
     @property
     def command(self) -> int:
-        """The command whose reply is expected."""
         return self.request[0]
 
     def is_answered_by(self, packet: gx1.Gx1Packet) -> bool:
-        """Return whether a reply answers the request."""
         return packet.command == self.command and (self.value is None or packet.words[0] == self.value)
 
 
@@ -173,7 +169,6 @@ class NoReplyError(Exception):
 
 
 def report(text: str) -> EndpointStatus:
-    """Report the progress of a script."""
     return EndpointStatus(EndpointPhase.CONFIGURING, text)
 
 
@@ -191,7 +186,6 @@ class ScriptRunner:
 
     @property
     def is_running(self) -> bool:
-        """Whether a script is active."""
         return self._script is not None
 
     @property
@@ -206,13 +200,11 @@ class ScriptRunner:
         return self.start(now)
 
     def start(self, now: HostTime) -> list[Output[bytes]]:
-        """Start the script from its beginning."""
         self.stop()
         self._script = self._make_script()
         return self._advance(partial(next, self._script), now)
 
     def stop(self) -> None:
-        """Abort the script."""
         if self._script is not None:
             self._script.close()
         self._script = self._step = None

@@ -71,7 +71,6 @@ class BoundSignal:
 
     @property
     def path(self) -> str:
-        """`Message.Signal`."""
         return f"{self.message}.{self.name}"
 
     def to_physical(self, raw: float) -> float | None:

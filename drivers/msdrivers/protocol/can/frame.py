@@ -35,7 +35,6 @@ class CanFrame:
 
     @property
     def key(self) -> FrameKey:
-        """Identifier of this kind of frame."""
         return FrameKey(self.arbitration_id, self.is_extended)
 
     @property

@@ -25,7 +25,6 @@ class BoundWheel:
 
     @property
     def signals(self) -> list[BoundSignal]:
-        """The mapped signals."""
         return [each for each in (self.count, self.speed, self.direction, self.steering) if each is not None]
 
     def make_odometer(self, max_speed: float, delay: float) -> Odometer | None:

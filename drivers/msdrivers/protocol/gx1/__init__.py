@@ -58,7 +58,6 @@ class ReplyLayout(NamedTuple):
 
     @property
     def words(self) -> int:
-        """Number of words in the fields."""
         return sum(count for _, count in self.fields)
 
     @property

@@ -22,7 +22,6 @@ class Gx1Request(NamedTuple):
     data: bytes = b""
 
     def to_bytes(self) -> bytes:
-        """Encode the request."""
         key, _ = _FRAMES[self.command]
         return bytes((self.command,)) + key + self.data
 
@@ -33,7 +32,6 @@ def make_poll(command: int) -> bytes:
 
 
 def make_stream(command: int) -> bytes:
-    """Return the request to stream a reply."""
     return Gx1Request(CommandByte.CONTINUOUS, bytes((command,))).to_bytes()
 
 
@@ -80,5 +78,4 @@ class RequestParser:
         return found
 
     def clear(self) -> None:
-        """Forget a request that has begun."""
         self._buffer.clear()

@@ -75,7 +75,6 @@ def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
 
 
 def quaternion_to_words(orientation: Quaternion) -> tuple[int, int, int, int]:
-    """Return the four words of a unit quaternion."""
     w, x, y, z = (round(element / _QUATERNION_SCALE) for element in orientation)
     return (w, x, y, z)
 
@@ -91,7 +90,6 @@ def temperature_from_word(word: int) -> float:
 
 
 def temperature_to_word(celsius: float) -> int:
-    """Return the unsigned word of a temperature, saturated."""
     return min(max(round((celsius / 100.0 + 0.5) * 65536.0 / 5.0), 0), 65535)
 
 

@@ -106,7 +106,6 @@ EXCEPTION_TEXTS = {
 
 
 def explain_exception(code: int) -> str:
-    """Return the meaning of an exception code."""
     return f"exception {code}: {EXCEPTION_TEXTS.get(code, 'a code that the standard does not have; see its manual')}"
 
 
@@ -122,7 +121,6 @@ def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bo
 
 
 def describe_request(request: ReadRegisters | WriteRegisters) -> str:
-    """Describe a request."""
     if isinstance(request, ReadRegisters):
         return f"reading {request.count} {request.table.value} registers from {request.address}"
     return f"writing {len(request.values)} registers from {request.address}"
@@ -193,7 +191,6 @@ class RegisterMap:
         return self.to_words(round((degrees - self.offset_deg) / self.scale_deg))
 
     def can_hold(self, degrees: float) -> bool:
-        """Return whether the registers can hold a value."""
         return self.lowest <= round((degrees - self.offset_deg) / self.scale_deg) <= self.highest
 
 

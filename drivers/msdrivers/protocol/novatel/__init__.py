@@ -239,7 +239,6 @@ class CommandResponse:
 
     @property
     def is_ok(self) -> bool:
-        """Whether the command was accepted."""
         return not self.error
 
 

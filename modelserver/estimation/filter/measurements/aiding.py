@@ -78,7 +78,6 @@ class AbsolutePose(_Anywhere):
     states: ClassVar[tuple[ErrorState, ...]] = ()
 
     def get_utime(self, sample: AbsolutePoseSample) -> int | None:
-        """Return the sample's stamp."""
         return sample.header.utime
 
     def evaluate(self, context: MeasurementContext, sample: AbsolutePoseSample) -> Innovation | str:
@@ -139,7 +138,6 @@ class BeaconRange(_Anywhere):
     states: ClassVar[tuple[ErrorState, ...]] = ()
 
     def get_utime(self, sample: RangeSample) -> int | None:
-        """Return the sample's stamp."""
         return sample.header.utime
 
     def evaluate(self, context: MeasurementContext, sample: RangeSample) -> Innovation | str:

@@ -106,7 +106,6 @@ class GpsPosition(_AtAntenna):
     states: ClassVar[tuple[ErrorState, ...]] = ()
 
     def get_utime(self, sample: GpsSample) -> int | None:
-        """Return the stamp of the fix."""
         return sample.header.utime
 
     def evaluate(self, context: MeasurementContext, sample: GpsSample) -> Innovation | str:

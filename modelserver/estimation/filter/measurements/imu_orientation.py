@@ -129,7 +129,6 @@ class Magnetometer:
 
     @classmethod
     def create(cls, rig: SensorRig, settings: FilterSettings) -> Self | None:
-        """Return it for a vehicle with an IMU."""
         return cls(rig.pose(rig.imu_frame).wxyz, rig.magnetometer) if rig.imu_frame else None
 
     def get_utime(self, sample: ImuSample) -> int | None:

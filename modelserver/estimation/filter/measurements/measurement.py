@@ -55,7 +55,6 @@ class MeasurementContext(NamedTuple):
     steering: float = math.nan
 
     def zero_jacobian(self, rows: int) -> Array:
-        """Return zeros (rows, n) to fill in."""
         return np.zeros((rows, self.layout.size))
 
     def extra(self, name: str) -> float:

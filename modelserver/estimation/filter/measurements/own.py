@@ -121,7 +121,6 @@ class OwnMeasurement:
         return not self.type or get_type(self.type).is_absolute
 
     def get_utime(self, sample: MeasurementSample) -> int | None:
-        """Return the sample's stamp."""
         return sample.header.utime
 
     def evaluate(self, context: MeasurementContext, sample: MeasurementSample) -> Innovation | str:

@@ -186,7 +186,6 @@ class WheelSpeed:
         return cls(contacts, rig.kinematics == "skid_steer", half, rig.imu, rig.steering)
 
     def get_utime(self, sample: WheelsSample) -> int | None:
-        """Return the sample's stamp."""
         return sample.header.utime
 
     def evaluate(self, context: MeasurementContext, sample: WheelsSample) -> Innovation | str:
