@@ -38,12 +38,17 @@ DEAD_CHANCE: Final = 1e-12
 slower ones, up to ten times; and the chance that a healthy one repeats its rate: once in three hundred years at 100 Hz.
 """
 
+NO_REPEATS: Final = (0, 0, 0)
+
+SHORTEST_PERIOD: Final = 1e-3
+"""Seconds between two samples, at least: no unit measures faster, but stamps may be closer."""
+
 
 class GyroAxes(NamedTuple):
     """How often each axis of the gyro has repeated its rate, and the smallest step that it has changed by, rad/s."""
 
     rate: Vector3 = ZERO
-    repeats: tuple[int, int, int] = (0, 0, 0)
+    repeats: tuple[int, int, int] = NO_REPEATS
     steps: Vector3 = (math.inf, math.inf, math.inf)
 
     def update(self, rate: Vector3) -> GyroAxes:
@@ -51,17 +56,23 @@ class GyroAxes(NamedTuple):
         (a, b, c), (x, y, z) = rate, self.rate
         if a == x and b == y and c == z:
             return self
-        n, m, k = self.repeats
-        d, e, f = self.steps
+        d, e, f = steps = self.steps
         p, q, r = abs(a - x), abs(b - y), abs(c - z)
-        repeats = (0 if p else n + 1, 0 if q else m + 1, 0 if r else k + 1)
-        steps = (p if 0.0 < p < d else d, q if 0.0 < q < e else e, r if 0.0 < r < f else f)
+        repeats = NO_REPEATS
+        if p < d or q < e or r < f:
+            n, m, k = self.repeats
+            repeats = (0 if p else n + 1, 0 if q else m + 1, 0 if r else k + 1)
+            steps = (p if 0.0 < p < d else d, q if 0.0 < q < e else e, r if 0.0 < r < f else f)
         return new_tuple(GyroAxes, (rate, repeats, steps))
 
-    def is_dead(self, sigma: float) -> bool:
-        """Return whether an axis repeats a rate that has noise `sigma`, rad/s, as by chance it does not."""
-        if max(self.repeats) < DEAD_SAMPLES:
+    def is_dead(self, noise: float, seconds: float) -> bool:
+        """Return whether an axis repeats a rate, as by chance it does not.
+
+        `noise` is that of the gyro, rad/s/sqrt(Hz), `seconds` the sampling period.
+        """
+        if self.repeats is NO_REPEATS or max(self.repeats) < DEAD_SAMPLES:
             return False
+        sigma = noise / math.sqrt(max(seconds, SHORTEST_PERIOD))
         for count, step in zip(self.repeats, self.steps, strict=True):
             chance = step / (2.0 * math.sqrt(math.pi) * sigma)
             if count >= DEAD_SAMPLES and chance < 1.0 and chance**count < DEAD_CHANCE:

@@ -59,9 +59,6 @@ LONG_REST_TIME: Final = 5.0
 UNNOTICED_TIME: Final = 10.0
 """Seconds for which the heading may have turned by that change unnoticed: then fixes hold it."""
 
-SHORTEST_PERIOD: Final = 1e-3
-"""Seconds between two samples, at least: no unit measures faster, but stamps may be closer."""
-
 LOST_ATTITUDE_SIGMA: Final = 0.7
 """Sigma of the attitude, rad, beyond which a gap in the IMU makes the filter level again."""
 
@@ -81,8 +78,7 @@ def fuse_imu(setup: Setup, state: FilterState, item: Item) -> Fused:
     utime, settings = item.utime, setup.settings
     assert sample.angular_velocity is not None
     imu = state.imu.update(utime, rate, force, state.imu.axes.update(sample.angular_velocity))
-    seconds = max((utime - state.imu.utime) * 1e-6, SHORTEST_PERIOD)
-    if not state.stationary.since and imu.axes.is_dead(settings.gyro_noise / math.sqrt(seconds)):
+    if not state.stationary.since and imu.axes.is_dead(settings.gyro_noise, (utime - state.imu.utime) * 1e-6):
         imu = imu._replace(used_utime=state.imu.used_utime)
         return state._replace(imu=imu), (reject(item, "axis"),)
     # a sample that is like the one before it changed before
