@@ -18,7 +18,7 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 
 from modelserver.transforms.pose import Pose
 from mstools.commands.demo import find_vehicle_file
-from mstools.view.drive import Picture
+from mstools.recordings.drive import Picture
 from mstools.view.page import Page, open_page
 from mstools.view.panels import describe_answer, escape_markdown, format_code
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid, read_mesh

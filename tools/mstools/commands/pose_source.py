@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +22,9 @@ from modelserver.messages import (
     Quality,
 )
 from mstools.terminal.options import parse_variables
-from mstools.terminal.output import print_problems
+from mstools.terminal.output import load_given_model
 
 if TYPE_CHECKING:
-    from modelserver.geometry.model import Model
     from mstools.recordings.log_platform import LogPlatform
 
 
@@ -77,15 +75,6 @@ class FileAnswers(FrameClient):
             reply = ExplanationReply(reply.header, reply.answer._replace(answer=answer))
         assert isinstance(reply, reply_type)
         return reply
-
-
-def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
-    """Load a geometry file, and print its problems. Raises GeometryError, OSError."""
-    from modelserver.formats import load_model
-
-    model = load_model(path, variables=variables)
-    print_problems(model.problems)
-    return model
 
 
 def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:

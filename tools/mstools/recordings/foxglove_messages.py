@@ -62,8 +62,7 @@ from modelserver.geometry.shape import Shape, ShapeKind
 from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import decode, fingerprint_of, get_type_names
-from mstools.view.drive import Drive, DriveEvent, EventKind
-from mstools.view.frames import FramePoses
+from mstools.recordings.drive import Drive, DriveEvent, EventKind, FramePoses
 
 FIX_PERIOD_US: Final = 200_000
 STATIC_PERIOD_US: Final = 5_000_000
@@ -138,13 +137,13 @@ class FoxgloveWriter:
 
     def __init__(self, context: Context, prefix: str = "", definitions: Path | None = None):
         self._context = context
-        self._drive = Drive(prefix)
+        self._drive = Drive(prefix, on_event=self._log_event)
+        self._now = 0
         self._definitions = definitions
         self._model: Model | None = None
         self._frames: FramePoses | None = None
         self._joints: Mapping[str, float] = {}
         self._next_static = self._next_fix = 0
-        self._events: list[DriveEvent] = []
         self._tf = FrameTransformsChannel("/tf", context=context)
         self._pose = PoseInFrameChannel("/pose", context=context)
         self._place = LocationFixChannel("/pose/fix", context=context)
@@ -167,6 +166,7 @@ class FoxgloveWriter:
         drive = self._drive
         if not channel.startswith(drive.prefix):
             return
+        self._now = now
         drive.feed(channel, data, now)
         name = channel[len(drive.prefix) :]
         if self._definitions is not None:
@@ -185,7 +185,6 @@ class FoxgloveWriter:
         except (WireError, GeodesyError, OverflowError):
             # the last one is a stamp that Foxglove's cannot hold
             self.skipped += 1
-        self._log_events(now)
 
     # --- frames
 
@@ -272,18 +271,10 @@ class FoxgloveWriter:
         header = {"stamp": {"sec": sec, "nsec": usec * 1000}, "frame_id": ""}
         self._diagnostics.log({"header": header, "status": status}, log_time=now * 1000)
 
-    def _log_events(self, now: int) -> None:
-        """Log the events that the drive has found since the last call."""
-        events = self._drive.events
-        if not events or (self._events and events[-1] is self._events[-1]):
-            return
-        known = {id(each) for each in self._events}
-        self._events = list(events)
-        for each in events:
-            if id(each) not in known:
-                level = _LEVELS.get(each.kind, LogLevel.Info)
-                message = Log(timestamp=_stamp(each.utime), level=level, message=each.text, name=each.kind)
-                self._log.log(message, log_time=now * 1000)
+    def _log_event(self, event: DriveEvent) -> None:
+        level = _LEVELS.get(event.kind, LogLevel.Info)
+        message = Log(timestamp=_stamp(event.utime), level=level, message=event.text, name=event.kind)
+        self._log.log(message, log_time=self._now * 1000)
 
     def _log_raw(self, channel: str, data: bytes, now: int) -> None:
         if channel not in self._raw:

@@ -32,8 +32,7 @@ from modelserver.geometry.parts import Body
 from modelserver.geometry.shape import Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.view.drive import FIX_COLORS, FixColor, Picture
-from mstools.view.frames import FramePoses
+from mstools.recordings.drive import FIX_COLORS, FixColor, FramePoses, Picture
 
 MAX_MESH_BYTES: Final = 50_000_000
 MAX_TRAIL_POINTS: Final = 4_000

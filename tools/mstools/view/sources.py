@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,11 +22,10 @@ from modelserver.server.stamp_axis import LOOKED_AT, measure
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import iter_batches
-from mstools.commands.pose_source import load_given_model
 from mstools.edit.session import EditedFile, EditSession
+from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
-from mstools.view.drive import Drive
+from mstools.terminal.output import load_given_model
 
 FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""
@@ -179,18 +177,11 @@ def open_live(url: str, prefix: str, timeout: float) -> Source:
     answers = Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="view")
     source = Source("live", drive, answers, is_live=True)
     stop = threading.Event()
-    listener = threading.Thread(target=_listen, args=(source, resolve_url(url), stop), name="view", daemon=True)
+    bus = open_lcm(resolve_url(url))
+    arguments = (bus, prefix, drive.feed, stop.is_set, source.lock)
+    listener = threading.Thread(target=follow_bus, args=arguments, name="view", daemon=True)
     listener.start()
     source._resources.callback(answers.close)
     source._resources.callback(listener.join, 2.0)
     source._resources.callback(stop.set)
     return source
-
-
-def _listen(source: Source, url: str, stop: threading.Event) -> None:
-    """Feed the messages of the bus to a drive until the event is set."""
-    for batch in iter_batches(open_lcm(url), source.drive.prefix, stop.is_set):
-        now = time.time_ns() // 1000
-        with source.lock:
-            for channel, data in batch:
-                source.drive.feed(channel, data, now)

@@ -1,30 +1,36 @@
-"""A drive as the viewer shows it: geometry, poses, joints, fixes and events over time, from a log or a running service.
+"""A drive as a viewer shows it: geometry, poses, joints, fixes and events over time, from a log or a running service.
 
 `Drive.feed` processes one message and stores what a picture needs; `Drive.get_picture` returns the picture of an
-instant. Poses and joints are stored at most once per `PICTURE_PERIOD_US`, more than a screen shows, so an hour of them
-takes some 20 MB, and is read without decoding the rest. No clock, no socket.
+instant, and `FramePoses` where the bodies of the model are in it. Poses and joints are stored at most once per
+`PICTURE_PERIOD_US`, more than a screen shows, so an hour of them takes some 20 MB, and is read without decoding the
+rest. Neither has a clock or a socket; `follow_bus` has.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
+import time
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from enum import StrEnum
 from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.earth.origin import Origin
-from modelserver.errors import WireError
+from modelserver.errors import QueryError, WireError
 from modelserver.formats.snapshot import decode_snapshot
-from modelserver.geometry.joint import coordinate_names
+from modelserver.geometry.joint import Coordinates, coordinate_names
+from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Body
 from modelserver.messages import (
     VALID,
     Decision,
@@ -43,7 +49,11 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
 from modelserver.wire.codec import decode, fingerprint_of
 from modelserver.wire.fields import read_text
+from modelserver.wire.provider import handle_message
 from modelserver.wire.snapshot import SnapshotAssembler
+
+if TYPE_CHECKING:
+    import lcm
 
 PICTURE_PERIOD_US: Final = 30_000
 """Least time between two stored poses, and two stored messages of joints of one source, microseconds."""
@@ -236,7 +246,8 @@ MAX_INTERPOLATION_US: Final = 1_000_000
 class Drive:
     """What is known of a drive. Channels have the prefix `prefix`; `model` is the geometry, from a snapshot or given.
 
-    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel.
+    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel. `on_event` is
+    called with each new event.
     """
 
     prefix: str = ""
@@ -250,6 +261,7 @@ class Drive:
     channels: dict[str, ChannelCount] = field(default_factory=dict)
     drivers: dict[str, DriverHealth] = field(default_factory=dict)
     damaged: int = 0
+    on_event: Callable[[DriveEvent], None] | None = None
 
     def __post_init__(self) -> None:
         self._coordinates = _list_coordinates(self.model)
@@ -399,8 +411,8 @@ class Drive:
         self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
 
     def _process_decisions(self, _: str, data: bytes, now: int) -> None:
-        for each in decode("decisions_t", data).decisions:
-            self._process_decision(each)
+        for decision in decode("decisions_t", data).decisions:
+            self._process_decision(decision)
 
     def _process_decision(self, decision: Decision) -> None:
         if not 0 < decision.utime < MAX_STAMP:
@@ -449,6 +461,8 @@ class Drive:
                 last.last, last.count = utime, last.count + 1
                 return
         self.events.append(DriveEvent(utime, kind, text, utime))
+        if self.on_event is not None:
+            self.on_event(self.events[-1])
         if len(self.events) > MAX_EVENTS:
             del self.events[: MAX_EVENTS // 2]
 
@@ -575,3 +589,94 @@ def _list_coordinates(model: Model | None) -> frozenset[str]:
 
 def _read_pose(row: Array) -> Pose:
     return Pose(tuple(row[_POSITION].tolist()), tuple(row[_QUATERNION].tolist()))
+
+
+class BodyPath(NamedTuple):
+    """How a body is reached: the path to its first frame, the body's pose in that frame, and the coordinates passed."""
+
+    path: KinematicPath
+    from_frame: Pose
+    coordinates: frozenset[str]
+
+
+class FramePoses:
+    """Compute where the bodies of a model are in `base_frame`; only those behind joints change."""
+
+    def __init__(self, model: Model, base_frame: str):
+        self._model = model
+        found = {body.name: self._find_path(body, base_frame) for body in model.bodies}
+        self.paths: dict[str, BodyPath] = {name: path for name, path in found.items() if path is not None}
+        """The bodies that are joined to the base frame."""
+
+    def _find_path(self, body: Body, base_frame: str) -> BodyPath | None:
+        if not body.frames:
+            return None
+        first = body.frames[0]
+        try:
+            path = self._model.get_kinematic_path(first.full_name, base_frame)
+        except QueryError:
+            return None
+        coordinates = frozenset(name for joint in path.joints for name in self._model.drives[joint.name].names)
+        return BodyPath(path, first.pose.inverse(), coordinates)
+
+    def compute_bodies(self, joints: Mapping[str, float], moved: Collection[str] | None = None) -> dict[str, Pose]:
+        """Return the poses of the bodies by name; with `moved` only of those behind these coordinates."""
+        return {
+            name: each.path.compute_pose([self._get_position(joint.name, joints) for joint in each.path.joints])
+            @ each.from_frame
+            for name, each in self.paths.items()
+            if moved is None or not each.coordinates.isdisjoint(moved)
+        }
+
+    def compute(self, joints: Mapping[str, float], moved: Collection[str] | None = None) -> dict[str, Pose]:
+        """Return the poses of the frames by full name; with `moved` only of those behind these coordinates."""
+        return {
+            frame.full_name: pose @ frame.pose
+            for name, pose in self.compute_bodies(joints, moved).items()
+            for frame in self._model.body(name)
+        }
+
+    def _get_position(self, joint: str, joints: Mapping[str, float]) -> Coordinates:
+        """Return a joint's position: received, else its default."""
+        drive = self._model.drives[joint]
+        leader = self._model.joints[drive.leader].joint
+        found = tuple(
+            [joints.get(name, default) for name, default in zip(drive.names, leader.default_position, strict=True)]
+        )
+        if drive.leader == joint:
+            return found
+        return tuple([drive.multiplier * value + drive.offset for value in found])
+
+
+# --- bus
+
+POLL_S: Final = 0.2
+"""Longest wait for a message, seconds: a signal may have ended it."""
+
+QUEUE_CAPACITY: Final = 10_000
+"""Queued messages of all channels together."""
+
+MAX_BATCH: Final = 500
+
+
+def follow_bus(
+    bus: lcm.LCM,
+    prefix: str,
+    feed: Callable[[str, bytes, int], None],
+    is_stopped: Callable[[], bool],
+    lock: AbstractContextManager[object] | None = None,
+) -> None:
+    """Feed the messages of all channels with a prefix, in batches under the lock, until it is stopped."""
+    received: list[tuple[str, bytes]] = []
+    subscription = bus.subscribe(f"{re.escape(prefix)}.*", lambda channel, data: received.append((channel, data)))
+    subscription.set_queue_capacity(QUEUE_CAPACITY)
+    while not is_stopped():
+        handle_message(bus, int(POLL_S * 1e3))
+        while len(received) < MAX_BATCH and handle_message(bus):
+            pass
+        now = time.time_ns() // 1000
+        with lock or nullcontext():
+            for channel, data in received:
+                feed(channel, data, now)
+        received.clear()
+    bus.unsubscribe(subscription)
