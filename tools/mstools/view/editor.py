@@ -1,37 +1,54 @@
 """The page's editor of a geometry file: what is selected, its fields, the gizmo, problems, saving and applying.
 
-All changes go through an `EditSession`. Callbacks of the page run in threads of their own; they only queue an action,
-which the viewer executes between two pictures.
+All changes go through an `EditSession`. Callbacks of the page only queue an action, which the viewer executes between
+two pictures. `PlacePanel` computes a pose from a frame with which it coincides, or from distances to others.
 """
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from modelserver.client.remote import Platform
 from modelserver.errors import ModelServerError, Problem, QueryError, Severity
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.geometry.placement import PlacementError
+from modelserver.geometry.parts import Sigma
+from modelserver.geometry.placement import (
+    DistanceFit,
+    Placement,
+    PlacementError,
+    list_measured_points,
+    locate_by_distances,
+    place_constraint,
+    place_frame,
+)
 from modelserver.messages import ReloadReply
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
+from modelserver.transforms.so3 import Vector3
+from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.session import EditSession
-from mstools.view.item_fields import ItemFields, Snap, list_frames
-from mstools.view.panels import escape_markdown
-from mstools.view.placing import PlacePanel
+from mstools.edit.yaml_text import EditError
+from mstools.view.fields import ChangeItem, ItemFields, NumberFields, Snap, find_part, list_frames
+from mstools.view.page import Actions
+from mstools.view.panels import escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
 MAX_LABEL: Final = 60
 LOOK_PERIOD_S: Final = 2.0
 """Period at which the file is compared with what was read, seconds."""
+
+MAX_DISTANCES: Final = 6
+NO_FRAME: Final = "-"
+DIGITS: Final = 6
+"""Decimals of a computed placement: micrometers, and millionths of a degree."""
 
 Change = Callable[[GeometryDocument], GeometryDocument]
 
@@ -67,7 +84,7 @@ class Editor:
         server: viser.ViserServer,
         scene: VehicleScene,
         editing: Editing,
-        actions: queue.SimpleQueue[Callable[[], None]],
+        actions: Actions,
         show: Callable[[Model], None],
     ):
         self._gui = gui = server.gui
@@ -89,24 +106,20 @@ class Editor:
         self._undo = self._add_button("Undo", lambda: self._step(session.undo))
         self._redo = self._add_button("Redo", lambda: self._step(session.redo))
         self._save = self._add_button("Save ...", self._ask_save)
-        self._apply = self._add_button("Apply to the service ...", self._ask_apply)
+        self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
         self._add_button("Read the file again", self._ask_read)
         self._problems = gui.add_folder("Problems")
         with self._problems:
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
-        self._kind.on_update(lambda event: self._queue(event, lambda: self._select_first(ItemKind(event.target.value))))
-        self._name.on_update(
-            lambda event: self._queue(
-                event, lambda: self.select(GeometryItem(ItemKind(self._kind.value), event.target.value))
-            )
-        )
+        actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
+        actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
         self._fields = ItemFields(server, session, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
             self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
-            self._gizmo.on_update(lambda event: self._queue(event, self.show_gizmo))
+            actions.on_update(self._gizmo, self.show_gizmo)
         with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
             self._add_button("Add body", lambda: self._add(ItemKind.BODY))
@@ -122,17 +135,21 @@ class Editor:
         self._select_first(ItemKind.FRAME)
         self._refresh()
 
-    # --- from the page
+    def _add_button(self, label: str, action: Callable[[], object]) -> Any:
+        return self._actions.add_button(self._gui, label, action)
 
-    def _queue(self, event: Any, action: Callable[[], None]) -> None:
-        """Queue an action of the page; values that this program sets have no client."""
-        if event.client_id is not None:
-            self._actions.put(action)
+    def _ask(self, title: str, text: str, answer: str, action: Callable[[], object]) -> None:
+        """Show a text in a dialog, and execute an action if a person answers so."""
+        modal: Any = self._gui.add_modal(title)
 
-    def _add_button(self, label: str, action: Callable[[], None]) -> Any:
-        button = self._gui.add_button(label)
-        button.on_click(lambda _: self._actions.put(action))
-        return button
+        def confirm() -> None:
+            modal.close()
+            action()
+
+        with modal:
+            self._gui.add_markdown(text)
+            self._add_button(answer, confirm)
+            self._add_button("Cancel", modal.close)
 
     # --- selection
 
@@ -212,7 +229,7 @@ class Editor:
         shown = [each for each in found if each.severity is not Severity.NOTE][:SHOWN_PROBLEMS]
         notes = sum(each.severity is Severity.NOTE for each in found)
         more = len(found) - len(shown) - notes
-        lines = [f"- {_describe(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
+        lines = [f"- {_describe_problem(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
         text = "\n".join(lines) or "none"
         if notes:
             text += f"\n\n{notes} note{'' if notes == 1 else 's'}: modelserver check --notes"
@@ -322,24 +339,18 @@ class Editor:
         if not self._fields.commit():
             return
         diff, shown = self._session.make_diff(), self._session.document
-        modal = self._gui.add_modal(f"Save {self._session.file.path.name}")
-        with modal:
-            # longer than what the file may have
-            fence = "`" * (3 + diff.count("`"))
-            self._gui.add_markdown(f"{fence}diff\n{diff}\n{fence}")
-            self._add_button("Save", lambda: self._confirm(modal, lambda: self._write_file(shown)))
-            self._add_button("Cancel", modal.close)
+        # longer than what the file may have
+        fence = "`" * (3 + diff.count("`"))
+        text = f"{fence}diff\n{diff}\n{fence}"
+        self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
 
     def _ask_read(self) -> None:
         """Read the file again, after a question if changes would be lost."""
         if not self._session.is_changed:
             self._step(self._session.read)
             return
-        modal = self._gui.add_modal("Read the file again")
-        with modal:
-            self._gui.add_markdown("The changes that are not saved are dropped.")
-            self._add_button("Drop them", lambda: self._confirm(modal, lambda: self._step(self._session.read)))
-            self._add_button("Cancel", modal.close)
+        text = "The changes that are not saved are dropped."
+        self._ask("Read the file again", text, "Drop them", lambda: self._step(self._session.read))
 
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
@@ -347,23 +358,12 @@ class Editor:
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
         elif self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
-        self._refresh_quietly()
-
-    def _refresh_quietly(self) -> None:
         message = self._message.content
         self._refresh()
         self._message.content = message
 
-    @staticmethod
-    def _confirm(modal: Any, action: Callable[[], None]) -> None:
-        modal.close()
-        action()
-
-    def _ask_apply(self) -> None:
-        """Ask the service what a reload would change."""
-        self._start_reload(dry_run=True)
-
     def _start_reload(self, dry_run: bool) -> None:
+        """Ask the service what a reload would change, or reload."""
         if self._reloading is None:
             self._report("asking the service ...")
             self._reloading = dry_run, self._executor.submit(self._editing.reload, dry_run)
@@ -396,17 +396,14 @@ class Editor:
             self._report(f"the service has this geometry already, revision {reply.revision}")
         else:
             self._report("")
-            modal = self._gui.add_modal("Apply to the running service")
-            with modal:
-                self._gui.add_markdown("\n".join(f"- {escape_markdown(each)}" for each in reply.changes))
-                self._add_button("Apply", lambda: self._confirm(modal, lambda: self._start_reload(dry_run=False)))
-                self._add_button("Cancel", modal.close)
+            changes = "\n".join(f"- {escape_markdown(each)}" for each in reply.changes)
+            self._ask("Apply to the running service", changes, "Apply", lambda: self._start_reload(dry_run=False))
 
     def close(self) -> None:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
-def _describe(problem: Problem) -> str:
+def _describe_problem(problem: Problem) -> str:
     fix = f"; {problem.fix}" if problem.fix else ""
     place = f" ({problem.element})" if problem.element else ""
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
@@ -418,3 +415,119 @@ def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
     plain = item.name.rpartition(":")[2]
     numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
     return next(name for name in numbers if item.name.removesuffix(plain) + name not in taken)
+
+
+class PlacePanel:
+    """Two folders: frames that coincide, and distances."""
+
+    def __init__(self, gui: viser.GuiApi, session: EditSession, change: ChangeItem, actions: Actions):
+        self._session = session
+        self._change = change
+        self._item: GeometryItem | None = None
+        with gui.add_folder("Frames that coincide"):
+            self._hint = gui.add_markdown("")
+            self._frame: Any = gui.add_dropdown("Frame", (NO_FRAME,))
+            self._target: Any = gui.add_dropdown("is at", (NO_FRAME,))
+            self._position_only: Any = gui.add_checkbox("Position only", False)
+            actions.add_button(gui, "Place there", lambda: self._place(self._coincide))
+        with gui.add_folder("Distances from frames"):
+            self._rows: list[tuple[Any, NumberFields]] = []
+            for number in range(1, MAX_DISTANCES + 1):
+                frame = gui.add_dropdown(f"From {number}", (NO_FRAME,))
+                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
+            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
+            self._mirrored: Any = gui.add_checkbox("On the other side", False, hint="Three distances fit two positions")
+            actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
+            self._result = gui.add_markdown("")
+
+    def show(self, item: GeometryItem) -> None:
+        """Offer the frames for an item."""
+        if item != self._item:
+            self._result.content = ""
+        self._item = item
+        frames = (NO_FRAME, *list_frames(self._session.document))
+        is_constraint = item.kind is ItemKind.CONSTRAINT
+        self._frame.visible = is_constraint
+        self._hint.content = {
+            ItemKind.CONSTRAINT: "Moves the constraint so that two frames, one on each side, are the same place.",
+            ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
+        }.get(item.kind, "Select a frame or a constraint.")
+        for dropdown in (self._frame, self._target, *(frame for frame, _ in self._rows)):
+            chosen = dropdown.value
+            dropdown.options = frames
+            dropdown.value = chosen if chosen in frames else NO_FRAME
+
+    def _place(self, compute: Callable[[Model, GeometryItem], tuple[Placement, Pose]]) -> None:
+        """Place the item where a function of the model computes it; that returns its old pose too."""
+        item = self._item
+        if item is None:
+            return
+
+        def change(document: GeometryDocument) -> GeometryDocument:
+            model = self._session.model
+            if model is None or self._session.has_errors:
+                raise EditError("fix the errors first; a pose is computed from a geometry without any")
+            return _write(document, item, *compute(model, item))
+
+        self._change(change, None)
+
+    def _coincide(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
+        target, position_only = self._target.value, self._position_only.value
+        if target == NO_FRAME:
+            raise EditError("choose the frame with which it coincides")
+        part = find_part(model, item)
+        if part is None:
+            raise EditError("select a frame or a constraint")
+        if item.kind is ItemKind.FRAME:
+            return place_frame(model, item.name, target, position_only), part.pose
+        if self._frame.value == NO_FRAME:
+            raise EditError("choose the two frames that coincide")
+        return place_constraint(model, item.name, self._frame.value, target, position_only), part.pose
+
+    def _measure(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
+        """Place a frame by its distances from others."""
+        if item.kind is not ItemKind.FRAME:
+            raise EditError("select the frame to which the distances were measured")
+        given = [(frame.value, distance.value[0]) for frame, distance in self._rows if frame.value != NO_FRAME]
+        points, P = list_measured_points(model, item.name, [name for name, _ in given])
+        distances = np.array([distance for _, distance in given], float)
+        (sigma_m,) = self._sigma.value
+        sigmas = np.full(len(given), sigma_m)
+        frame = model.frame(item.name)
+        fit = locate_by_distances(points, distances, sigmas, frame.pose.xyz, P)
+        if self._mirrored.value:
+            if fit.mirrored is None:
+                raise EditError("the distances fit on one side only")
+            fit = locate_by_distances(points, distances, sigmas, fit.mirrored, P)
+        self._result.content = _describe_fit(fit, [name for name, _ in given], sigma_m)
+        rotation = (frame.sigma or Sigma()).rotation
+        sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), rotation)
+        return Placement(Pose(fit.position, frame.pose.wxyz), sigma), frame.pose
+
+
+def _write(document: GeometryDocument, item: GeometryItem, found: Placement, old: Pose) -> GeometryDocument:
+    """Write a placement; a rotation that is the old one stays as it is written."""
+    degrees = np.degrees(found.pose.rpy)
+    is_turned = old.distance(found.pose)[1] > SAME_RADIANS
+    placed = document.set_pose(item, _round(found.pose.xyz), _round(degrees) if is_turned else so3.to_vector3(degrees))
+    if found.sigma is None:
+        return placed
+    return placed.set_sigma(item, _round(found.sigma.position), _round(np.degrees(found.sigma.rotation)))
+
+
+def _round(values: Any) -> Vector3:
+    return so3.to_vector3(round(float(each), DIGITS) + 0.0 for each in values)
+
+
+def _describe_fit(fit: DistanceFit, frames: list[str], sigma: float) -> str:
+    deviations = np.sqrt(np.diag(fit.covariance)).tolist()
+    rows = [
+        (frame, f"{1000.0 * residual:+.1f} mm", "too large" if abs(residual) > 3.0 * sigma else "")
+        for frame, residual in zip(frames, fit.residuals.tolist(), strict=True)
+    ]
+    parts = [format_table(("from", "residual", ""), rows)]
+    parts.append("Sigma x, y, z: " + ", ".join(f"{1000.0 * each:.1f} mm" for each in deviations))
+    if fit.mirrored is not None:
+        place = ", ".join(f"{each:.4f}" for each in fit.mirrored)
+        parts.append(escape_markdown(f"They fit at {place} m too, on the other side of the plane of the frames."))
+    return "\n\n".join(parts)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import hmac
 import http
 import ipaddress
+import queue
 import secrets
 import socket
 from collections.abc import Callable
@@ -99,6 +100,20 @@ class Guard:
                 attributes = "HttpOnly; SameSite=Strict; Path=/"
                 response.headers["Set-Cookie"] = f"{self.cookie}={self.token}; {attributes}"
         return response
+
+
+class Actions(queue.SimpleQueue[Callable[[], object]]):
+    """Actions of the page's widgets, whose callbacks run in threads of their own: executed between two pictures."""
+
+    def on_update(self, field: Any, action: Callable[[], object]) -> None:
+        """Queue an action where a person changes a field; values that this program sets have no client."""
+        field.on_update(lambda event: self.put(action) if event.client_id is not None else None)
+
+    def add_button(self, gui: viser.GuiApi, label: str, action: Callable[[], object]) -> viser.GuiButtonHandle:
+        """Add a button that queues an action."""
+        button = gui.add_button(label)
+        button.on_click(lambda _: self.put(action))
+        return button
 
 
 class PageServer(viser.ViserServer):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import queue
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -22,6 +21,7 @@ from modelserver.geometry.model import Model
 from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.terminal.health_text import format_body, format_duration
+from mstools.view.page import Actions
 from mstools.view.scene import CHI_SQUARE_3, NameLabels
 from mstools.view.sources import Source, list_coordinates
 
@@ -235,7 +235,7 @@ class TimePanel:
     `utime` is 0 while the newest picture of a live drive is followed.
     """
 
-    def __init__(self, gui: viser.GuiApi, is_live: bool, actions: queue.SimpleQueue[Callable[[], None]]):
+    def __init__(self, gui: viser.GuiApi, is_live: bool, actions: Actions):
         self._begin = 0
         self._end = 0
         self._at = 0.0
@@ -246,24 +246,15 @@ class TimePanel:
         self._drive: Drive | None = None
         self._clock = gui.add_markdown("")
         self._slider: Any = gui.add_slider("Time (s)", 0.0, 1.0, 0.05, 0.0)
-        # a value that this program sets has no client
-        self._slider.on_update(
-            lambda event: actions.put(lambda: self.jump(event.target.value)) if event.client_id is not None else None
-        )
-        self._play = gui.add_button("Play")
-        self._play.on_click(lambda _: actions.put(self.toggle))
+        actions.on_update(self._slider, lambda: self.jump(self._slider.value))
+        self._play = actions.add_button(gui, "Play", self.toggle)
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
         self._follow: Any = gui.add_checkbox("Live", is_live, visible=is_live)
-        self._follow.on_update(
-            lambda event: (
-                actions.put(lambda: self._set_following(event.target.value)) if event.client_id is not None else None
-            )
-        )
+        actions.on_update(self._follow, lambda: self._set_following(self._follow.value))
         with gui.add_folder("Events"):
             self._kind = gui.add_dropdown("Kind", (ALL, *EventKind))
-            previous, following = gui.add_button("Previous"), gui.add_button("Next")
-            previous.on_click(lambda _: actions.put(lambda: self._jump_to_event(-1)))
-            following.on_click(lambda _: actions.put(lambda: self._jump_to_event(1)))
+            actions.add_button(gui, "Previous", lambda: self._jump_to_event(-1))
+            actions.add_button(gui, "Next", lambda: self._jump_to_event(1))
             self._events = gui.add_markdown("")
 
     @property
@@ -284,8 +275,7 @@ class TimePanel:
 
     def _set_following(self, is_following: bool) -> None:
         self.is_following = is_following
-        if self._follow.value != is_following:
-            self._follow.value = is_following
+        self._follow.value = is_following
 
     def _list_events(self) -> list[DriveEvent]:
         wanted = self._kind.value
@@ -332,21 +322,16 @@ class TimePanel:
         here = self._begin + round(self._at * 1e6) if self._begin else 0
         when = datetime.fromtimestamp(here * 1e-6, UTC).isoformat(sep=" ", timespec="milliseconds") if here else ""
         clock = f"**{self._at:.2f} s** of {length:.1f} s  \n{when}" if here else "no pose and no joints yet"
-        self._set(self._clock, clock)
+        self._clock.content = clock
         events = self._list_events()
         before = [each for each in events if each.utime <= here][-SHOWN_EVENTS:]
         after = [each for each in events if each.utime > here][:2]
         rows = [self._describe(each) for each in (*before, *after)]
-        self._set(self._events, format_table(("s", "event", ""), rows) if rows else "none")
+        self._events.content = format_table(("s", "event", ""), rows) if rows else "none"
 
     def _describe(self, event: DriveEvent) -> tuple[str, str, str]:
         repeated = f" ({event.count}x)" if event.count > 1 else ""
         return (f"{(event.utime - self._begin) * 1e-6:.2f}", event.kind, event.text + repeated)
-
-    @staticmethod
-    def _set(handle: viser.GuiMarkdownHandle, text: str) -> None:
-        if handle.content != text:
-            handle.content = text
 
 
 class StatePanel:
@@ -509,7 +494,7 @@ class DisplayPanel:
 class JointsPanel:
     """A slider for each coordinate of a geometry file, degrees and meters, within its limits."""
 
-    def __init__(self, gui: viser.GuiApi, source: Source, actions: queue.SimpleQueue[Callable[[], None]]):
+    def __init__(self, gui: viser.GuiApi, source: Source, actions: Actions):
         self._gui = gui
         self._source = source
         self._actions = actions
@@ -545,7 +530,7 @@ class JointsPanel:
         value = default if moved is None else min(max(moved, lower), upper)
         unit, step = ("deg", 0.1) if is_angle else ("m", 0.001)
         slider = self._gui.add_slider(f"{name} ({unit})", lower, upper, step, value)
-        slider.on_update(lambda event: self._actions.put(self._apply) if event.client_id is not None else None)
+        self._actions.on_update(slider, self._apply)
         self._sliders[name] = (slider, scale)
 
     def _apply(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 import time
 import traceback
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from typing import Final
 from modelserver.geometry.model import Model
 from mstools.edit.document import GeometryItem, ItemKind
 from mstools.view.editor import Editing, Editor
-from mstools.view.page import Page
+from mstools.view.page import Actions, Page
 from mstools.view.panels import (
     STATE_PERIOD_S,
     DisplayPanel,
@@ -41,7 +40,7 @@ class Viewer:
     def __init__(self, page: Page, source: Source, editing: Editing | None = None):
         self._source = source
         self._server = page.server
-        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._actions = Actions()
         self._model: Model | None = None
         self._named: tuple[NameLabels, tuple[str, str]] | None = None
         self._next_slider = self._next_state = self._next_fixes = 0.0
@@ -90,7 +89,7 @@ class Viewer:
         if self._editor is not None:
             self._editor.close()
 
-    def _execute(self, action: Callable[[], None]) -> None:
+    def _execute(self, action: Callable[[], object]) -> None:
         """Execute an action of the page. An error of this program does not end it: changes may not be saved yet."""
         try:
             action()

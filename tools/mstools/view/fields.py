@@ -1,9 +1,13 @@
-"""The fields of a body, frame or constraint in the editor: numbers and texts that are set together."""
+"""The fields of a body, frame or constraint in the editor: numbers and texts that are set together.
+
+Each number has a text field, so that what is typed stays as it is typed. A number that was not changed in its field is
+as exact as it was given, whatever decimals the field shows.
+"""
 
 from __future__ import annotations
 
+import html
 import math
-import queue
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import StrEnum
@@ -13,6 +17,7 @@ import numpy as np
 import viser
 
 from modelserver.errors import QueryError, quote
+from modelserver.formats.reading import parse_number
 from modelserver.formats.writing import format_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
@@ -20,20 +25,92 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Vector3
 from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.session import EditSession
 from mstools.edit.yaml_text import EditError
-from mstools.view.number_fields import PRECISION, NumberFields, parse_typed
+from mstools.view.page import Actions
+
+PRECISION: Final = 6
+"""Decimals of a field."""
 
 SAME: Final = 10.0**-PRECISION
-"""A number that differs by less from what a field was given was not changed in it."""
+"""A drag by less has not moved, or turned, what is dragged."""
 
 NO_LEADER: Final = "-"
 _INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
 
+_MINUS: Final = str.maketrans(dict.fromkeys("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d", "-"))
+"""Minus signs and dashes that keyboards and other programs write."""
+
+_RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
+
 ChangeItem = Callable[[Callable[[GeometryDocument], GeometryDocument], GeometryItem | None], bool]
 """Makes a change and selects an item; returns whether it could be made."""
+
+
+def parse_typed(label: str, text: str) -> float:
+    """Return the number that was typed: with a sign, an exponent, a decimal comma. Raises EditError."""
+    plain = text.strip().translate(_MINUS)
+    if plain.count(",") == 1 and "." not in plain:
+        plain = plain.replace(",", ".")
+    try:
+        return parse_number(plain)
+    except ValueError as error:
+        raise EditError(f"{label}: {error}") from None
+
+
+def _format_field(value: float) -> str:
+    return format_number(round(value, PRECISION) + 0.0)
+
+
+class NumberFields:
+    """Fields of numbers with a label each. What is no number is marked in red, and stays."""
+
+    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float], actions: Actions):
+        self._labels = tuple(labels)
+        self._given = tuple(map(float, values))
+        self._texts: list[Any] = [
+            gui.add_text(label, _format_field(value)) for label, value in zip(labels, values, strict=True)
+        ]
+        self._problem: Any = gui.add_html("")
+        for each in self._texts:
+            actions.on_update(each, self.mark)
+
+    @property
+    def value(self) -> tuple[float, ...]:
+        """The numbers. Raises EditError for a text that is none."""
+        typed = [parse_typed(label, each.value) for label, each in zip(self._labels, self._texts, strict=True)]
+        return tuple(
+            [old if new == float(_format_field(old)) else new for old, new in zip(self._given, typed, strict=True)]
+        )
+
+    @value.setter
+    def value(self, numbers: Sequence[float]) -> None:
+        self.texts = tuple(map(_format_field, numbers))
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether a number differs from what was given. Raises EditError."""
+        return self.value != self._given
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        return tuple([str(each.value) for each in self._texts])
+
+    @texts.setter
+    def texts(self, words: Sequence[str]) -> None:
+        for each, word in zip(self._texts, words, strict=True):
+            each.value = word
+        self.mark()
+
+    def mark(self) -> None:
+        """Show why the numbers cannot be read, if so."""
+        problem = ""
+        try:
+            _ = self.value
+        except EditError as error:
+            problem = _RED.format(html.escape(str(error)))
+        self._problem.content = problem
 
 
 class Snap(StrEnum):
@@ -69,13 +146,7 @@ def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint
 class ItemFields:
     """A form with the fields of what is selected; its button sets all of them as one change."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        session: EditSession,
-        change: ChangeItem,
-        actions: queue.SimpleQueue[Callable[[], None]],
-    ):
+    def __init__(self, server: viser.ViserServer, session: EditSession, change: ChangeItem, actions: Actions):
         self._server = server
         self._gui = gui = server.gui
         self._session = session
@@ -86,6 +157,7 @@ class ItemFields:
         self._part: BodyFrame | Constraint | None = None
         self._fields: dict[str, Any] = {}
         self._given: dict[str, Any] = {}
+        self._exact: dict[str, tuple[float, ...]] = {}
         self._place = gui.add_folder("Values")
 
     # --- what is shown
@@ -93,7 +165,7 @@ class ItemFields:
     def show(self, item: GeometryItem) -> None:
         """Show the fields of an item."""
         self._item = item
-        self._fields, self._given = {}, {}
+        self._fields, self._given, self._exact = {}, {}, {}
         self._part = find_part(self._session.drawn, item)
         old = self._form
         with self._server.atomic():
@@ -104,7 +176,7 @@ class ItemFields:
             if old is not None:
                 # last: a page hides a folder that was empty for a moment, and may never show it again
                 old.remove()
-        self._form.on_submit(lambda _: self._actions.put(self._submit))
+        self._form.on_submit(lambda _: self._actions.put(self.set))
 
     def _add_fields(self, item: GeometryItem) -> None:
         document = self._session.document
@@ -121,7 +193,7 @@ class ItemFields:
         if isinstance(self._part, Constraint):
             self._add_joint(self._part.joint)
         self._add("description", self._gui.add_text("Description", self._get_description(item)))
-        self._gui.add_button("Set").on_click(lambda _: self._actions.put(self._submit))
+        self._actions.add_button(self._gui, "Set", self.set)
 
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:
@@ -133,8 +205,7 @@ class ItemFields:
         self._fields[key], self._given[key] = field, field.value
 
     def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
-        self._add(key, NumberFields(self._gui, labels, values, self._actions))
-        self._given[key] = tuple(values)
+        self._fields[key] = NumberFields(self._gui, labels, values, self._actions)
 
     def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
         degrees = [math.degrees(each) for each in pose.rpy]
@@ -171,12 +242,13 @@ class ItemFields:
         elif joint.upper and not joint.lower:
             limits = [-math.inf, joint.upper[0]]
         for key, label, values in (
-            ("limits", f"limits ({unit})", limits),
+            ("limits", f"limits ({unit})", tuple(limits)),
             ("rate_limit", f"rate limit ({unit}/s)", joint.rate_limit),
             ("default", f"default ({unit})", joint.default),
             ("sigma", f"joint sigma ({unit})", joint.sigma),
         ):
             self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
+            self._exact[key] = values
         assert self._item is not None
         others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
         leaders = (NO_LEADER, *(each for each in others if each != self._item.name))
@@ -186,6 +258,7 @@ class ItemFields:
         known = mimic or Mimic("")
         self._add("multiplier", gui.add_text("multiplier", format_number(known.multiplier)))
         self._add("offset", gui.add_text(f"offset ({unit})", _format_values([known.offset], scale)))
+        self._exact |= {"multiplier": (known.multiplier,), "offset": (known.offset,)}
 
     @property
     def in_template(self) -> bool:
@@ -193,9 +266,6 @@ class ItemFields:
         return "template" in self._fields and bool(self._fields["template"].value)
 
     # --- what is set
-
-    def _submit(self) -> None:
-        self.set()
 
     def commit(self) -> bool:
         """Set what was typed, if anything was; return whether nothing is left that cannot be set."""
@@ -219,11 +289,13 @@ class ItemFields:
     def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
         in_template = self.in_template
         if self._is_changed("xyz", "rpy"):
-            document = document.set_pose(item, self._read_vector("xyz"), self._read_vector("rpy"), in_template)
+            xyz, rpy = (so3.to_vector3(self._fields[key].value) for key in ("xyz", "rpy"))
+            document = document.set_pose(item, xyz, rpy, in_template)
         if self._is_changed("has_sigma", "sigma_xyz", "sigma_rpy"):
             # numbers that are typed are meant, whatever the checkbox has
             is_stated = self._fields["has_sigma"].value or self._is_changed("sigma_xyz", "sigma_rpy")
-            stated = [self._read_vector(key) if is_stated else None for key in ("sigma_xyz", "sigma_rpy")]
+            fields = (self._fields["sigma_xyz"], self._fields["sigma_rpy"])
+            stated = [so3.to_vector3(each.value) if is_stated else None for each in fields]
             document = document.set_sigma(item, stated[0], stated[1], in_template)
         if self._is_changed("description"):
             document = document.set_description(item, self._fields["description"].value.strip(), in_template)
@@ -244,16 +316,8 @@ class ItemFields:
         return any(is_wrong or self._differs(key) for key in present)
 
     def _differs(self, key: str) -> bool:
-        given, value = self._given[key], self._fields[key].value
-        if isinstance(given, tuple):
-            return any(abs(a - b) > SAME for a, b in zip(given, value, strict=True))
-        return bool(given != value)
-
-    def _read_vector(self, key: str) -> Vector3:
-        """Return the numbers of a field; those that were not changed are as exact as they were given."""
-        pairs = zip(self._given[key], self._fields[key].value, strict=True)
-        x, y, z = (float(old if abs(old - new) <= SAME else new) for old, new in pairs)
-        return (x, y, z)
+        field = self._fields[key]
+        return field.is_changed if isinstance(field, NumberFields) else bool(field.value != self._given[key])
 
     def _read_joint(self, old: Joint) -> Joint:
         """Return the joint that the fields state. Raises EditError for a wrong number."""
@@ -261,7 +325,7 @@ class ItemFields:
         if not any(key in self._fields and self._differs(key) for key in keys):
             return old
         kind = JointType(self._fields["joint"].value)
-        axis = self._read_vector("axis") if "axis" in self._fields else (0.0, 0.0, 1.0)
+        axis = so3.to_vector3(self._fields["axis"].value) if "axis" in self._fields else (0.0, 0.0, 1.0)
         try:
             if kind is JointType.FIXED:
                 return Joint()
@@ -294,29 +358,16 @@ class ItemFields:
 
     def _read_values(self, key: str, count: int, is_angle: bool) -> tuple[float, ...]:
         """Return the numbers in a text, none for an empty one, radians and meters."""
+        if not self._differs(key):
+            return self._exact[key]
         text = self._fields[key].value.strip()
         if not text:
             return ()
-        parts = [each.strip() for each in text.strip("[]").split(",")]
+        label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
         if len(parts) != count:
             what = "two numbers, lower and upper" if count == 2 else "one number"
-            raise EditError(f"{key.replace('_', ' ')}: expected {what}, got {quote(text, 40)}")
-        if not self._differs(key):
-            # as exact as it is in the file
-            assert isinstance(self._part, Constraint)
-            joint = self._part.joint
-            exact = {
-                "limits": joint.lower + joint.upper,
-                "rate_limit": joint.rate_limit,
-                "default": joint.default,
-                "sigma": joint.sigma,
-            }.get(key, ())
-            if len(exact) == count:
-                return exact
-        try:
-            numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(each) for each in parts]
-        except ValueError as error:
-            raise EditError(f"{key.replace('_', ' ')}: {error}") from None
+            raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
+        numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
         return tuple([math.radians(each) if is_angle else each for each in numbers])
 
     # --- gizmo
