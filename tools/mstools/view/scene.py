@@ -113,7 +113,7 @@ class VehicleScene:
         self._model: Model | None = None
         self._positions: Mapping[str, float] = {}
         self._path: tuple[str, ...] = ()
-        self._drawn: dict[str, object] = {}
+        self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
         self.unread: list[str] = []
         """Mesh files that could not be read, with the reason."""
@@ -246,14 +246,9 @@ class VehicleScene:
         if shape.material is not None and shape.material.color is not None:
             red, green, blue, opacity = shape.material.color
             color = (round(255 * red), round(255 * green), round(255 * blue))
-        scene, place = self._scene, shape.pose
-        transparency = opacity if opacity < 1.0 else None
-        look: dict[str, Any] = {
-            "color": color,
-            "opacity": transparency,
-            "wxyz": place.wxyz,
-            "position": place.xyz,
-        }
+        scene = self._scene
+        look: dict[str, Any] = {"color": color, "opacity": opacity if opacity < 1.0 else None}
+        look |= {"wxyz": shape.pose.wxyz, "position": shape.pose.xyz}
         if shape.kind is ShapeKind.BOX:
             return scene.add_box(name, dimensions=np.array(shape.size), **look)
         if shape.kind is ShapeKind.CYLINDER:
@@ -281,17 +276,9 @@ class VehicleScene:
         """Move the vehicle and its joints to those of a picture."""
         self._move_joints(picture.joints)
         pose = picture.pose or Pose.identity()
-        if self._is_changed("pose", (pose, self.follow)):
-            self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
-            x, y, z = pose.xyz if self.follow else (0.0, 0.0, 0.0)
-            self._world.position = (-x, -y, -z)
-
-    def _is_changed(self, what: str, value: object) -> bool:
-        """Return whether a value differs from the last one of that name, and store it."""
-        if what in self._drawn and self._drawn[what] == value:
-            return False
-        self._drawn[what] = value
-        return True
+        self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
+        x, y, z = pose.xyz if self.follow else (0.0, 0.0, 0.0)
+        self._world.position = (-x, -y, -z)
 
     def _move_joints(self, positions: Mapping[str, float]) -> None:
         if self._frames is None or positions == self._positions:
@@ -333,8 +320,7 @@ class VehicleScene:
     def _draw_path(self) -> None:
         points = [pose.xyz for frame in self._path if (pose := self.get_frame_pose(frame)) is not None]
         lines = [pair for pair in pairwise(points) if pair[0] != pair[1]]
-        if self._is_changed("path", lines):
-            self._path_lines.points = np.array(lines, np.float32).reshape(-1, 2, 3)
+        self._path_lines.points = np.array(lines, np.float32).reshape(-1, 2, 3)
 
     def show_gizmo(self, body: str, parent: Pose, pose: Pose, move: Callable[[Pose, bool], None]) -> None:
         """Show a gizmo at a pose in the frame `parent` of a body.
@@ -396,58 +382,40 @@ class VehicleScene:
 
     def show_fixes(self, points: Array, colors: npt.NDArray[np.int64]) -> None:
         """Draw fixes at points (n, 3) in World:UTM, by their index into `FIX_COLORS` (n,)."""
-        key = (len(points), tuple(points[-1]), tuple(colors[-20:])) if len(points) else ()
-        if self._is_changed("fixes", key) and len(points):
-            self._fixes.visible = True
+        self._fixes.visible = bool(len(points))
+        if len(points):
             self._fixes.points = points[-MAX_FIXES:].astype(np.float32)
             self._fixes.colors = _PALETTE[colors[-MAX_FIXES:]].reshape(-1, 3)
 
     def show_uncertainty(self, picture: Picture, confidence: int, is_shown: bool) -> None:
         """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
-        key = (picture, confidence, is_shown)
-        if self._drawn.get("uncertainty") == key[1:] and self._drawn.get("uncertain picture") is picture:
-            return
-        self._drawn["uncertainty"], self._drawn["uncertain picture"] = key[1:], picture
-        color = INVALID_COLOR if picture.invalid else VALID_COLOR
-        has_ellipsoid = is_shown and picture.covariance is not None and picture.pose is not None
-        self._ellipsoid.visible = has_ellipsoid
-        if has_ellipsoid:
-            assert picture.pose is not None
-            assert picture.covariance is not None
-            radii, pose = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
-            self._ellipsoid.position, self._ellipsoid.wxyz = picture.pose.xyz, pose.wxyz
-            self._ellipsoid.scale = radii
-            self._ellipsoid.color = color
-        self._show_levels(picture, color, is_shown)
-
-    def _show_levels(self, picture: Picture, color: Rgb, is_shown: bool) -> None:
-        """Draw the horizontal protection level, a circle, and that of the heading, a wedge."""
+        pose, color = picture.pose, INVALID_COLOR if picture.invalid else VALID_COLOR
         radius, heading = picture.horizontal_protection_level, picture.heading_protection_level
-        self._level.visible = is_shown and picture.pose is not None and math.isfinite(radius)
-        if not self._level.visible or picture.pose is None:
+        self._ellipsoid.visible = is_shown and picture.covariance is not None and pose is not None
+        self._level.visible = is_shown and pose is not None and math.isfinite(radius)
+        if pose is None or not is_shown:
             return
-        self._level.position = picture.pose.xyz
-        is_known = math.isfinite(heading)
-        if self._is_changed("levels", (round(radius, 2), is_known, color)):
-            self._circle.scale = radius
+        if picture.covariance is not None:
+            self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
+            self._ellipsoid.position, self._ellipsoid.wxyz, self._ellipsoid.color = pose.xyz, axes.wxyz, color
+        if self._level.visible:
+            self._level.position, self._circle.scale = pose.xyz, round(radius, 2)
             for lines in (self._circle, *self._wedge):
                 lines.colors = np.array(color, np.uint8)
-            for side in self._wedge:
-                side.visible = is_known
-                side.scale = max(radius, MIN_WEDGE)
-        for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
-            if is_known:
-                yaw = float(picture.pose.rpy[2]) + sign * min(heading, math.pi)
-                side.wxyz = Pose.from_rpy((0.0, 0.0, 0.0), yaw=yaw).wxyz
+            for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
+                side.visible, side.scale = math.isfinite(heading), round(max(radius, MIN_WEDGE), 2)
+                if side.visible:
+                    yaw = float(pose.rpy[2]) + sign * min(heading, math.pi)
+                    side.wxyz = Pose.from_rpy((0.0, 0.0, 0.0), yaw=yaw).wxyz
 
     def label_grid(self, picture: Picture, origin: Origin | None) -> None:
         """Label the grid around the vehicle with UTM coordinates, latitude and longitude."""
         if picture.pose is None or origin is None:
             return
         east, north = (round(each / LABEL_SPACING) for each in picture.pose.xyz[:2])
-        if not self._is_changed("labels", (east, north, origin)):
+        if self._labeled == (east, north, origin):
             return
-        geodesy = geodesy_of(origin)
+        self._labeled, geodesy = (east, north, origin), geodesy_of(origin)
         for i in range(-GRID_LABELS, GRID_LABELS + 1):
             for k in range(-GRID_LABELS, GRID_LABELS + 1):
                 x, y = (east + i) * LABEL_SPACING, (north + k) * LABEL_SPACING
