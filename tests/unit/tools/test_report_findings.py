@@ -10,9 +10,14 @@ import pytest
 
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
-from mstools.report import consistency
-from mstools.report.findings import collect_findings, estimate_fix_latency
-from mstools.report.replay_data import FindingLevel, FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
+from mstools.report.findings import (
+    FindingLevel,
+    collect_findings,
+    compute_consistency,
+    compute_running_nis,
+    estimate_fix_latency,
+)
+from mstools.report.replay_data import FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
 
 START = 1_700_000_000_000_000
 
@@ -187,10 +192,10 @@ def test_given_fixes_without_numbers_then_only_that_reason_is_explained() -> Non
 def test_given_normal_residuals_then_nis_is_one_and_a_twentieth_is_beyond() -> None:
     draws = np.random.default_rng(2).normal(0.0, 1.0, 4000) ** 2
     made = [decisions("a", float(nis), 1)[0]._replace(utime=START + n * 1000) for n, nis in enumerate(draws)]
-    (found,) = consistency.compute_consistency(made)
+    (found,) = compute_consistency(made)
     assert found.mean == pytest.approx(1.0, abs=0.07)
     assert found.beyond == pytest.approx(0.05, abs=0.015)
-    utimes, means = consistency.compute_running_nis(made, 1.0)
+    utimes, means = compute_running_nis(made, 1.0)
     assert len(utimes) == len(means) == 4000
     assert means[-1] == pytest.approx(float(draws[-1001:].mean()))
 
@@ -198,4 +203,4 @@ def test_given_normal_residuals_then_nis_is_one_and_a_twentieth_is_beyond() -> N
 def test_given_what_was_set_aside_then_it_does_not_count() -> None:
     aside = decisions("a", 9.0, 1)[0]._replace(verdict=Verdict.MONITORED)
     rejected = Decision(START, "gps", 0, "a", Verdict.REJECTED, "satellites")
-    assert consistency.compute_consistency([aside, rejected]) == []
+    assert compute_consistency([aside, rejected]) == []

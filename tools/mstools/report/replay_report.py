@@ -11,10 +11,10 @@ from itertools import chain, cycle, pairwise
 
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
-from mstools.report import charts, consistency
+from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, StripRow, decade_axis, level, value_range
-from mstools.report.findings import collect_findings
-from mstools.report.replay_data import ReplayData, ReportFinding, StateSample
+from mstools.report.findings import ReportFinding, collect_findings, compute_consistency, compute_running_nis
+from mstools.report.replay_data import ReplayData, StateSample
 from mstools.terminal.output import escape, format_count
 
 HOLD_S = 1.0
@@ -340,7 +340,7 @@ def _epochs(data: ReplayData) -> list[tuple[float, str]]:
 
 
 def _render_consistency(data: ReplayData) -> str:
-    found = consistency.compute_consistency(data.decisions)
+    found = compute_consistency(data.decisions)
     if not found:
         return f"<p>No innovations: {_explain_no_decisions(data)}.</p>"
     rows = []
@@ -352,7 +352,7 @@ def _render_consistency(data: ReplayData) -> str:
     drawn = [level("expected", x, 1.0)]
     for each, color in zip([each for each in found if each.count >= 10], cycle(charts.PALETTE), strict=False):
         of_kind = (decision for decision in data.decisions if decision.kind == each.kind)
-        utimes, means = consistency.compute_running_nis(of_kind, NIS_WINDOW_S)
+        utimes, means = compute_running_nis(of_kind, NIS_WINDOW_S)
         drawn.append(Series(each.kind, list(map(data.to_seconds, utimes)), means, color))
     axis = Axis("NIS / dof", 0.01, 100.0, is_logarithmic=True)
     panel = Panel(f"NIS, mean of {NIS_WINDOW_S:.0f} s", axis, drawn, 220.0)
