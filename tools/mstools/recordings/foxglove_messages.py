@@ -80,41 +80,28 @@ _TYPE_OF: Final = {fingerprint_of(name): name for name in get_type_names()}
 _OK, _WARN, _ERROR, _STALE = range(4)
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
-DIAGNOSTICS_SCHEMA: Final = {
-    "title": "diagnostic_msgs/DiagnosticArray",
-    "type": "object",
-    "properties": {
-        "header": {
-            "type": "object",
-            "properties": {
-                "stamp": {
-                    "type": "object",
-                    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-                },
-                "frame_id": {"type": "string"},
-            },
-        },
-        "status": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "level": {"type": "integer"},
-                    "name": {"type": "string"},
-                    "message": {"type": "string"},
-                    "hardware_id": {"type": "string"},
-                    "values": {
-                        "type": "array",
-                        "items": {
-                            "type": "object",
-                            "properties": {"key": {"type": "string"}, "value": {"type": "string"}},
-                        },
-                    },
-                },
-            },
-        },
-    },
-}
+
+def _make_schema(**fields: object) -> dict[str, object]:
+    """Return the JSON schema of an object; a list is an array of its item, a text the name of a plain type."""
+
+    def convert(field: object) -> object:
+        if isinstance(field, list):
+            return {"type": "array", "items": convert(field[0])}
+        return {"type": field} if isinstance(field, str) else field
+
+    return {"type": "object", "properties": {name: convert(field) for name, field in fields.items()}}
+
+
+_STATUS: Final = _make_schema(
+    level="integer",
+    name="string",
+    message="string",
+    hardware_id="string",
+    values=[_make_schema(key="string", value="string")],
+)
+DIAGNOSTICS_SCHEMA: Final = {"title": "diagnostic_msgs/DiagnosticArray"} | _make_schema(
+    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"), status=[_STATUS]
+)
 
 
 def find_definitions() -> Path:

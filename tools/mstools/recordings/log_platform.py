@@ -14,6 +14,8 @@ from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.errors import QueryError, RecordingError, WireError
 from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
 from modelserver.messages import Policy, PoseAnswer, SnapshotPart, TimeQuery
 from modelserver.query import PlatformView
 from modelserver.wire.codec import decode
@@ -56,27 +58,23 @@ class LogContents(NamedTuple):
 class LogPlatform(LocalPlatform):
     """`Platform` on a log. `prefix` is that of the channels.
 
-    `model` replaces the log's own geometry; `contents` are those of `scan_log`, if it was read already. Raises
+    `model` replaces the log's own geometry; its base frame is the log's, without poses its first one. `contents` are those of `scan_log`, if it was read already. Raises
     RecordingError where geometry is missing, OSError.
     """
 
-    def __init__(
-        self, path: Path, prefix: str = "", model: ModelSnapshot | None = None, contents: LogContents | None = None
-    ):
+    def __init__(self, path: Path, prefix: str = "", model: Model | None = None, contents: LogContents | None = None):
         self.where = f"in {path}"
         self._path = path
         self._prefix = prefix
-        self._given_model = model
+        self._given: ModelSnapshot | None = None
         if contents is None:
             with LogFile(path) as log:
                 contents = scan_log(log, prefix, with_geometry=model is None)
         self._contents = contents
-        if model is not None and self._contents.base_frame:
-            base = self._contents.base_frame
-            self._given_model = ModelSnapshot(
-                model.vehicle, model.model, base, base, model.history_s, model.joints_channel
-            )
-        elif model is None and self._contents.snapshot is None:
+        if model is not None:
+            base = contents.base_frame or names.join(model.root.name, model.root.frames[0].name)
+            self._given = ModelSnapshot("", model, base, base, HISTORY_S, f"{prefix}JOINTS")
+        elif contents.snapshot is None:
             raise RecordingError(self._no_geometry())
         self._read: tuple[MirrorState, int] = (MirrorState(), 0)
 
@@ -96,8 +94,8 @@ class LogPlatform(LocalPlatform):
 
     @property
     def base_frame(self) -> str:
-        """The frame whose pose the log has, empty without poses."""
-        return self._contents.base_frame
+        """The frame whose pose the log has, without poses that of its geometry."""
+        return self._contents.base_frame or (self._given.base_frame if self._given is not None else "")
 
     def read_state(self) -> tuple[MirrorState, int]:
         """Return what was known at the time that was read up to."""
@@ -121,8 +119,8 @@ class LogPlatform(LocalPlatform):
         begin, end = self._contents.begin, self._contents.end
         if at and not begin - MAX_OUTSIDE_US <= at <= end + MAX_OUTSIDE_US:
             raise RecordingError(self._describe_outside(at, begin, end))
-        snapshot = self._given_model or self._contents.snapshot
-        knowledge = MirrorReceiver(self._prefix, snapshot, self._given_model is not None)
+        snapshot = self._given or self._contents.snapshot
+        knowledge = MirrorReceiver(self._prefix, snapshot, self._given is not None)
         channels = set(knowledge.channels)
         # messages on these channels may be of any age
         any_age = (f"{self._prefix}MODEL_SNAPSHOT", f"{self._prefix}JOINTS_HELD")
@@ -149,7 +147,7 @@ class LogPlatform(LocalPlatform):
 
     def _is_of_other_geometry(self, event: LogEvent, known: MirrorState) -> bool:
         """Return whether a pose or snapshot is of another geometry: after a reload, or of a service started later."""
-        if known.view is None or self._given_model is not None:
+        if known.view is None or self._given is not None:
             return False
         try:
             if event.channel == f"{self._prefix}MODEL_SNAPSHOT":

@@ -14,7 +14,6 @@ from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
 from modelserver.formats.snapshot import ModelSnapshot
-from modelserver.geometry import names
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
@@ -140,21 +139,15 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
 
     `show_progress` is called with the part that is read, 0 to 1. Raises RecordingError, GeometryError, OSError.
     """
-    given = None
-    drive = Drive(prefix)
-    if model is not None:
-        loaded = load_given_model(model, {})
-        base = names.join(loaded.root.name, loaded.root.frames[0].name)
-        given = ModelSnapshot("", loaded, base, base, HISTORY_S, f"{prefix}JOINTS")
-        drive = Drive(prefix, loaded, base, keep_geometry=True)
+    given = None if model is None else load_given_model(model, {})
+    drive = Drive(prefix, given, keep_geometry=given is not None)
     with LogFile(path) as log:
         contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
         notes = [*map(str, log.damage)]
         # reads the log from its beginning, and forgets the damage
         notes += measure(islice(log, LOOKED_AT)).describe()
     answers = LogPlatform(path, prefix, given, contents)
-    if not drive.base_frame:
-        drive.base_frame = answers.base_frame
+    drive.base_frame = drive.base_frame or answers.base_frame
     folder = model.resolve().parent if model is not None else None
     return Source(path.name, drive, answers, folder, notes=tuple(notes))
 
