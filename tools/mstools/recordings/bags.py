@@ -1,4 +1,4 @@
-"""Recordings of other formats: ROS bags (library rosbags), converted to samples, and MCAP files of `modelserver export`.
+"""Recordings of other formats: ROS bags (library rosbags) as samples, and MCAP files of `modelserver export`.
 
 A file has one clear error for all that can be wrong with it. ROS messages are read by their fields, as any ROS library
 presents them; ROS 1 and 2 are alike in all fields used. What a message leaves open (height reference, orientation
@@ -467,12 +467,10 @@ class JointsConverter(Converter):
 
     def convert(self, header: SensorHeader, message: Any) -> JointsSample:
         # each of the other arrays may be empty
-        columns = (
-            message.name,
-            itertools.chain(message.position, itertools.repeat(NAN)),
-            itertools.chain(message.velocity, itertools.repeat(NAN)),
+        positions, rates = (
+            itertools.chain(each, itertools.repeat(NAN)) for each in (message.position, message.velocity)
         )
-        rows = zip(*columns, strict=False)
+        rows = zip(message.name, positions, rates, strict=False)
         return JointsSample(header, tuple(JointSample(str(n), float(p), rate=float(v)) for n, p, v in rows))
 
 

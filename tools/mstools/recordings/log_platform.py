@@ -58,8 +58,8 @@ class LogContents(NamedTuple):
 class LogPlatform(LocalPlatform):
     """`Platform` on a log. `prefix` is that of the channels.
 
-    `model` replaces the log's own geometry; its base frame is the log's, without poses its first one. `contents` are those of `scan_log`, if it was read already. Raises
-    RecordingError where geometry is missing, OSError.
+    `model` replaces the log's own geometry; its base frame is the log's, without poses its first one. `contents` are
+    those of `scan_log`, if it was read already. Raises RecordingError where geometry is missing, OSError.
     """
 
     def __init__(self, path: Path, prefix: str = "", model: Model | None = None, contents: LogContents | None = None):
