@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from modelserver.errors import Severity
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
 from mstools.report.findings import (
-    FindingLevel,
     collect_findings,
     compute_consistency,
     compute_running_nis,
@@ -65,7 +65,7 @@ def test_given_nothing_wrong_then_nothing_is_found() -> None:
 def test_given_a_wheel_that_counts_backward_then_it_is_named_and_the_other_is_not() -> None:
     found = collect_findings(make_data(wheels=(*turns("left", -1.01), *turns("right", 1.0))))
     assert [each.title for each in found] == ["Wheel left counts backward"]
-    assert found[0].level is FindingLevel.ERROR
+    assert found[0].level is Severity.ERROR
     assert "sign" in found[0].advice
 
 
@@ -175,7 +175,7 @@ def test_given_rejected_and_delayed_samples_and_gaps_then_all_are_found_worst_fi
         "sensor:imu: 7 samples too_old",
         "imu: 1 gap, the longest 5.0 s",
     ]
-    assert [each.level for each in found] == sorted(each.level for each in found)
+    assert [each.level for each in found] == sorted((each.level for each in found), key=list(Severity).index)
 
 
 def test_given_fixes_without_numbers_then_only_that_reason_is_explained() -> None:

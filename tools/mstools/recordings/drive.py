@@ -37,7 +37,6 @@ from modelserver.messages import (
     DriverHealth,
     FixType,
     GpsSample,
-    Health,
     Invalid,
     JointsSample,
     Mode,
@@ -47,6 +46,7 @@ from modelserver.messages import (
 )
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode, fingerprint_of
 from modelserver.wire.fields import read_text
 from modelserver.wire.provider import handle_message
@@ -299,22 +299,22 @@ class Drive:
             counted = self.channels[channel] = ChannelCount()
         counted.add(now)
         name = channel[len(self.prefix) :]
-        if not 0 < int.from_bytes(data[8:16], "big", signed=True) < MAX_STAMP:
+        if not 0 < (stamp := read_stamp(data)) < MAX_STAMP:
             # every message of this project begins with its stamp; what does not is of no use here
             self.damaged += name in self._handlers
             return
         try:
             handler = self._handlers.get(name)
             if handler is not None:
-                handler(name, data, now)
+                handler(name, stamp, data)
             elif data[:8] == self._gps:
                 self._process_gps(decode("gps_t", data))
             elif channel == self.joints_channel:
-                self._process_joints(name, data, now)
+                self._process_joints(name, stamp, data)
         except (WireError, GeodesyError, struct.error):
             self.damaged += 1
 
-    def _process_snapshot(self, _: str, data: bytes, now: int) -> None:
+    def _process_snapshot(self, name: str, stamp: int, data: bytes) -> None:
         part: SnapshotPart = decode("model_snapshot_t", data)
         if self.model is not None and part.model_revision == self.model.revision:
             return
@@ -336,9 +336,8 @@ class Drive:
         self.model = model
         self._coordinates = _list_coordinates(model)
 
-    def _process_pose(self, _: str, data: bytes, now: int) -> None:
+    def _process_pose(self, name: str, stamp: int, data: bytes) -> None:
         # the stamp alone decides whether the rest is read
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
         if 0 <= stamp - self._last_pose < PICTURE_PERIOD_US and self.poses.count:
             return
         answer: PoseAnswer = decode("pose_transform_t", data)
@@ -374,9 +373,8 @@ class Drive:
             self._add_event(utime, EventKind.RESET, f"the position was reset: epoch {epoch}")
         self._invalid, self._epoch = invalid, epoch
 
-    def _process_joints(self, name: str, data: bytes, now: int) -> None:
+    def _process_joints(self, name: str, stamp: int, data: bytes) -> None:
         # stamp and source alone decide whether the rest is read
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
         source = f"{name} {read_text(data, SOURCE_OFFSET)[0]}"
         if 0 <= stamp - self._sources.get(source, 0) < PICTURE_PERIOD_US:
             return
@@ -410,7 +408,7 @@ class Drive:
         position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
         self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
 
-    def _process_decisions(self, _: str, data: bytes, now: int) -> None:
+    def _process_decisions(self, name: str, stamp: int, data: bytes) -> None:
         for decision in decode("decisions_t", data).decisions:
             self._process_decision(decision)
 
@@ -429,13 +427,12 @@ class Drive:
             kind = EventKind.RESET if is_reset else EventKind.REJECTION
             self._add_event(decision.utime, kind, f"{verb} {decision.kind} of {decision.source}{reason}")
 
-    def _process_driver(self, _: str, data: bytes, now: int) -> None:
+    def _process_driver(self, name: str, stamp: int, data: bytes) -> None:
         health: DriverHealth = decode("driver_health_t", data)
         if health.source in self.drivers or len(self.drivers) < MAX_CHANNELS:
             self.drivers[health.source] = health
 
-    def _store_report(self, name: str, data: bytes, now: int) -> None:
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
+    def _store_report(self, name: str, stamp: int, data: bytes) -> None:
         stored = self._reports.setdefault(name, [])
         if name == "LOCALIZATION_STATE":
             self._add_mode_event(stamp, data)
@@ -542,14 +539,14 @@ class Drive:
         found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
         return {name: float(table.rows[row, 0]) for name, (table, row) in found.items() if row >= 0}
 
-    def get_health(self, utime: int = 0) -> Health | None:
-        """Return the last health report at or before a time; the latest one at 0."""
-        health: Health | None = self._get_report("MODELSERVER_HEALTH", "health_t", utime)
-        return health
-
-    def get_navigation_state(self, utime: int = 0) -> Any:
-        """Return the filter's last published state at or before a time, None without one; the latest one at 0."""
-        return self._get_report("LOCALIZATION_STATE", "navigation_state_t", utime)
+    def get_report(self, name: str, utime: int = 0) -> Any:
+        """Return the last report on a channel at or before a time, None without one; the latest one at 0."""
+        stored = self._reports.get(name, [])
+        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
+        try:
+            return decode(BY_NAME[name].type_name, stored[at - 1][1]) if at else None
+        except WireError:
+            return None
 
     def get_state_course(self, state: str, utime: int = 0, seconds: float = 60.0) -> tuple[Array, Array, Array]:
         """Return times (n,), values (n,) and standard deviations (n,) of a state of the filter before a time.
@@ -572,13 +569,10 @@ class Drive:
         times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
         return times, values, sigmas
 
-    def _get_report(self, name: str, type_name: str, utime: int) -> Any:
-        stored = self._reports.get(name, [])
-        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
-        try:
-            return decode(type_name, stored[at - 1][1]) if at else None
-        except WireError:
-            return None
+
+def read_stamp(data: bytes) -> int:
+    """Return the stamp of a message, which is behind the fingerprint; 0 for one that is too short."""
+    return int.from_bytes(data[8:16], "big", signed=True) if len(data) >= 16 else 0
 
 
 def _list_coordinates(model: Model | None) -> frozenset[str]:

@@ -21,6 +21,7 @@ from modelserver.query import PlatformView
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.snapshot import SnapshotAssembler
+from mstools.recordings.drive import read_stamp
 
 CORRECTION_WINDOW_US: Final = 2_000_000
 """Time after an instant in which delayed samples may still change its pose."""
@@ -131,7 +132,7 @@ class LogPlatform(LocalPlatform):
             for event in log.read_from(self._find_start(oldest)):
                 if event.channel not in channels:
                     continue
-                stamp = _stamp(event)
+                stamp = read_stamp(event.data)
                 if event.channel not in any_age and stamp < oldest:
                     continue
                 if at and policy is Policy.LATEST and stamp > at:
@@ -190,11 +191,6 @@ class LogPlatform(LocalPlatform):
         return f"{text}; +SECONDS counts from its start"
 
 
-def _stamp(event: LogEvent) -> int:
-    """Return the stamp of a pose, snapshot part or joints (after the fingerprint), 0 for a message too short."""
-    return int.from_bytes(event.data[8:16], "big", signed=True) if len(event.data) >= 16 else 0
-
-
 def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -> LogContents:
     """Return the contents of a log; `with_geometry` includes the snapshot."""
     offsets: list[tuple[int, int]] = []
@@ -210,7 +206,7 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
         try:
             if event.channel == f"{prefix}POSE":
                 first = first or decode("pose_transform_t", event.data)
-                stamp = _stamp(event)
+                stamp = read_stamp(event.data)
                 _extend(poses, stamp)
                 if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
                     offsets.append((stamp, event.end))
@@ -224,7 +220,7 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
             else:
-                _extend(others.setdefault(event.channel, []), _stamp(event))
+                _extend(others.setdefault(event.channel, []), read_stamp(event.data))
         except WireError:
             continue
     joints = others.get(f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel)

@@ -20,12 +20,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import partial
 from itertools import groupby
 
 import numpy as np
 
+from modelserver.errors import Severity
 from modelserver.estimation.filter.eskf import chi_square_gate
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.transforms.so3 import Array
@@ -51,25 +51,17 @@ MODES_WITHOUT = {
 DEGREES_PER_RADIAN = math.degrees(1.0)
 
 
-class FindingLevel(IntEnum):
-    """Severity of a finding, worst first."""
-
-    ERROR = 0
-    WARNING = 1
-    NOTE = 2
-
-
 @dataclass(frozen=True, slots=True)
 class ReportFinding:
     """One finding: a headline, the observation, and what to do."""
 
-    level: FindingLevel
+    level: Severity
     title: str
     observation: str
     advice: str
 
 
-error, warning, note = (partial(ReportFinding, level) for level in FindingLevel)
+error, warning, note = (partial(ReportFinding, level) for level in Severity)
 
 
 def collect_findings(data: ReplayData) -> list[ReportFinding]:
@@ -83,7 +75,7 @@ def collect_findings(data: ReplayData) -> list[ReportFinding]:
         checks.append(check_rejected_fixes)
     found = causes + [finding for check in (*checks, check_stamps, check_gaps) for finding in check(data)]
     found += check_validity(data, has_cause=bool(causes))
-    return sorted(found, key=lambda each: each.level)
+    return sorted(found, key=lambda each: list(Severity).index(each.level))
 
 
 def _to_sentence(text: str) -> str:

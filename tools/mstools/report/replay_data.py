@@ -451,7 +451,6 @@ class ReplayCollector:
         self._origin: Origin | None = None
         self._last_snapshot_utime = 0
         self._keys: dict[str, str] = {}
-        self._wheel_names: dict[str, None] = {}
         self._yaw_rates = SecondMeans()
         self._q_rolling_imu = self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None
 
@@ -471,7 +470,6 @@ class ReplayCollector:
             self._fixes.append(sample)
         elif isinstance(sample, WheelsSample):
             self._wheels.append(sample)
-            self._wheel_names.update(dict.fromkeys(wheel.name for wheel in sample.wheels))
         elif isinstance(sample, ImuSample):
             self._add_imu(sample)
         # before the first state, the estimate at the sample has the reasons why there is none
@@ -518,7 +516,7 @@ class ReplayCollector:
             channels=tuple(sorted(channels)),
             axis=axis or StampAxis(),
             sensor_keys=dict(self._keys),
-            wheel_names=tuple(self._wheel_names),
+            wheel_names=tuple(dict.fromkeys(wheel.name for sample in self._wheels for wheel in sample.wheels)),
             sensor_motion=compute_sensor_motion(
                 self._yaw_rates.finish(),
                 self._fixes,

@@ -76,7 +76,7 @@ def render_page(data: ReplayData) -> str:
 def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
     """Return the lines to print: the path of the page, and the headlines of its findings."""
     lines = [f"report: {escape(path)}, {format_count(len(found), 'finding')}"]
-    return lines + [f"  {each.level.name.lower()}: {escape(each.title)}" for each in found]
+    return lines + [f"  {each.level}: {escape(each.title)}" for each in found]
 
 
 # --- parts of the page --------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ def _render_findings(found: Sequence[ReportFinding]) -> str:
     if not found:
         return '<p class="good">No findings. Compare the charts below with docs/tuning.md.</p>'
     return "\n".join(
-        f'<div class="finding {each.level.name.lower()}"><h3><span>{each.level.name.lower()}</span> '
+        f'<div class="finding {each.level}"><h3><span>{each.level}</span> '
         f"{_escape(each.title)}</h3><p>{_escape(each.observation)}</p><p>{_escape(each.advice)}</p></div>"
         for each in found
     )

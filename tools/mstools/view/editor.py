@@ -36,8 +36,7 @@ from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, 
 from mstools.edit.session import EditSession
 from mstools.edit.yaml_text import EditError
 from mstools.view.fields import ChangeItem, ItemFields, NumberFields, Snap, find_part, list_frames
-from mstools.view.page import Actions
-from mstools.view.panels import escape_markdown, format_table
+from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8

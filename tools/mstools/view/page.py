@@ -18,9 +18,10 @@ import hmac
 import http
 import ipaddress
 import queue
+import re
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import partial
@@ -114,6 +115,21 @@ class Actions(queue.SimpleQueue[Callable[[], object]]):
         button = gui.add_button(label)
         button.on_click(lambda _: self.put(action))
         return button
+
+
+# --- content of the page
+
+_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|$~])")
+
+
+def escape_markdown(text: str) -> str:
+    return _SPECIAL.sub(r"\\\1", text.replace("\n", " "))
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown; the cells are texts."""
+    lines = [header, ["---"] * len(header), *[[escape_markdown(cell) for cell in row] for row in rows]]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 class PageServer(viser.ViserServer):
