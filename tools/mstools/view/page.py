@@ -22,7 +22,7 @@ import re
 import secrets
 import socket
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
@@ -71,20 +71,13 @@ class Guard:
         return ""
 
     def _has_token(self, request: Request) -> bool:
+        cookies = SimpleCookie()
+        with suppress(CookieError):
+            cookies.load(request.headers.get("Cookie", ""))
+        cookie = cookies[self.cookie].value if self.cookie in cookies else ""
         # the link's counts too where a cookie is there: it may be of a viewer that was served here before
-        given = (self._get_cookie_token(request), self._get_query_token(request))
+        given = (cookie, parse_qs(urlsplit(request.path).query).get("token", [""])[0])
         return any(hmac.compare_digest(each.encode(), self.token.encode()) for each in given)
-
-    def _get_cookie_token(self, request: Request) -> str:
-        try:
-            cookie = SimpleCookie(request.headers.get("Cookie", "")).get(self.cookie)
-        except CookieError:
-            return ""
-        return "" if cookie is None else cookie.value
-
-    @staticmethod
-    def _get_query_token(request: Request) -> str:
-        return parse_qs(urlsplit(request.path).query).get("token", [""])[0]
 
     def process(
         self, inner: Callable[..., Response | None] | None, connection: ServerConnection, request: Request
