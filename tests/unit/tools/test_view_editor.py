@@ -19,8 +19,7 @@ from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from mstools.edit.document import GeometryItem, ItemKind
 from mstools.edit.session import EditedFile, EditSession
-from mstools.view.editor import Editing, Editor
-from mstools.view.fields import Snap
+from mstools.view.editor import Editing, Editor, Snap
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import NameLabels, VehicleScene
 

@@ -279,7 +279,6 @@ class Converter:
         self._options = options
 
     def convert(self, header: SensorHeader, message: Any) -> Sample:
-        """Return the sample of a message."""
         raise NotImplementedError
 
     def notes(self) -> list[str]:

@@ -95,12 +95,6 @@ class FixColor(StrEnum):
     NO_DECISION = "no decision"
 
 
-_COLOR_OF: Final = {
-    Verdict.USED: FixColor.USED,
-    Verdict.RESET: FixColor.USED,
-    Verdict.REJECTED: FixColor.REJECTED,
-    Verdict.MONITORED: FixColor.MONITORED,
-}
 FIX_COLORS: Final = tuple(FixColor)
 _NO_DECISION: Final = FIX_COLORS.index(FixColor.NO_DECISION)
 
@@ -199,7 +193,6 @@ class ChannelCount:
     _counted: int = 0
 
     def add(self, now: int) -> None:
-        """Count a message received at `now`, microseconds."""
         self.count += 1
         self.last = now
         self._first = self._first or now
@@ -332,7 +325,6 @@ class Drive:
         self.set_model(snapshot.model)
 
     def set_model(self, model: Model) -> None:
-        """Show another geometry."""
         self.model = model
         self._coordinates = _list_coordinates(model)
 
@@ -419,7 +411,8 @@ class Drive:
         if decision.kind == POSITION and table is not None:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
-                table.rows[row, 3] = FIX_COLORS.index(_COLOR_OF[decision.verdict])
+                is_used = decision.verdict is Verdict.RESET
+                table.rows[row, 3] = FIX_COLORS.index(FixColor.USED if is_used else FixColor[decision.verdict.name])
         if decision.verdict in (Verdict.REJECTED, Verdict.RESET):
             is_reset = decision.verdict is Verdict.RESET
             verb = "reset by" if is_reset else "rejected"
@@ -576,7 +569,6 @@ def read_stamp(data: bytes) -> int:
 
 
 def _list_coordinates(model: Model | None) -> frozenset[str]:
-    """Return the names of the coordinates that JOINTS may drive."""
     joints = model.joints if model is not None else {}
     return frozenset(name for each in joints.values() for name in coordinate_names(each.name, each.joint))
 

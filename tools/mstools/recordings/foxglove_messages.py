@@ -145,7 +145,6 @@ class FoxgloveWriter:
 
     @property
     def has_geometry(self) -> bool:
-        """Whether a complete geometry was received."""
         return self._model is not None
 
     def feed(self, channel: str, data: bytes, now: int) -> None:
@@ -195,7 +194,6 @@ class FoxgloveWriter:
             self._scene.log(SceneUpdate(entities=entities), log_time=now * 1000)
 
     def _log_joints(self, now: int) -> None:
-        """Log the frames behind joints that moved."""
         joints = self._drive.get_joints(now)
         if self._frames is None or joints == self._joints:
             return

@@ -48,6 +48,8 @@ MODES_WITHOUT = {
 }
 """Modes that need no such sensor."""
 
+REVERSE_WHEEL = "Reverse the sign of this wheel in its driver, or swap its encoder's two channels."
+
 DEGREES_PER_RADIAN = math.degrees(1.0)
 
 
@@ -86,7 +88,6 @@ def _to_sentence(text: str) -> str:
 
 
 def check_missing(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find sensors of the vehicle file without messages in the log."""
     for key, channel in data.missing_channels:
         if data.mode in MODES_WITHOUT.get(key, ()):
             continue
@@ -136,7 +137,6 @@ REASONS = {
 
 
 def check_unused(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find sensors whose samples are nearly all rejected."""
     used: dict[str, set[tuple[int, int]]] = {}
     rejected: dict[str, dict[tuple[int, int], str]] = {}
     for each in data.decisions:
@@ -197,7 +197,6 @@ def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find wheels with reversed sign or swapped sides."""
     raw = data.sensor_motion
     by_gyro = bool(raw.gyro)
     reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
@@ -210,7 +209,7 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
         yield error(
             f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
             f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
-            "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
+            REVERSE_WHEEL,
         )
         return
     course = compare_turn_rates(raw.wheel_turn_rate, raw.course_turn_rate())
@@ -298,7 +297,7 @@ def check_wheels(data: ReplayData) -> Iterable[ReportFinding]:
             yield error(
                 f"Wheel {name} counts backward",
                 f"In {against} of {len(moving)} samples in motion it measured the negative of the expected speed.",
-                "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
+                REVERSE_WHEEL,
             )
         elif silent > 0.5 * len(moving) or longest > 5.0:
             yield error(
@@ -344,7 +343,6 @@ def check_wheel_scale(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find an IMU that repeats one sample."""
     if data.frozen:
         total = sum(b - a for a, b in data.frozen)
         begin = data.frozen[0][0]
@@ -358,7 +356,6 @@ def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_biases(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find biases far outside the data sheet."""
     for kind, words, unit, factor in (
         ("gyro_bias", "Gyro bias about", "deg/s", math.degrees(1.0)),
         ("accelerometer_bias", "Accelerometer bias along", "m/s2", 1.0),
@@ -471,7 +468,6 @@ def _smooth(t: Array, series: Array) -> Array:
 
 
 def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find a large share of rejected fixes, with the reasons."""
     reasons = Counter(each.reason or each.verdict for each in data.fixes if each.verdict == "rejected")
     rejected, total = sum(reasons.values()), len(data.fixes)
     if total >= 20 and rejected > 0.2 * total:
@@ -488,7 +484,6 @@ def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find delayed, duplicate and future samples."""
     for reason in ("too_old", "duplicate", "future"):
         by_source: Counter[str] = Counter()
         for (source, why), count in data.rejected.items():
@@ -504,7 +499,6 @@ def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find sensors with gaps that cost accuracy."""
     for sensor in data.sensors:
         found = [(a, b) for a, b in sensor.find_gaps() if b - a > max(1.0, 5.0 * sensor.period)]
         if found:

@@ -45,7 +45,6 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 
 
 def render_page(data: ReplayData) -> str:
-    """Return the HTML page."""
     found = collect_findings(data)
     sections = [
         ("findings", "Findings", _render_findings(found)),
@@ -496,7 +495,6 @@ def _render_verdicts(data: ReplayData) -> str:
 
 
 def _explain_no_decisions(data: ReplayData) -> str:
-    """Return why the filter decided nothing."""
     if data.mode is Mode.RAW:
         return "raw mode"
     if data.missing_channels:

@@ -57,7 +57,6 @@ class Source:
         return not isinstance(self.answers, FilePlatform)
 
     def close(self) -> None:
-        """End the threads and leave the bus."""
         self._resources.close()
 
 
@@ -165,7 +164,6 @@ def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], No
 
 
 def open_live(url: str, prefix: str, timeout: float) -> Source:
-    """Follow the running service."""
     drive = Drive(prefix)
     answers = Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="view")
     source = Source("live", drive, answers, is_live=True)

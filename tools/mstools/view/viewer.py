@@ -231,7 +231,6 @@ class QueryPanel:
         self._interest.value, self._reference.value = interest, reference
 
     def pick(self, frame: str, is_reference: bool) -> None:
-        """Choose one of the frames, as a click does."""
         (self._reference if is_reference else self._interest).value = frame
 
     def update(self, utime: int, now: float, state: object) -> bool:
@@ -280,7 +279,6 @@ class QueryPanel:
 
 
 def describe_answer(explanation: Explanation, motion: MotionAnswer | None) -> str:
-    """Format an answer as Markdown tables."""
     answer = explanation.answer
     found = answer.transformation
     values = (*found.pose.xyz, *map(math.degrees, found.rpy))
@@ -504,7 +502,6 @@ class StatePanel:
             self._states = gui.add_markdown("")
 
     def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
-        """Show the last minute of the chosen state."""
         options = (NO_STATE, *states)
         if tuple(self._state.options) != options:
             chosen = self._state.value
@@ -584,7 +581,6 @@ def _format_channels(drive: Drive, now: int) -> str:
 
 
 def _format_states(navigation: Any) -> str:
-    """Format the states of the filter with their standard deviations."""
     count = len(navigation.names)
     rows = []
     for n, (name, value) in enumerate(zip(navigation.names, navigation.values, strict=True)):
