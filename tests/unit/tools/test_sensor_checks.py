@@ -106,7 +106,7 @@ def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
     assert found.distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.01)
     compared = compare_turn_rates(found.gyro, found.wheel_turn_rate)
     assert compared == pytest.approx((1.0, 1.0), abs=0.1)
-    assert compare_turn_rates(found.gyro, found.course_turn_rate()) == pytest.approx((1.0, 1.0), abs=0.1)
+    assert found.compare_with_course(found.gyro) == pytest.approx((1.0, 1.0), abs=0.1)
     assert collect_findings(make_data(sensor_motion=found)) == []
     swapped = make_motion(arrival=arrival, place=place, swapped=True)
     assert only(make_data(sensor_motion=swapped)).title == "Left and right wheels are swapped"

@@ -183,7 +183,7 @@ def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
     motion = data.sensor_motion
     pairs = (
         (compare_turn_rates(motion.gyro, motion.wheel_turn_rate), "wheels"),
-        (compare_turn_rates(motion.gyro, motion.course_turn_rate()), "fixes"),
+        (motion.compare_with_course(motion.gyro), "fixes"),
     )
     known = [(found.ratio, what) for found, what in pairs if found is not None and abs(found.correlation) > 0.5]
     for ratio, what in known[:1]:
@@ -212,7 +212,7 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
             REVERSE_WHEEL,
         )
         return
-    course = compare_turn_rates(raw.wheel_turn_rate, raw.course_turn_rate())
+    course = raw.compare_with_course(raw.wheel_turn_rate)
     compared = compare_turn_rates(raw.gyro, raw.wheel_turn_rate) if by_gyro else course
     if compared is None or compared.correlation > -0.6:
         return

@@ -108,21 +108,37 @@ class SensorMotion:
         track = y_left - y_right
         return {second: (right[second] - left[second]) / track for second in left.keys() & right.keys()}
 
-    def course_turn_rate(self) -> dict[int, float]:
-        """Return the turn rate of the fixes' course, rad/s."""
+    def course_changes(self) -> list[tuple[float, float, float]]:
+        """Return begin, end (s since 1970) and angle (rad) of each change of the fixes' course."""
         places = _thin_by_distance(self.fixes, COURSE_STEP_M)
         courses = [
             (0.5 * (a[0] + b[0]), math.atan2(b[2] - a[2], b[1] - a[1]))
             for a, b in pairwise(places)
             if 0.0 < b[0] - a[0] < MAX_STEP_S
         ]
-        rates: dict[int, float] = {}
+        turns = []
         for (t, before), (u, after) in pairwise(courses):
             turn = math.remainder(after - before, 2.0 * math.pi)
             # reversing looks like a turn on the spot
             if 0.0 < u - t < MAX_STEP_S and abs(turn) < 2.0:
-                rates.update(dict.fromkeys(range(math.floor(t), math.floor(u)), turn / (u - t)))
+                turns.append((t, u, turn))
+        return turns
+
+    def course_turn_rate(self) -> dict[int, float]:
+        """Return the turn rate of the fixes' course, rad/s."""
+        rates: dict[int, float] = {}
+        for t, u, turn in self.course_changes():
+            rates.update(dict.fromkeys(range(math.floor(t), math.floor(u)), turn / (u - t)))
         return rates
+
+    def compare_with_course(self, rates: Mapping[int, float]) -> TurnRateComparison | None:
+        """Compare a turn rate with the fixes' course, integrated over the intervals of its changes."""
+        found: dict[int, tuple[float, float]] = {}
+        for t, u, turn in self.course_changes():
+            mean = _mean_between(rates, t, u)
+            if math.isfinite(mean):
+                found[math.floor(t)] = (mean * (u - t), turn)
+        return _compare(found.values(), 0.1)
 
     def count_opposed(self, turn: Mapping[int, float]) -> tuple[int, int]:
         """Return the seconds of straight driving in which the sides rolled against each other, and all of them."""
@@ -140,27 +156,22 @@ class SensorMotion:
 
     def compare_distances(self) -> DistanceComparison:
         """Return the distances by wheels and by fixes, over sections of `DISTANCE_STEP_M` by the wheels."""
-        rolled = fixed = 0.0
-        speeds = self._mean_speed()
-        if not speeds or not self.fixes:
-            return DistanceComparison(0.0, 0.0)
-        # distance by the wheels at the begin and the end of each second, from the first one on
-        seconds, ends = np.array(list(speeds)), np.cumsum(list(speeds.values()))
-        begins = ends - list(speeds.values())
-        travelled = np.interp(
-            [each[0] for each in self.fixes],
-            np.column_stack([seconds, seconds + 1.0]).ravel(),
-            np.column_stack([begins, ends]).ravel(),
-        ).tolist()
-        anchor = before = (self.fixes[0], travelled[0])
-        for place in zip(self.fixes, travelled, strict=True):
-            if place[0][0] - before[0][0] > 5.0:
-                anchor = place
-            elif place[1] - anchor[1] >= DISTANCE_STEP_M:
-                rolled += place[1] - anchor[1]
-                fixed += math.dist(place[0][1:], anchor[0][1:])
-                anchor = place
-            before = place
+        speed = self._mean_speed()
+        rolled = fixed = distance = 0.0
+        anchor: tuple[float, float, float] | None = None
+        before = -math.inf
+        for each in self.fixes:
+            if anchor is None or each[0] - before > 5.0:
+                anchor, distance, before = each, 0.0, each[0]
+                continue
+            mean = _mean_between(speed, before, each[0])
+            if math.isfinite(mean):
+                distance += mean * (each[0] - before)
+            before = each[0]
+            if distance >= DISTANCE_STEP_M:
+                rolled += distance
+                fixed += math.dist(each[1:], anchor[1:])
+                anchor, distance = each, 0.0
         return DistanceComparison(rolled, fixed)
 
     def distance_travelled(self) -> float:
@@ -189,11 +200,15 @@ class SensorMotion:
 
 
 def compare_turn_rates(first: Mapping[int, float], second: Mapping[int, float]) -> TurnRateComparison | None:
-    """Compare two turn rates second by second; None with fewer than 12, or where the second is below 0.02 (rms)."""
-    both = sorted(first.keys() & second.keys())
-    a, b = np.array([(first[each], second[each]) for each in both]).reshape(-1, 2).T
+    """Compare two turn rates second by second; None without enough turns."""
+    return _compare([(first[each], second[each]) for each in sorted(first.keys() & second.keys())], 0.02)
+
+
+def _compare(turns: Collection[tuple[float, float]], least: float) -> TurnRateComparison | None:
+    """Compare pairs of turns; None with fewer than 12, or where the second ones are smaller than `least` (rms)."""
+    a, b = np.array([*turns]).reshape(-1, 2).T
     squares, others = float(a @ a), float(b @ b)
-    if len(a) < 12 or not squares > 0.0 or others < len(b) * 0.02**2:
+    if len(a) < 12 or not squares > 0.0 or others < len(b) * least * least:
         return None
     return TurnRateComparison(float(a @ b) / math.sqrt(squares * others), math.sqrt(squares / others))
 
@@ -282,6 +297,17 @@ def _project_fixes(fixes: Iterable[tuple[float, GpsSample]]) -> Iterator[tuple[f
             # of one height: its noise is none of the way
             ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
             yield (t, *plane.from_ecef(ecef)[:2])
+
+
+def _mean_between(series: Mapping[int, float], begin: float, end: float) -> float:
+    """Return the mean of a series of seconds over a time, s since 1970, as far as it is known; nan where it is not."""
+    known = [
+        (series[second], min(end, second + 1.0) - max(begin, second))
+        for second in range(math.floor(begin), math.ceil(end))
+        if second in series
+    ]
+    total = sum(weight for _, weight in known)
+    return sum(value * weight for value, weight in known) / total if total > 0.0 else math.nan
 
 
 def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float) -> list[tuple[float, float, float]]:
