@@ -112,6 +112,20 @@ def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
     assert only(make_data(sensor_motion=swapped)).title == "Left and right wheels are swapped"
 
 
+def test_given_quick_turns_of_a_slow_vehicle_then_the_gyro_is_compared_over_the_steps_of_the_fixes() -> None:
+    plane, gyro, fixes = LocalFrame.at(50.0, -111.0, 0.0), {}, []
+    x = y = yaw = 0.0
+    for n in range(600):
+        # a quarter turn within two seconds every half minute, left and right in turns
+        gyro[START + n] = rate = (math.pi / 4.0 if n % 30 < 2 else 0.0) * (-1) ** (n // 60)
+        yaw += rate
+        x, y = x + math.cos(yaw), y + math.sin(yaw)
+        latitude, longitude, _ = geodetic_from_ecef(plane.to_ecef((x, y, 0.0)))
+        fixes.append(GpsSample(SensorHeader((START + n) * 1_000_000, "gps"), FixType.FIX_3D, latitude, longitude))
+    found = compute_sensor_motion(gyro, fixes, [], {})
+    assert found.compare_with_course(gyro) == pytest.approx((1.0, 1.0), abs=0.2)
+
+
 def test_given_speeds_without_travel_then_they_are_means_of_their_seconds() -> None:
     speed = [0.5, 1.5]
     samples = [
