@@ -138,7 +138,7 @@ class FoxgloveWriter:
         self._log = LogChannel("/events", context=context)
         self._diagnostics = Channel("/diagnostics", schema=DIAGNOSTICS_SCHEMA, context=context)
         self._fixes: dict[str, LocationFixChannel] = {}
-        self._raw: dict[str, Channel | None] = {}
+        self._raw: dict[str, Channel] = {}
         self._gps = fingerprint_of("gps_t")
         self.skipped = 0
         """Messages that could not be read."""
@@ -156,7 +156,7 @@ class FoxgloveWriter:
         drive.feed(channel, data, now)
         name = channel[len(drive.prefix) :]
         if self._definitions is not None:
-            self._log_raw(channel, data, now)
+            self._log_raw(self._definitions, channel, data, now)
         try:
             if drive.model is not None and (drive.model is not self._model or now >= self._next_static):
                 self._log_geometry(drive.model, now)
@@ -261,22 +261,17 @@ class FoxgloveWriter:
         message = Log(timestamp=_stamp(event.utime), level=level, message=event.text, name=event.kind)
         self._log.log(message, log_time=self._now * 1000)
 
-    def _log_raw(self, channel: str, data: bytes, now: int) -> None:
+    def _log_raw(self, definitions: Path, channel: str, data: bytes, now: int) -> None:
         if channel not in self._raw:
-            self._raw[channel] = self._make_raw_channel(channel, data)
-        raw = self._raw[channel]
-        if raw is not None:
-            raw.log(data, log_time=now * 1000)
-
-    def _make_raw_channel(self, channel: str, data: bytes) -> Channel | None:
-        """Return a channel for LCM messages; None where there are too many."""
-        if len(self._raw) >= MAX_SOURCES:
-            return None
-        name, text = _TYPE_OF.get(data[:8], ""), b""
-        if name and self._definitions is not None:
-            text = (self._definitions / f"{name}.lcm").read_bytes()
-        schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
-        return Channel(f"/lcm/{channel}", schema=schema, message_encoding="lcm", context=self._context)
+            if len(self._raw) >= MAX_SOURCES:
+                return
+            name = _TYPE_OF.get(data[:8], "")
+            text = (definitions / f"{name}.lcm").read_bytes() if name else b""
+            schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
+            self._raw[channel] = Channel(
+                f"/lcm/{channel}", schema=schema, message_encoding="lcm", context=self._context
+            )
+        self._raw[channel].log(data, log_time=now * 1000)
 
 
 def _stamp(utime: int) -> Timestamp:
@@ -284,19 +279,24 @@ def _stamp(utime: int) -> Timestamp:
     return Timestamp(seconds, microseconds * 1000)
 
 
-def _convert_pose(pose: Pose) -> FoxglovePose:
+def _convert(pose: Pose) -> tuple[Vector3, Quaternion]:
     (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
-    return FoxglovePose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+
+
+def _convert_pose(pose: Pose) -> FoxglovePose:
+    position, orientation = _convert(pose)
+    return FoxglovePose(position=position, orientation=orientation)
 
 
 def _make_transform(parent: str, child: str, pose: Pose, utime: int) -> FrameTransform:
-    (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
+    translation, rotation = _convert(pose)
     return FrameTransform(
         timestamp=_stamp(utime),
         parent_frame_id=parent,
         child_frame_id=child,
-        translation=Vector3(x=x, y=y, z=z),
-        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+        translation=translation,
+        rotation=rotation,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import chain, cycle, pairwise
 
@@ -130,7 +130,8 @@ def _render_key_figures(data: ReplayData) -> str:
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
     ]
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    return f'<div class="figures">{cells}</div>\n<p>{_escape(_describe_key_figures(data))}</p>'
+    words = " ".join(_describe_key_figures(data, verdicts))
+    return f'<div class="figures">{cells}</div>\n<p>{_escape(words)}</p>'
 
 
 def _valid_share(data: ReplayData) -> float:
@@ -139,26 +140,23 @@ def _valid_share(data: ReplayData) -> float:
     return min(sum(held) / data.duration, 1.0) if data.duration > 0.0 else 0.0
 
 
-def _describe_key_figures(data: ReplayData) -> str:
-    """Return an explanation of the key figures and of the fixes that were not used."""
-    verdicts = Counter(each.verdict for each in data.fixes)
-    words = ["Valid: share of the recorded time, from the log's first event on."]
-    if data.fixes:
-        rest = [
-            f"{format_count(verdicts[verdict], 'fix', 'fixes')} {what}"
-            for verdict, what in (
-                ("monitored", "monitored (stationary or unused)"),
-                ("reset", "reset the position"),
-                ("", "without a decision (before heading alignment, or pending at the end)"),
-            )
-            if verdicts[verdict]
-        ]
-        if rest:
-            words.append(f"Of the fixes not used as positions (gps_position): {', '.join(rest)}.")
-        heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in data.decisions)
-        if heights:
-            words.append(f"{format_count(heights, 'height')} (gps_height) of fixes rejected.")
-    return " ".join(words)
+def _describe_key_figures(data: ReplayData, verdicts: Mapping[str, int]) -> Iterator[str]:
+    """Yield explanations of the key figures and of the fixes that were not used."""
+    yield "Valid: share of the recorded time, from the log's first event on."
+    rest = [
+        f"{format_count(verdicts[verdict], 'fix', 'fixes')} {what}"
+        for verdict, what in (
+            ("monitored", "monitored (stationary or unused)"),
+            ("reset", "reset the position"),
+            ("", "without a decision (before heading alignment, or pending at the end)"),
+        )
+        if verdicts[verdict]
+    ]
+    if rest:
+        yield f"Of the fixes not used as positions (gps_position): {', '.join(rest)}."
+    heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in data.decisions)
+    if heights:
+        yield f"{format_count(heights, 'height')} (gps_height) of fixes rejected."
 
 
 def _render_findings(found: Sequence[ReportFinding]) -> str:
