@@ -622,13 +622,11 @@ class ItemFields:
             return
         unit = "deg" if joint.type is JointType.REVOLUTE else "m"
         scale = math.degrees(1.0) if unit == "deg" else 1.0
-        limits = [*joint.lower, *joint.upper] if joint.lower and joint.upper else []
-        if joint.lower and not joint.upper:
-            limits = [joint.lower[0], math.inf]
-        elif joint.upper and not joint.lower:
-            limits = [-math.inf, joint.upper[0]]
+        limits: tuple[float, ...] = ()
+        if joint.lower or joint.upper:
+            limits = (joint.lower or (-math.inf,)) + (joint.upper or (math.inf,))
         for key, label, values in (
-            ("limits", f"limits ({unit})", tuple(limits)),
+            ("limits", f"limits ({unit})", limits),
             ("rate_limit", f"rate limit ({unit}/s)", joint.rate_limit),
             ("default", f"default ({unit})", joint.default),
             ("sigma", f"joint sigma ({unit})", joint.sigma),

@@ -381,7 +381,6 @@ class TimePanel:
         self._shown_at = math.nan
         self._is_settled = False
         self.is_playing = False
-        self.is_following = is_live
         self._drive: Drive | None = None
         self._clock = gui.add_markdown("")
         self._slider: Any = gui.add_slider("Time (s)", 0.0, 1.0, 0.05, 0.0)
@@ -389,7 +388,6 @@ class TimePanel:
         self._play = actions.add_button(gui, "Play", self.toggle)
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
         self._follow: Any = gui.add_checkbox("Live", is_live, visible=is_live)
-        actions.on_update(self._follow, lambda: self._set_following(self._follow.value))
         with gui.add_folder("Events"):
             self._kind = gui.add_dropdown("Kind", (ALL, *EventKind))
             actions.add_button(gui, "Previous", lambda: self._jump_to_event(-1))
@@ -398,12 +396,16 @@ class TimePanel:
 
     @property
     def utime(self) -> int:
-        return 0 if self.is_following else self._begin + round(self._at * 1e6)
+        return 0 if self._follow.value else self._here
+
+    @property
+    def _here(self) -> int:
+        return self._begin + round(self._at * 1e6)
 
     def jump(self, seconds: float) -> None:
         """Show the time so many seconds after the begin of the drive."""
         self._at = min(max(seconds, 0.0), (self._end - self._begin) * 1e-6)
-        self._set_following(False)
+        self._follow.value = False
 
     def toggle(self) -> None:
         """Play or pause; playing from the end begins again."""
@@ -412,23 +414,18 @@ class TimePanel:
             self.jump(0.0)
         self._play.label = "Pause" if self.is_playing else "Play"
 
-    def _set_following(self, is_following: bool) -> None:
-        self.is_following = is_following
-        self._follow.value = is_following
-
     def _list_events(self) -> list[DriveEvent]:
         wanted = self._kind.value
         events = sorted(self._drive.events if self._drive else [], key=lambda each: each.utime)
         return [each for each in events if wanted in (ALL, each.kind)]
 
     def _jump_to_event(self, direction: int) -> None:
-        here = self._begin + round(self._at * 1e6)
-        times = [each.utime for each in self._list_events()]
-        later = [each for each in times if (each - here) * direction > 1_000]
+        distances = [each.utime - self._here for each in self._list_events()]
+        later = [each for each in distances if each * direction > 1_000]
         if later:
-            self.is_playing = False
-            self._play.label = "Play"
-            self.jump((min(later, key=lambda each: abs(each - here)) - self._begin) * 1e-6)
+            if self.is_playing:
+                self.toggle()
+            self.jump((self._here + min(later, key=abs) - self._begin) * 1e-6)
 
     def advance(self, drive: Drive, seconds: float) -> None:
         """Continue playback after `seconds` of wall time, over a drive that may have become longer."""
@@ -438,7 +435,7 @@ class TimePanel:
             self._at += (self._begin - begin) * 1e-6
         self._begin, self._end = begin, end
         length = max((end - begin) * 1e-6, 0.1)
-        if self.is_following:
+        if self._follow.value:
             self._at = length
         elif self.is_playing:
             self._at = min(self._at + seconds * float(self._speed.value.rstrip("x")), length)
@@ -458,19 +455,18 @@ class TimePanel:
             if self._is_settled:
                 self._slider.value = value + 0.05
             self._slider.value = value
-        here = self._begin + round(self._at * 1e6) if self._begin else 0
+        here = self._here if self._begin else 0
         when = datetime.fromtimestamp(here * 1e-6, UTC).isoformat(sep=" ", timespec="milliseconds") if here else ""
-        clock = f"**{self._at:.2f} s** of {length:.1f} s  \n{when}" if here else "no pose and no joints yet"
-        self._clock.content = clock
+        clock = f"**{self._at:.2f} s** of {length:.1f} s  \n{when}"
+        self._clock.content = clock if here else "no pose and no joints yet"
         events = self._list_events()
         before = [each for each in events if each.utime <= here][-SHOWN_EVENTS:]
         after = [each for each in events if each.utime > here][:2]
-        rows = [self._describe(each) for each in (*before, *after)]
+        rows = [
+            (f"{(each.utime - self._begin) * 1e-6:.2f}", each.kind, each.text + f" ({each.count}x)" * (each.count > 1))
+            for each in (*before, *after)
+        ]
         self._events.content = format_table(("s", "event", ""), rows) if rows else "none"
-
-    def _describe(self, event: DriveEvent) -> tuple[str, str, str]:
-        repeated = f" ({event.count}x)" if event.count > 1 else ""
-        return (f"{(event.utime - self._begin) * 1e-6:.2f}", event.kind, event.text + repeated)
 
 
 class StatePanel:
