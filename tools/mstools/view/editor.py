@@ -43,6 +43,7 @@ from modelserver.transforms.so3 import Vector3
 from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.session import EditSession
 from mstools.edit.yaml_text import EditError
+from mstools.terminal.output import format_count
 from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
@@ -114,7 +115,7 @@ class Editor:
         self._actions = actions
         self._show = show
         self._shown = session.drawn
-        self._item: GeometryItem | None = None
+        self._item = self._find_first(ItemKind.FRAME)
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
         self._next_look = 0.0
@@ -134,7 +135,7 @@ class Editor:
         self._name: Any = gui.add_dropdown("Item", ("",))
         actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
         actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
-        self._fields = ItemFields(server, session, self._change_item, actions)
+        self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
             self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
@@ -147,11 +148,10 @@ class Editor:
             self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
         with gui.add_folder("Place by measurement", expand_by_default=False):
-            self._place = PlacePanel(gui, session, self._change_item, actions)
+            self._place = PlacePanel(gui, session, self._item, self._change_item, actions)
         with gui.add_folder("As text", expand_by_default=False):
             self._text: Any = gui.add_text("YAML", "", multiline=True)
             self._add_button("Write text", self._write_text)
-        self._select_first(ItemKind.FRAME)
         self._refresh()
 
     def _add_button(self, label: str, action: Callable[[], object]) -> Any:
@@ -173,7 +173,7 @@ class Editor:
     # --- selection
 
     def select(self, item: GeometryItem) -> None:
-        if self._item is not None and item != self._item and not self._fields.commit():
+        if item != self._item and not self._fields.commit():
             # what was typed is not lost: it stays until it can be set
             self._kind.value, self._name.value = self._item.kind, self._item.name
             return
@@ -184,22 +184,23 @@ class Editor:
         self._kind.value = item.kind
         self._name.options = tuple([each.name for each in items if each.kind is item.kind])
         self._name.value = item.name
-        self._show_item()
+        self._fields.show(item)
+        self._place.show(item)
+        self._text.value = self._session.document.get_yaml(item)
+        self.show_gizmo()
 
     def _select_first(self, kind: ItemKind) -> None:
-        found = next((each for each in self._session.document.list_items() if each.kind is kind), None)
-        if found is None:
+        found = self._find_first(kind)
+        if found.kind is not kind:
             self._report(f"there is no {kind} yet; add one below")
-            self._kind.value = self._item.kind if self._item is not None else ItemKind.BODY
+            self._kind.value = self._item.kind
         else:
             self.select(found)
 
-    def _show_item(self) -> None:
-        assert self._item is not None
-        self._fields.show(self._item)
-        self._place.show(self._item)
-        self._text.value = self._session.document.get_yaml(self._item)
-        self.show_gizmo()
+    def _find_first(self, kind: ItemKind) -> GeometryItem:
+        """Return the first item of a kind, without one the first of all."""
+        items = self._session.document.list_items()
+        return next((each for each in items if each.kind is kind), items[0])
 
     def _refresh(self) -> None:
         session = self._session
@@ -214,11 +215,8 @@ class Editor:
         self._save.disabled = not session.is_changed or session.has_errors
         self._apply.disabled = session.is_changed
         self._show_problems()
-        items = session.document.list_items()
-        if self._item not in items:
-            kind = self._item.kind if self._item is not None else ItemKind.FRAME
-            self._item = next((each for each in items if each.kind is kind), items[0])
-        assert self._item is not None
+        if self._item not in session.document.list_items():
+            self._item = self._find_first(self._item.kind)
         self.select(self._item)
         if session.model is not None and session.model is not self._shown:
             self._shown = session.drawn
@@ -230,7 +228,7 @@ class Editor:
         errors = sum(each.severity is Severity.ERROR for each in session.problems)
         state = "not saved" if session.is_changed else "saved"
         if errors:
-            state += f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows " + (
+            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
                 "the last model" if session.model is not None else "the bodies, not joined"
             )
         if self._is_outdated:
@@ -248,7 +246,7 @@ class Editor:
         lines = [f"- {_describe_problem(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
         text = "\n".join(lines) or "none"
         if notes:
-            text += f"\n\n{notes} note{'' if notes == 1 else 's'}: modelserver check --notes"
+            text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
         self._problem_texts.content = text
         with self._problems:
             for number, problem in enumerate(shown, 1):
@@ -289,13 +287,11 @@ class Editor:
 
     def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
         """Make a change of what is selected; return whether it could be made."""
-        assert self._item is not None
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
         name = self._new.value.strip()
         item = self._item
-        assert item is not None
         frames = list_frames(self._session.document)
         if kind is ItemKind.BODY:
             self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
@@ -316,7 +312,6 @@ class Editor:
 
     def _duplicate(self) -> None:
         item = self._item
-        assert item is not None
         plain = item.name.rpartition(":")[2]
         name = self._new.value.strip() or _find_free_name(self._session.document, item)
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
@@ -324,13 +319,11 @@ class Editor:
 
     def _delete(self) -> None:
         item = self._item
-        assert item is not None
         in_template = self._fields.in_template
         self._change(f"delete {item.name}", lambda document: document.delete(item, in_template))
 
     def _write_text(self) -> None:
         item, text = self._item, self._text.value
-        assert item is not None
         self._change(f"write {item.name}", lambda document: document.set_yaml(item, text))
 
     # --- gizmo
@@ -533,13 +526,15 @@ def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint
 class ItemFields:
     """A form with the fields of what is selected; its button sets all of them as one change."""
 
-    def __init__(self, server: viser.ViserServer, session: EditSession, change: ChangeItem, actions: Actions):
+    def __init__(
+        self, server: viser.ViserServer, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
+    ):
         self._server = server
         self._gui = gui = server.gui
         self._session = session
         self._change = change
         self._actions = actions
-        self._item: GeometryItem | None = None
+        self._item = item
         self._form: Any = None
         self._part: BodyFrame | Constraint | None = None
         self._fields: dict[str, Any] = {}
@@ -633,7 +628,6 @@ class ItemFields:
         ):
             self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
             self._exact[key] = values
-        assert self._item is not None
         others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
         leaders = (NO_CHOICE, *(each for each in others if each != self._item.name))
         mimic = joint.mimic
@@ -653,7 +647,7 @@ class ItemFields:
 
     def commit(self) -> bool:
         """Set what was typed, if anything was; return whether nothing is left that cannot be set."""
-        return self._item is None or not self._is_typed() or self.set()
+        return not self._is_typed() or self.set()
 
     def _is_typed(self) -> bool:
         try:
@@ -664,7 +658,6 @@ class ItemFields:
     def set(self) -> bool:
         """Set what was changed in the fields; return whether that could be done."""
         item = self._item
-        assert item is not None
         plain = item.name.rpartition(":")[2]
         name = self._fields["name"].value.strip()
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name) if name != plain else None
@@ -693,7 +686,6 @@ class ItemFields:
 
     def _is_changed(self, *keys: str) -> bool:
         """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
-        assert self._item is not None
         present = [key for key in keys if key in self._fields]
         # the fields show the model that is drawn, not what the text has
         is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
@@ -758,7 +750,7 @@ class ItemFields:
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
         model, part = self._session.drawn, self._part
-        if part is None or self._item is None:
+        if part is None:
             return None
         if isinstance(part, BodyFrame):
             return names.split(self._item.name)[0], Pose.identity(), part.pose
@@ -791,10 +783,12 @@ def _format_values(values: Sequence[float], scale: float) -> str:
 class PlacePanel:
     """Two folders: frames that coincide, and distances."""
 
-    def __init__(self, gui: viser.GuiApi, session: EditSession, change: ChangeItem, actions: Actions):
+    def __init__(
+        self, gui: viser.GuiApi, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
+    ):
         self._session = session
         self._change = change
-        self._item: GeometryItem | None = None
+        self._item = item
         with gui.add_folder("Frames that coincide"):
             self._hint = gui.add_markdown("")
             self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
@@ -824,15 +818,12 @@ class PlacePanel:
             ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
         }.get(item.kind, "Select a frame or a constraint.")
         for dropdown in (self._frame, self._target, *(frame for frame, _ in self._rows)):
-            chosen = dropdown.value
+            # a frame that is not among them gives way to the first
             dropdown.options = frames
-            dropdown.value = chosen if chosen in frames else NO_CHOICE
 
     def _place(self, compute: Callable[[Model, GeometryItem], tuple[Placement, Pose]]) -> None:
         """Place the item where a function of the model computes it; that returns its old pose too."""
         item = self._item
-        if item is None:
-            return
 
         def change(document: GeometryDocument) -> GeometryDocument:
             model = self._session.model

@@ -117,7 +117,6 @@ class VehicleScene:
         self._size = 1.0
         self.unread: list[str] = []
         """Mesh files that could not be read, with the reason."""
-        self.follow = True
         self.is_edited = False
         """Whether it has a gizmo: bodies are not clicked then, frames are."""
         # without reflections and shadows, which show nothing of a geometry: where no graphics card draws them, the
@@ -272,12 +271,12 @@ class VehicleScene:
 
     # --- pictures
 
-    def show(self, picture: Picture) -> None:
-        """Move the vehicle and its joints to those of a picture."""
+    def show(self, picture: Picture, follow: bool = True) -> None:
+        """Move the vehicle and its joints to those of a picture; the vehicle stays at the origin where `follow`."""
         self._move_joints(picture.joints)
         pose = picture.pose or Pose.identity()
         self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
-        x, y, z = pose.xyz if self.follow else (0.0, 0.0, 0.0)
+        x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
         self._world.position = (-x, -y, -z)
 
     def _move_joints(self, positions: Mapping[str, float]) -> None:

@@ -145,8 +145,7 @@ class Viewer:
             if (named := (display.labels, self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
-            self._scene.follow = display.follow.value
-            self._scene.show(picture)
+            self._scene.show(picture, display.follow.value)
             self._scene.show_trail(utimes, track)
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
@@ -499,10 +498,9 @@ class StatePanel:
 
     def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
         options = (NO_STATE, *states)
-        if tuple(self._state.options) != options:
-            chosen = self._state.value
+        if self._state.options != options:
+            # a state that is not among them gives way to the first
             self._state.options = options
-            self._state.value = chosen if chosen in options else NO_STATE
         self._course.visible = self._state.value != NO_STATE
         if self._course.visible:
             times, values, sigmas = drive.get_state_course(self._state.value, utime)
