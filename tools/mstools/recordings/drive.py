@@ -14,7 +14,7 @@ import struct
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from operator import itemgetter
@@ -30,7 +30,6 @@ from modelserver.formats.snapshot import decode_snapshot
 from modelserver.geometry.joint import Coordinates, coordinate_names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import Body
 from modelserver.messages import (
     VALID,
     Decision,
@@ -586,48 +585,51 @@ class BodyPath(NamedTuple):
 
 
 class FramePoses:
-    """Compute where the bodies of a model are in `base_frame`; only those behind joints change."""
+    """Where the bodies of a model are in `base_frame`, with joints where they were received.
+
+    `paths` has the bodies that are joined to the base frame.
+    """
 
     def __init__(self, model: Model, base_frame: str):
-        self._model = model
-        found = {body.name: self._find_path(body, base_frame) for body in model.bodies}
-        self.paths: dict[str, BodyPath] = {name: path for name, path in found.items() if path is not None}
-        """The bodies that are joined to the base frame."""
+        self.model = model
+        self.paths: dict[str, BodyPath] = {}
+        self._joints: Mapping[str, float] = {}
+        for body in model.bodies:
+            if not body.frames:
+                continue
+            with suppress(QueryError):
+                path = model.get_kinematic_path(body.frames[0].full_name, base_frame)
+                coordinates = frozenset(name for joint in path.joints for name in model.drives[joint.name].names)
+                self.paths[body.name] = BodyPath(path, body.frames[0].pose.inverse(), coordinates)
 
-    def _find_path(self, body: Body, base_frame: str) -> BodyPath | None:
-        if not body.frames:
-            return None
-        first = body.frames[0]
-        try:
-            path = self._model.get_kinematic_path(first.full_name, base_frame)
-        except QueryError:
-            return None
-        coordinates = frozenset(name for joint in path.joints for name in self._model.drives[joint.name].names)
-        return BodyPath(path, first.pose.inverse(), coordinates)
-
-    def compute_bodies(self, joints: Mapping[str, float], moved: Collection[str] | None = None) -> dict[str, Pose]:
+    def compute_bodies(self, moved: Collection[str] | None = None) -> dict[str, Pose]:
         """Return the poses of the bodies by name; with `moved` only of those behind these coordinates."""
         return {
-            name: each.path.compute_pose([self._get_position(joint.name, joints) for joint in each.path.joints])
+            name: each.path.compute_pose([self._get_position(joint.name) for joint in each.path.joints])
             @ each.from_frame
             for name, each in self.paths.items()
             if moved is None or not each.coordinates.isdisjoint(moved)
         }
 
-    def compute(self, joints: Mapping[str, float], moved: Collection[str] | None = None) -> dict[str, Pose]:
-        """Return the poses of the frames by full name; with `moved` only of those behind these coordinates."""
-        return {
-            frame.full_name: pose @ frame.pose
-            for name, pose in self.compute_bodies(joints, moved).items()
-            for frame in self._model.body(name)
-        }
+    def move_joints(self, joints: Mapping[str, float]) -> dict[str, Pose]:
+        """Set the coordinates that were received, and return the poses of the bodies that moved."""
+        known, self._joints = self._joints, dict(joints)
+        moved = {name for name in known.keys() | joints.keys() if known.get(name) != joints.get(name)}
+        return self.compute_bodies(moved) if moved else {}
 
-    def _get_position(self, joint: str, joints: Mapping[str, float]) -> Coordinates:
+    def compute_frames(self, bodies: Mapping[str, Pose]) -> dict[str, Pose]:
+        """Return the poses of the frames of bodies by full name."""
+        return {frame.full_name: pose @ frame.pose for name, pose in bodies.items() for frame in self.model.body(name)}
+
+    def _get_position(self, joint: str) -> Coordinates:
         """Return a joint's position: received, else its default."""
-        drive = self._model.drives[joint]
-        leader = self._model.joints[drive.leader].joint
+        drive = self.model.drives[joint]
+        leader = self.model.joints[drive.leader].joint
         found = tuple(
-            [joints.get(name, default) for name, default in zip(drive.names, leader.default_position, strict=True)]
+            [
+                self._joints.get(name, default)
+                for name, default in zip(drive.names, leader.default_position, strict=True)
+            ]
         )
         if drive.leader == joint:
             return found

@@ -127,9 +127,7 @@ class FoxgloveWriter:
         self._drive = Drive(prefix, on_event=self._log_event)
         self._now = 0
         self._definitions = definitions
-        self._model: Model | None = None
         self._frames: FramePoses | None = None
-        self._joints: Mapping[str, float] = {}
         self._next_static = self._next_fix = 0
         self._tf = FrameTransformsChannel("/tf", context=context)
         self._pose = PoseInFrameChannel("/pose", context=context)
@@ -145,7 +143,7 @@ class FoxgloveWriter:
 
     @property
     def has_geometry(self) -> bool:
-        return self._model is not None
+        return self._frames is not None
 
     def feed(self, channel: str, data: bytes, now: int) -> None:
         """Log what a message received at `now`, microseconds, holds."""
@@ -158,7 +156,7 @@ class FoxgloveWriter:
         if self._definitions is not None:
             self._log_raw(self._definitions, channel, data, now)
         try:
-            if drive.model is not None and (drive.model is not self._model or now >= self._next_static):
+            if drive.model is not None:
                 self._log_geometry(drive.model, now)
             if name == "POSE":
                 self._log_pose(decode("pose_transform_t", data), now)
@@ -166,8 +164,8 @@ class FoxgloveWriter:
                 self._log_health(decode("health_t", data), now)
             elif data[:8] == self._gps:
                 self._log_gps(decode("gps_t", data), now)
-            elif name.startswith("JOINTS") or channel == drive.joints_channel:
-                self._log_joints(now)
+            elif self._frames is not None and (name.startswith("JOINTS") or channel == drive.joints_channel):
+                self._log_frames(self._frames, self._frames.move_joints(drive.get_joints(now)), now)
         except (WireError, GeodesyError, OverflowError):
             # the last one is a stamp that Foxglove's cannot hold
             self.skipped += 1
@@ -175,35 +173,29 @@ class FoxgloveWriter:
     # --- frames
 
     def _log_geometry(self, model: Model, now: int) -> None:
-        if model is not self._model:
-            if self._model is not None:
+        frames = self._frames
+        if frames is not None and frames.model is model and now < self._next_static:
+            return
+        if frames is None or frames.model is not model:
+            if frames is not None:
                 everything = SceneEntityDeletion(type=SceneEntityDeletionType.All)
                 self._scene.log(SceneUpdate(deletions=[everything]), log_time=now * 1000)
-            self._model = model
-            self._frames = FramePoses(model, self._drive.base_frame)
+            frames = self._frames = FramePoses(model, self._drive.base_frame)
+            frames.move_joints(self._drive.get_joints(now))
         self._next_static = now + STATIC_PERIOD_US
-        assert self._frames is not None
-        everything_in_base = self._frames.compute(self._joints)
-        self._log_frames(everything_in_base, now)
+        self._log_frames(frames, frames.compute_bodies(), now)
         entities = [
             _make_entity(body.frames[0].full_name, body.frames[0].pose, body.visuals or body.collisions, now)
             for body in model.bodies
-            if body.frames and (body.visuals or body.collisions) and body.frames[0].full_name in everything_in_base
+            if body.name in frames.paths and (body.visuals or body.collisions)
         ]
         if entities:
             self._scene.log(SceneUpdate(entities=entities), log_time=now * 1000)
 
-    def _log_joints(self, now: int) -> None:
-        joints = self._drive.get_joints(now)
-        if self._frames is None or joints == self._joints:
-            return
-        moved = {name for name, value in joints.items() if self._joints.get(name) != value}
-        self._joints = joints
-        self._log_frames(self._frames.compute(joints, moved), now)
-
-    def _log_frames(self, frames: Mapping[str, Pose], now: int) -> None:
+    def _log_frames(self, frames: FramePoses, bodies: Mapping[str, Pose], now: int) -> None:
         base = self._drive.base_frame
-        transforms = [_make_transform(base, name, pose, now) for name, pose in frames.items() if name != base]
+        poses = frames.compute_frames(bodies)
+        transforms = [_make_transform(base, name, pose, now) for name, pose in poses.items() if name != base]
         if transforms:
             self._tf.log(FrameTransforms(transforms=transforms), log_time=now * 1000)
 

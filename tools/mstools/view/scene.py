@@ -110,8 +110,6 @@ class VehicleScene:
         self._poses: dict[str, Pose] = {}
         self._segments: list[ConstraintLine] = []
         self._labels: list[tuple[NameLabels, str, viser.LabelHandle]] = []
-        self._model: Model | None = None
-        self._positions: Mapping[str, float] = {}
         self._path: tuple[str, ...] = ()
         self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
@@ -172,10 +170,6 @@ class VehicleScene:
 
     # --- geometry
 
-    @property
-    def model(self) -> Model | None:
-        return self._model
-
     def set_model(self, model: Model, base_frame: str, labels: NameLabels) -> float:
         """Draw another model, and return its size in meters; `base_frame` is the frame whose pose is published."""
         for each in self._bodies.values():
@@ -183,7 +177,6 @@ class VehicleScene:
         # went with its body
         self._gizmo = None
         self._bodies, self._poses, self._labels, self._segments, self.unread = {}, {}, [], [], []
-        self._model, self._positions = model, {}
         self._frames = FramePoses(model, base_frame)
         size = self._size = _measure_model(model)
         orphans = 0
@@ -202,7 +195,7 @@ class VehicleScene:
             points = [model.frame(each).pose.xyz for each in (constraint.from_, constraint.to)]
             bodies = (ends[0][0], ends[1][0])
             self._segments.append(ConstraintLine(bodies, (points[0], points[1]), constraint.joint.is_movable))
-        self._place_bodies(self._frames.compute_bodies({}))
+        self._place_bodies(self._frames.compute_bodies())
         return size
 
     def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
@@ -273,21 +266,12 @@ class VehicleScene:
 
     def show(self, picture: Picture, follow: bool = True) -> None:
         """Move the vehicle and its joints to those of a picture; the vehicle stays at the origin where `follow`."""
-        self._move_joints(picture.joints)
+        if self._frames is not None and (moved := self._frames.move_joints(picture.joints)):
+            self._place_bodies(moved)
         pose = picture.pose or Pose.identity()
         self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
         x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
         self._world.position = (-x, -y, -z)
-
-    def _move_joints(self, positions: Mapping[str, float]) -> None:
-        if self._frames is None or positions == self._positions:
-            return
-        moved = {name for name, value in positions.items() if self._positions.get(name) != value}
-        moved |= self._positions.keys() - positions.keys()
-        self._positions = dict(positions)
-        poses = self._frames.compute_bodies(positions, moved)
-        if poses:
-            self._place_bodies(poses)
 
     def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
         """Move bodies to their poses in the base frame, and redraw what depends on them."""
@@ -307,9 +291,9 @@ class VehicleScene:
     def get_frame_pose(self, frame: str) -> Pose | None:
         """Return the pose of a frame in the base frame as drawn; None for an unknown or world frame."""
         body, _, name = frame.partition(":")
-        if body not in self._poses or self._model is None or not self._model.body(body).has_frame(name):
+        if body not in self._poses or self._frames is None or not self._frames.model.body(body).has_frame(name):
             return None
-        return self._poses[body] @ self._model.frame(frame).pose
+        return self._poses[body] @ self._frames.model.frame(frame).pose
 
     def highlight_path(self, frames: Sequence[str]) -> None:
         """Highlight the path through some frames, none to remove it."""
