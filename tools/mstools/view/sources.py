@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -49,15 +48,12 @@ class Source:
     set_model: Callable[[Model], None] | None = None
     notes: tuple[str, ...] = ()
     lock: threading.Lock = field(default_factory=threading.Lock)
-    _resources: ExitStack = field(default_factory=ExitStack)
+    close: Callable[[], None] = lambda: None
 
     @property
     def has_time(self) -> bool:
         """Whether it changes with time: a log or a running service."""
         return not isinstance(self.answers, FilePlatform)
-
-    def close(self) -> None:
-        self._resources.close()
 
 
 # --- geometry file
@@ -172,7 +168,11 @@ def open_live(url: str, prefix: str, timeout: float) -> Source:
     arguments = (bus, prefix, drive.feed, stop.is_set, source.lock)
     listener = threading.Thread(target=follow_bus, args=arguments, name="view", daemon=True)
     listener.start()
-    source._resources.callback(answers.close)
-    source._resources.callback(listener.join, 2.0)
-    source._resources.callback(stop.set)
+
+    def close() -> None:
+        stop.set()
+        listener.join(2.0)
+        answers.close()
+
+    source.close = close
     return source
