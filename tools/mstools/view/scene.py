@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -84,14 +84,6 @@ class NameLabels(StrEnum):
     FRAMES = "frames"
 
 
-class ConstraintLine(NamedTuple):
-    """A constraint as a line between two points, each in the coordinates of its body."""
-
-    bodies: tuple[str, str]
-    points: tuple[Vector3, Vector3]
-    is_movable: bool
-
-
 class VehicleScene:
     """Draw one model and its pictures.
 
@@ -108,7 +100,6 @@ class VehicleScene:
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._frames: FramePoses | None = None
         self._poses: dict[str, Pose] = {}
-        self._segments: list[ConstraintLine] = []
         self._labels: list[tuple[NameLabels, str, viser.LabelHandle]] = []
         self._path: tuple[str, ...] = ()
         self._labeled: tuple[int, int, Origin] | None = None
@@ -176,7 +167,7 @@ class VehicleScene:
             each.remove()
         # went with its body
         self._gizmo = None
-        self._bodies, self._poses, self._labels, self._segments, self.unread = {}, {}, [], [], []
+        self._bodies, self._poses, self._labels, self.unread = {}, {}, [], []
         self._frames = FramePoses(model, base_frame)
         size = self._size = _measure_model(model)
         orphans = 0
@@ -190,12 +181,7 @@ class VehicleScene:
                 self._poses[body.name] = Pose((0.0, -size - orphans * 0.5, 0.0))
                 node.position = self._poses[body.name].xyz
             self._draw_body(root, body, size, labels)
-        for constraint in model.constraints:
-            ends = [names.split(each) for each in (constraint.from_, constraint.to)]
-            points = [model.frame(each).pose.xyz for each in (constraint.from_, constraint.to)]
-            bodies = (ends[0][0], ends[1][0])
-            self._segments.append(ConstraintLine(bodies, (points[0], points[1]), constraint.joint.is_movable))
-        self._place_bodies(self._frames.compute_bodies())
+        self._place_bodies(self._frames, self._frames.compute_bodies())
         return size
 
     def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
@@ -267,24 +253,25 @@ class VehicleScene:
     def show(self, picture: Picture, follow: bool = True) -> None:
         """Move the vehicle and its joints to those of a picture; the vehicle stays at the origin where `follow`."""
         if self._frames is not None and (moved := self._frames.move_joints(picture.joints)):
-            self._place_bodies(moved)
+            self._place_bodies(self._frames, moved)
         pose = picture.pose or Pose.identity()
         self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
         x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
         self._world.position = (-x, -y, -z)
 
-    def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
+    def _place_bodies(self, frames: FramePoses, poses: Mapping[str, Pose]) -> None:
         """Move bodies to their poses in the base frame, and redraw what depends on them."""
         for name, pose in poses.items():
             node = self._bodies[name]
             node.position, node.wxyz = pose.xyz, pose.wxyz
         self._poses.update(poses)
-        for is_movable, lines in enumerate(self._edges):
-            points = [
-                [self._poses[body].transform(point) for body, point in zip(each.bodies, each.points, strict=True)]
-                for each in self._segments
-                if each.is_movable == bool(is_movable)
-            ]
+
+        def locate(frame: str) -> Array:
+            return self._poses[names.split(frame)[0]].transform(frames.model.frame(frame).pose.xyz)
+
+        for is_movable, lines in zip((False, True), self._edges, strict=True):
+            chosen = [each for each in frames.model.constraints if each.joint.is_movable == is_movable]
+            points = [(locate(each.from_), locate(each.to)) for each in chosen]
             lines.points = np.array(points, np.float32).reshape(-1, 2, 3)
         self._draw_path()
 
