@@ -21,7 +21,7 @@ from mstools.edit.document import GeometryItem, ItemKind
 from mstools.edit.session import EditedFile, EditSession
 from mstools.view.editor import Editing, Editor, Snap
 from mstools.view.page import Actions, open_page
-from mstools.view.scene import NameLabels, VehicleScene
+from mstools.view.scene import VehicleScene
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
@@ -36,7 +36,7 @@ class EditedPage:
         self.actions = Actions()
         self.shown: list[Model] = []
         scene = VehicleScene(server, None, lambda frame, is_reference: None)
-        scene.set_model(self.session.drawn, "Raptor:CG", NameLabels.NONE)
+        scene.set_model(self.session.drawn, "Raptor:CG")
         self.scene = scene
         self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
         self.fields = self.editor._fields

@@ -46,7 +46,7 @@ def page() -> Iterator[Page]:
 def make_scene(page: Page, source: Source) -> VehicleScene:
     scene = VehicleScene(page.server, source.folder, lambda frame, is_reference: None)
     assert source.drive.model is not None
-    scene.set_model(source.drive.model, source.drive.base_frame, NameLabels.FRAMES)
+    scene.set_model(source.drive.model, source.drive.base_frame)
     return scene
 
 

@@ -161,7 +161,7 @@ class VehicleScene:
 
     # --- geometry
 
-    def set_model(self, model: Model, base_frame: str, labels: NameLabels) -> float:
+    def set_model(self, model: Model, base_frame: str) -> float:
         """Draw another model, and return its size in meters; `base_frame` is the frame whose pose is published."""
         for each in self._bodies.values():
             each.remove()
@@ -180,11 +180,11 @@ class VehicleScene:
                 orphans += 1
                 self._poses[body.name] = Pose((0.0, -size - orphans * 0.5, 0.0))
                 node.position = self._poses[body.name].xyz
-            self._draw_body(root, body, size, labels)
+            self._draw_body(root, body, size)
         self._place_bodies(self._frames, self._frames.compute_bodies())
         return size
 
-    def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
+    def _draw_body(self, root: str, body: Body, size: float) -> None:
         for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
             nodes = [self._draw_shape(f"{root}/{kind}/{number}", shape, kind) for number, shape in enumerate(shapes)]
             drawn = [node for node in nodes if node is not None]
@@ -194,7 +194,7 @@ class VehicleScene:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
             if drawn:
                 break
-        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0), labels)
+        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0))
         if not body.frames:
             return
         axes = self._scene.add_batched_axes(
@@ -206,11 +206,11 @@ class VehicleScene:
         )
         self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
         for number, frame in enumerate(body.frames):
-            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz, labels)
+            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz)
 
-    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3, shown: NameLabels) -> None:
+    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3) -> None:
         label = self._scene.add_label(
-            node, text, position=place, visible=kind == shown, font_screen_scale=0.8, anchor="bottom-center"
+            node, text, position=place, visible=False, font_screen_scale=0.8, anchor="bottom-center"
         )
         self._labels.append((kind, text, label))
 

@@ -172,7 +172,7 @@ class Viewer:
             self._server.gui.set_panel_label(title)
 
     def _set_model(self, model: Model, base_frame: str) -> None:
-        size = self._scene.set_model(model, base_frame, self._display.labels)
+        size = self._scene.set_model(model, base_frame)
         self._named = None
         if self._model is None:
             self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
