@@ -195,19 +195,22 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
     """Return the contents of a log; `with_geometry` includes the snapshot."""
     offsets: list[tuple[int, int]] = []
     first: PoseAnswer | None = None
-    poses: list[int] = []
-    others: dict[str, list[int]] = {}
-    received_at: list[int] = []
+    spans: dict[str, tuple[int, int]] = {}
     parts = ""
     snapshot: ModelSnapshot | None = None
     assembler, received = SnapshotAssembler(), set[tuple[str, int]]()
+
+    def extend(what: str, stamp: int) -> None:
+        low, high = spans.get(what, (stamp, stamp))
+        spans[what] = (min(low, stamp), max(high, stamp))
+
     for event in log:
-        _extend(received_at, event.utime)
+        extend("", event.utime)
         try:
             if event.channel == f"{prefix}POSE":
                 first = first or decode("pose_transform_t", event.data)
                 stamp = read_stamp(event.data)
-                _extend(poses, stamp)
+                extend(event.channel, stamp)
                 if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
                     offsets.append((stamp, event.end))
             elif event.channel == f"{prefix}MODEL_SNAPSHOT":
@@ -220,18 +223,12 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
             else:
-                _extend(others.setdefault(event.channel, []), read_stamp(event.data))
+                extend(event.channel, read_stamp(event.data))
         except WireError:
             continue
-    joints = others.get(f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel)
-    begin, end = poses or joints or received_at or [0, 0]
-    transformation = None if first is None else first.transformation
-    base_frame, revision = (
-        ("", "") if transformation is None else (transformation.frame_of_interest, transformation.model_revision)
-    )
+    joints = f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel
+    begin, end = spans.get(f"{prefix}POSE") or spans.get(joints) or spans.get("") or (0, 0)
+    base_frame = revision = ""
+    if first is not None:
+        base_frame, revision = first.transformation.frame_of_interest, first.transformation.model_revision
     return LogContents(snapshot, begin, end, base_frame, revision, parts, tuple(offsets))
-
-
-def _extend(span: list[int], stamp: int) -> None:
-    """Extend a time range, empty or of two, by a stamp."""
-    span[:] = [min(span[0], stamp), max(span[1], stamp)] if span else [stamp, stamp]
