@@ -34,8 +34,7 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
-from modelserver.simulation import Event
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Event
 
 pytestmark = pytest.mark.slow
 
