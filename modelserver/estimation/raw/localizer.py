@@ -15,40 +15,26 @@ samples fill the gaps between good stamps. Those of a clock that was set back co
 already, so between two of them lies a good one. `filter.clock_monitor` has the same rules for sources that share a
 horizon; here a delayed sample is rejected, because raw mode has no buffer to sort samples in.
 
-Speed and course: let u be the integral of the unit vector along Odom's heading (`RawMotion.path`), as a complex number.
-A vehicle of constant speed v, whose heading is Odom's plus b, is at p = p_0 + v exp(ib) u. So c = v exp(ib) is the
-straight-line fit
+Speed and course are fitted to recent fixes (motion.py), or are those of the receiver. Its antenna velocity becomes that
+of the base frame by
 
-    c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2,   variance s^2 / sum |u_i - mean u|^2     (1)
-
-of fixes p_i with noise s, on curves as on straights. The lever arm of the antenna, exp(ib) w_i, is subtracted first.
-`filter.heading_alignment` fits the same line once per fix; here running sums give the fits of all segments that end
-at the newest fix, of which the best is used.
-For the speed, noise falls with the length T of the segment. But a fit gives the speed T/2 ago, which has changed by
-about `usual_acceleration` T/2 since: the segment with the smallest sum of both is used.
-For the course, beside the noise of the fit, sigma includes the time-correlated part of the error of a fix, which
-changes by sigma sqrt(2 (1 - exp(-T / tau))) over the segment, and the turn, in which speed is not constant.
-With the antenna velocity of the receiver neither is needed: it becomes that of the base frame by
-
-    v_base = v_antenna - exp(ib) R (w x r)                                                                      (2)
+    v_base = v_antenna - exp(ib) R (w x r)                                                                      (1)
 
 with the lever arm r; before b is known, its direction is that of the velocity itself.
 
-Position at an instant: p_base = p_antenna + exp(ib) (travel in Odom since the fix - lever arm at the fix)      (3)
+Position at an instant: p_base = p_antenna + exp(ib) (travel in Odom since the fix - lever arm at the fix)      (2)
 Its covariance is that of the fix plus the growth by its age, `compute_growth`, plus the yaw error on the arm a from the
 antenna at the fix to the base frame: yaw variance times (-a_n, a_e)(-a_n, a_e)', which also correlates position with
 yaw. Protection levels are those of `filter.protection_levels`, at probability `risk`. World:UTM and World:ENU are each
 computed from the earth-centered position.
 
-Read top-down from the end of the file: `RawLocalizer.process` -> `_process_imu`, `_process_gps` -> `update_fixes`;
-`compute_estimate`.
+Read top-down from the end of the file: `RawLocalizer.process` -> `_process_imu`, `_process_gps`; `compute_estimate`.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -81,10 +67,14 @@ from modelserver.estimation.raw.motion import (
     RawMotion,
     StationaryPlace,
     TrackFix,
+    append_fix,
     compute_yaw_rate,
     correct_up,
+    fit_best_speed,
+    fit_course,
     get_first_up,
     interpolate_motion,
+    is_slow_by_fixes,
     read_raw_imu,
     to_level_axes,
     update_stationary,
@@ -162,124 +152,11 @@ class StampMonitor(NamedTuple):
         return 0.0 if self.last is None else (self.last - self.odd_since + self.last - self.odd_utime) * 1e-6
 
 
-# --- speed and course ------------------------------------------------------------------------------------------
+# --- anchor -------------------------------------------------------------------------------------------------
 
-
-MAX_TRACK_FIXES: Final = 32
-"""Fixes stored: of a longer segment every second one is dropped."""
 
 MAX_AGE: Final = 1e4
 """Seconds of the age of a fix that count: a stamp may be wrong by years."""
-
-
-class SpeedFit(NamedTuple):
-    """A fit of equation (1).
-
-    Attributes
-    ----------
-    velocity, sigma: c and the sigma of each of its components, m/s.
-    seconds, length, turned: duration of the segment, distance travelled (m) and angle turned (rad).
-    """
-
-    velocity: complex
-    sigma: float
-    seconds: float
-    length: float
-    turned: float
-
-
-# --- fits of speed ---------------------------------------------------------------------------------------------------
-
-
-def append_fix(fixes: tuple[TrackFix, ...], fix: TrackFix, window: float) -> tuple[TrackFix, ...]:
-    """Return a segment with one fix more, no longer than `window` seconds, and thinned if it has too many."""
-    oldest = fix.utime - int(window * 1e6)
-    segment = tuple(each for each in fixes if each.utime >= oldest)
-    return (*(segment[::2] if len(segment) >= MAX_TRACK_FIXES else segment), fix)
-
-
-def fit_speeds(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> Iterator[SpeedFit]:
-    """Yield the fits of the last 2, 3, ... fixes; `direction` is exp(ib), or 0 to leave the lever arm in."""
-    if len(fixes) < 2:
-        return
-    newest = fixes[-1]
-    n, su, sp, suu, sup, ss = 0, 0j, 0j, 0.0, 0j, 0.0
-    turned, yaw = 0.0, newest.yaw
-    last_position = newest.position - direction * newest.lever
-    for fix in reversed(fixes):
-        u = fix.path - newest.path
-        p = fix.position - direction * fix.lever - last_position
-        n += 1
-        su += u
-        sp += p
-        suu += u.real * u.real + u.imag * u.imag
-        sup += u.conjugate() * p
-        ss += fix.sigma
-        turned += abs(fix.yaw - yaw)
-        yaw = fix.yaw
-        spread = suu - (su.real * su.real + su.imag * su.imag) / n
-        if n < 2 or spread < 1e-6:
-            continue
-        velocity = (sup - su.conjugate() * sp / n) / spread
-        noise = settings.fix_noise_share * ss / n
-        seconds = (newest.utime - fix.utime) * 1e-6
-        yield SpeedFit(velocity, noise / math.sqrt(spread), seconds, abs(velocity) * abs(u), turned)
-
-
-def fit_best_speed(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
-    """Return the fit with the smallest error of the present speed; its sigma includes the change of speed since."""
-    best: SpeedFit | None = None
-    for fit in fit_speeds(fixes, direction, settings):
-        if fit.seconds > settings.speed_window:
-            break
-        sigma = math.hypot(fit.sigma, 0.5 * settings.usual_acceleration * fit.seconds)
-        if best is None or sigma < best.sigma:
-            best = fit._replace(sigma=sigma)
-    return best
-
-
-def fit_course(
-    fixes: Sequence[TrackFix], direction: complex | None, settings: RawSettings
-) -> tuple[float, float] | None:
-    """Return the heading offset b of the whole segment and its sigma, rad; None if it does not show one."""
-    fit = _fit_whole(fixes, direction or 0j, settings)
-    if direction is None:
-        # the lever arm turns with the heading to be found: two iterations converge
-        for _ in range(2):
-            if fit is None or abs(fit.velocity) < 1e-9:
-                return None
-            fit = _fit_whole(fixes, fit.velocity / abs(fit.velocity), settings)
-    if fit is None or fit.length < 1e-9:
-        return None
-    correlated = math.sqrt(max(1.0 - settings.fix_noise_share**2, 0.0)) * fixes[-1].sigma
-    changed = correlated * math.sqrt(-2.0 * math.expm1(-fit.seconds / settings.fix_correlation_time))
-    turn = settings.course_turn_share * fit.turned
-    return cmath.phase(fit.velocity), math.hypot(fit.sigma / abs(fit.velocity), changed / fit.length, turn)
-
-
-def _fit_whole(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
-    fit = None
-    for fit in fit_speeds(fixes, direction, settings):  # noqa: B007
-        pass
-    return fit
-
-
-def is_slow_by_fixes(fixes: Sequence[TrackFix], settings: RawSettings) -> bool:
-    """Return whether by its fixes the vehicle may be stationary.
-
-    The segment is the shortest that resolves a third of `stationary_speed`, or else all fixes if they resolve that.
-    """
-    found: SpeedFit | None = None
-    for fit in fit_speeds(fixes, 0j, settings):
-        # the path of a stationary vehicle is straight at 1 m/s, thus time: the fit is its velocity
-        if fit.seconds >= settings.stationary_time and fit.sigma <= settings.stationary_speed:
-            found = fit
-            if fit.sigma <= settings.stationary_speed / 3.0:
-                break
-    return found is not None and abs(found.velocity) <= 2.0 * settings.stationary_speed
-
-
-# --- anchor -------------------------------------------------------------------------------------------------
 
 
 class FixAnchor(NamedTuple):
@@ -300,7 +177,7 @@ class FixAnchor(NamedTuple):
     lever_up: float
 
     def propagate_base(self, motion: RawMotion, direction: complex) -> tuple[complex, float, complex]:
-        """Propagate the base frame to `motion` by equation (3): position and height in the working frame.
+        """Propagate the base frame to `motion` by equation (2): position and height in the working frame.
 
         The third value is the arm from the antenna at the fix to the base frame, which an error of heading turns.
         """
@@ -376,83 +253,13 @@ class FixMonitor(NamedTuple):
         return self._replace(recent=(), segment=()) if self.recent or self.segment else self
 
 
-class FixInput(NamedTuple):
-    """A good fix, and the vehicle at its instant.
-
-    Attributes
-    ----------
-    motion, is_stationary: of the base frame.
-    lever: position of the antenna in the base frame, m.
-    fallback_height: for a fix without height before any has one, m; nan: unknown.
-    turn_variance: of the turn up to the fix for which no IMU sample has arrived, rad2.
-    """
-
-    sample: GpsSample
-    fix: AcceptedFix
-    motion: RawMotion
-    is_stationary: bool
-    lever: Vector3
-    fallback_height: float
-    turn_variance: float
-
-
-class FixStep(NamedTuple):
-    """What one fix changed: the new states, and what its course did; None: it has none."""
-
-    fixes: FixMonitor
-    heading: Heading
-    speed: float = 0.0
-    speed_sigma: float = 0.0
-    is_slow: bool = False
-    course: CourseResult | None = None
-    ecef: Vector3 = ZERO
-
-
-def update_fixes(fixes: FixMonitor, heading: Heading, given: FixInput, settings: RawSettings) -> FixStep:
-    """Update the state from fixes, the heading and the speed with one good fix."""
-    motion, utime = given.motion, given.sample.header.utime
-    arm, arm_up = compute_lever_arm(motion, given.lever)
-    fix = _complete_height(fixes.anchor, given, arm_up, settings)
-    ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
-    fixes, heading, work = fixes.recenter(fix, ecef, heading)
-    position, up = _locate(work, ecef)
-    anchor = FixAnchor(utime, position, up, fix, motion, arm, arm_up)
-
-    newest = TrackFix(utime, position, fix.sigma, motion.path, arm, motion.yaw, ecef)
-    recent = append_fix(fixes.recent, newest, settings.speed_window + settings.stationary_time)
-    segment = append_fix(fixes.segment, newest, settings.course_window)
-    velocity = _read_velocity(given, settings)
-    if velocity is None:
-        measured, is_slow = None, is_slow_by_fixes(recent, settings)
-    else:
-        measured = velocity.to_base(heading), velocity.sigma
-        # the speed up to which one velocity may be a stationary vehicle's; their mean over time shows more
-        limit = min(settings.stationary_speed + 3.0 * velocity.sigma, settings.course_speed)
-        is_slow = abs(measured[0]) <= max(velocity.sigma, limit)
-    least_speed = max(abs(motion.speed) - 2.0 * motion.speed_sigma, 0.0)
-    place, heading, is_slow = update_stationary(
-        fixes.stationary, is_slow, given.is_stationary, newest, measured, least_speed, heading, settings
-    )
-    course = None
-    if given.is_stationary and is_slow:
-        # the path at 1 m/s continues while the vehicle is stationary: a segment must not reach back into that
-        segment = (newest,)
-        speed, speed_sigma = 0.0, settings.stationary_speed / 2.0
-    else:
-        heading, course = _update_course(heading, velocity, segment, given.turn_variance, settings)
-        if course is not None:
-            segment = (newest,)
-        speed, speed_sigma = _estimate_speed(heading, velocity, recent, settings)
-    fixes = FixMonitor(work, anchor, recent, segment, stationary=place)
-    return FixStep(fixes, heading, speed, speed_sigma, is_slow, course, ecef)
-
-
 # --- position -----------------------------------------------------------------------------------------------
 
 
-def _complete_height(before: FixAnchor | None, given: FixInput, arm_up: float, settings: RawSettings) -> AcceptedFix:
-    """Return the fix with a height: its own, else that of the fix before propagated, else the fallback."""
-    fix, motion = given.fix, given.motion
+def _complete_height(
+    fix: AcceptedFix, before: FixAnchor | None, motion: RawMotion, arm_up: float, fallback: float, settings: RawSettings
+) -> AcceptedFix:
+    """Return the fix with a height: its own, else that of the fix before propagated, else `fallback` if not nan."""
     if not math.isnan(fix.height):
         return fix
     if before is not None:
@@ -460,9 +267,9 @@ def _complete_height(before: FixAnchor | None, given: FixInput, arm_up: float, s
         height = before.fix.height + motion.z - before.motion.z + arm_up - before.lever_up
         variance = before.fix.up_variance + compute_growth(age, motion.speed_sigma, settings)
         return replace(fix, height=height, up_variance=min(variance, settings.unknown_height_sigma**2))
-    if math.isnan(given.fallback_height):
+    if math.isnan(fallback):
         return replace(fix, height=0.0, up_variance=settings.unknown_height_sigma**2)
-    return replace(fix, height=given.fallback_height, up_variance=settings.assumed_height_sigma**2)
+    return replace(fix, height=fallback, up_variance=settings.assumed_height_sigma**2)
 
 
 def _locate(work: LocalFrame, ecef: Vector3) -> tuple[complex, float]:
@@ -492,7 +299,7 @@ class ReceiverVelocity(NamedTuple):
     measured_yaw: float
 
     def to_base(self, heading: Heading) -> complex:
-        """Return the velocity of the base frame by equation (2), east + i north, m/s."""
+        """Return the velocity of the base frame by equation (1), east + i north, m/s."""
         if heading.is_known:
             direction = heading.direction
         elif abs(self.vector) > 0.0:
@@ -502,12 +309,13 @@ class ReceiverVelocity(NamedTuple):
         return self.vector - direction * self.lever_velocity
 
 
-def _read_velocity(given: FixInput, settings: RawSettings) -> ReceiverVelocity | None:
+def _read_velocity(
+    sample: GpsSample, motion: RawMotion, lever: Vector3, settings: RawSettings
+) -> ReceiverVelocity | None:
     """Return the velocity of the receiver, or that of its speed and course; None if it reports neither.
 
     Unlike the filter's `read_velocity`: horizontal, with one sigma for both axes, and at any speed.
     """
-    sample, motion = given.sample, given.motion
     sigma, course_sigma = settings.velocity_sigma, math.nan
     if sample.velocity is not None:
         vector = complex(sample.velocity[0], sample.velocity[1])
@@ -530,7 +338,7 @@ def _read_velocity(given: FixInput, settings: RawSettings) -> ReceiverVelocity |
         vector,
         sigma,
         max(course_sigma, settings.heading_floor),
-        compute_lever_arm(motion, cross(motion.rate, given.lever))[0],
+        compute_lever_arm(motion, cross(motion.rate, lever))[0],
         motion.yaw,
         motion.yaw - motion.yaw_rate * latency,
     )
@@ -763,30 +571,53 @@ class RawLocalizer(NamedTuple):
             heading = heading.propagate(ahead, settings)
             ahead = 0.0
             motion = motion.propagate(utime, motion.rate, settings)
-        given = FixInput(
-            sample,
-            fix,
-            self.get_motion_at(utime, motion),
-            self.quiet.is_stationary(utime, settings),
-            self.mounts.X_base_antenna.xyz,
-            math.nan if self.origin is None else self.origin.height,
-            (settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)) ** 2,
+        turn_variance = (settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)) ** 2
+        at, is_stationary = self.get_motion_at(utime, motion), self.quiet.is_stationary(utime, settings)
+        lever = self.mounts.X_base_antenna.xyz
+        arm, arm_up = compute_lever_arm(at, lever)
+        fallback = math.nan if self.origin is None else self.origin.height
+        fix = _complete_height(fix, self.fixes.anchor, at, arm_up, fallback, settings)
+        ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
+        fixes, heading, work = self.fixes.recenter(fix, ecef, heading)
+        position, up = _locate(work, ecef)
+        newest = TrackFix(utime, position, fix.sigma, at.path, arm, at.yaw, ecef)
+        recent = append_fix(fixes.recent, newest, settings.speed_window + settings.stationary_time)
+        segment = append_fix(fixes.segment, newest, settings.course_window)
+        velocity = _read_velocity(sample, at, lever, settings)
+        if velocity is None:
+            measured, is_slow = None, is_slow_by_fixes(recent, settings)
+        else:
+            measured = velocity.to_base(heading), velocity.sigma
+            # the speed up to which one velocity may be a stationary vehicle's; their mean over time shows more
+            limit = min(settings.stationary_speed + 3.0 * velocity.sigma, settings.course_speed)
+            is_slow = abs(measured[0]) <= max(velocity.sigma, limit)
+        least_speed = max(abs(at.speed) - 2.0 * at.speed_sigma, 0.0)
+        place, heading, is_slow = update_stationary(
+            fixes.stationary, is_slow, is_stationary, newest, measured, least_speed, heading, settings
         )
-        step = update_fixes(self.fixes, heading, given, settings)
-        events = _reject(sample, "course") if step.course is CourseResult.REJECTED else ()
-        # the first course turns no pose that was valid
-        has_jumped = step.course is CourseResult.RESET and heading.is_known
-        result = self._replace(
-            motion=motion, fixes=step.fixes, heading=step.heading, pose_epoch=self.pose_epoch + int(has_jumped)
-        )
-        result, captured = result._set_origin(utime, step.ecef, fix.sigma)
-        result = result._replace(
-            motion=motion._replace(speed=step.speed, speed_utime=utime, speed_sigma=step.speed_sigma),
-            quiet=self.quiet._replace(is_slow=step.is_slow),
-            is_clock_stepped=self.is_clock_stepped and not step.heading.is_known,
+        course, was_known = None, heading.is_known
+        if is_stationary and is_slow:
+            # the path at 1 m/s continues while the vehicle is stationary: a segment must not reach back into that
+            segment = (newest,)
+            speed, speed_sigma = 0.0, settings.stationary_speed / 2.0
+        else:
+            heading, course = _update_course(heading, velocity, segment, turn_variance, settings)
+            if course is not None:
+                segment = (newest,)
+            speed, speed_sigma = _estimate_speed(heading, velocity, recent, settings)
+        anchor = FixAnchor(utime, position, up, fix, at, arm, arm_up)
+        localizer = self._replace(
+            motion=motion._replace(speed=speed, speed_utime=utime, speed_sigma=speed_sigma),
+            fixes=FixMonitor(work, anchor, recent, segment, stationary=place),
+            heading=heading,
+            quiet=self.quiet._replace(is_slow=is_slow),
+            # the first course turns no pose that was valid
+            pose_epoch=self.pose_epoch + int(course is CourseResult.RESET and was_known),
+            is_clock_stepped=self.is_clock_stepped and not heading.is_known,
             newest=max(self.newest, utime),
         )
-        return result, events + captured
+        localizer, captured = localizer._set_origin(utime, ecef, fix.sigma)
+        return localizer, (_reject(sample, "course") if course is CourseResult.REJECTED else ()) + captured
 
     def _set_origin(self, utime: int, ecef: Vector3, sigma: float) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
         """Return the localizer with the origin set, if it can be, and its projection at the new fix."""

@@ -38,6 +38,20 @@ separated, and the course resets o too.
 Limits: one course is forward or backward, never sideways; side slip goes into o. The variance has the floor
 `heading_floor` and the ceiling of a direction of which nothing is known.
 
+Speed and course: let u be the integral of the unit vector along Odom's heading (`RawMotion.path`), as a complex number.
+A vehicle of constant speed v, whose heading is Odom's plus b, is at p = p_0 + v exp(ib) u. So c = v exp(ib) is the
+straight-line fit
+
+    c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2,   variance s^2 / sum |u_i - mean u|^2     (3)
+
+of fixes p_i with noise s, on curves as on straights. The lever arm of the antenna, exp(ib) w_i, is subtracted first.
+`filter.heading_alignment` fits the same line once per fix; here running sums give the fits of all segments that end
+at the newest fix, of which the best is used.
+For the speed, noise falls with the length T of the segment. But a fit gives the speed T/2 ago, which has changed by
+about `usual_acceleration` T/2 since: the segment with the smallest sum of both is used.
+For the course, beside the noise of the fit, sigma includes the time-correlated part of the error of a fix, which
+changes by sigma sqrt(2 (1 - exp(-T / tau))) over the segment, and the turn, in which speed is not constant.
+
 Stationary: the gyro is quiet, and the fixes do not move.
 
 Gyro (`QuietDetector`): running mean and variance of the yaw rate without bias. The mean may be off zero by the
@@ -55,6 +69,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -450,7 +465,7 @@ class Heading(NamedTuple):
         return Heading(True, math.remainder(offset, math.tau), variance, self.bias, self.bias_variance)
 
 
-# --- stationary ------------------------------------------------------------------------------------------------
+# --- speed and course of recent fixes -----------------------------------------------------------------------
 
 
 class TrackFix(NamedTuple):
@@ -472,6 +487,117 @@ class TrackFix(NamedTuple):
     lever: complex
     yaw: float
     ecef: Vector3 = ZERO
+
+
+MAX_TRACK_FIXES: Final = 32
+"""Fixes stored: of a longer segment every second one is dropped."""
+
+
+class SpeedFit(NamedTuple):
+    """A fit of equation (3).
+
+    Attributes
+    ----------
+    velocity, sigma: c and the sigma of each of its components, m/s.
+    seconds, length, turned: duration of the segment, distance travelled (m) and angle turned (rad).
+    """
+
+    velocity: complex
+    sigma: float
+    seconds: float
+    length: float
+    turned: float
+
+
+def append_fix(fixes: tuple[TrackFix, ...], fix: TrackFix, window: float) -> tuple[TrackFix, ...]:
+    """Return a segment with one fix more, no longer than `window` seconds, and thinned if it has too many."""
+    oldest = fix.utime - int(window * 1e6)
+    segment = tuple(each for each in fixes if each.utime >= oldest)
+    return (*(segment[::2] if len(segment) >= MAX_TRACK_FIXES else segment), fix)
+
+
+def fit_speeds(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> Iterator[SpeedFit]:
+    """Yield the fits of the last 2, 3, ... fixes; `direction` is exp(ib), or 0 to leave the lever arm in."""
+    if len(fixes) < 2:
+        return
+    newest = fixes[-1]
+    n, su, sp, suu, sup, ss = 0, 0j, 0j, 0.0, 0j, 0.0
+    turned, yaw = 0.0, newest.yaw
+    last_position = newest.position - direction * newest.lever
+    for fix in reversed(fixes):
+        u = fix.path - newest.path
+        p = fix.position - direction * fix.lever - last_position
+        n += 1
+        su += u
+        sp += p
+        suu += u.real * u.real + u.imag * u.imag
+        sup += u.conjugate() * p
+        ss += fix.sigma
+        turned += abs(fix.yaw - yaw)
+        yaw = fix.yaw
+        spread = suu - (su.real * su.real + su.imag * su.imag) / n
+        if n < 2 or spread < 1e-6:
+            continue
+        velocity = (sup - su.conjugate() * sp / n) / spread
+        noise = settings.fix_noise_share * ss / n
+        seconds = (newest.utime - fix.utime) * 1e-6
+        yield SpeedFit(velocity, noise / math.sqrt(spread), seconds, abs(velocity) * abs(u), turned)
+
+
+def fit_best_speed(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
+    """Return the fit with the smallest error of the present speed; its sigma includes the change of speed since."""
+    best: SpeedFit | None = None
+    for fit in fit_speeds(fixes, direction, settings):
+        if fit.seconds > settings.speed_window:
+            break
+        sigma = math.hypot(fit.sigma, 0.5 * settings.usual_acceleration * fit.seconds)
+        if best is None or sigma < best.sigma:
+            best = fit._replace(sigma=sigma)
+    return best
+
+
+def fit_course(
+    fixes: Sequence[TrackFix], direction: complex | None, settings: RawSettings
+) -> tuple[float, float] | None:
+    """Return the heading offset b of the whole segment and its sigma, rad; None if it does not show one."""
+    fit = _fit_whole(fixes, direction or 0j, settings)
+    if direction is None:
+        # the lever arm turns with the heading to be found: two iterations converge
+        for _ in range(2):
+            if fit is None or abs(fit.velocity) < 1e-9:
+                return None
+            fit = _fit_whole(fixes, fit.velocity / abs(fit.velocity), settings)
+    if fit is None or fit.length < 1e-9:
+        return None
+    correlated = math.sqrt(max(1.0 - settings.fix_noise_share**2, 0.0)) * fixes[-1].sigma
+    changed = correlated * math.sqrt(-2.0 * math.expm1(-fit.seconds / settings.fix_correlation_time))
+    turn = settings.course_turn_share * fit.turned
+    return cmath.phase(fit.velocity), math.hypot(fit.sigma / abs(fit.velocity), changed / fit.length, turn)
+
+
+def _fit_whole(fixes: Sequence[TrackFix], direction: complex, settings: RawSettings) -> SpeedFit | None:
+    fit = None
+    for fit in fit_speeds(fixes, direction, settings):  # noqa: B007
+        pass
+    return fit
+
+
+def is_slow_by_fixes(fixes: Sequence[TrackFix], settings: RawSettings) -> bool:
+    """Return whether by its fixes the vehicle may be stationary.
+
+    The segment is the shortest that resolves a third of `stationary_speed`, or else all fixes if they resolve that.
+    """
+    found: SpeedFit | None = None
+    for fit in fit_speeds(fixes, 0j, settings):
+        # the path of a stationary vehicle is straight at 1 m/s, thus time: the fit is its velocity
+        if fit.seconds >= settings.stationary_time and fit.sigma <= settings.stationary_speed:
+            found = fit
+            if fit.sigma <= settings.stationary_speed / 3.0:
+                break
+    return found is not None and abs(found.velocity) <= 2.0 * settings.stationary_speed
+
+
+# --- stationary ------------------------------------------------------------------------------------------------
 
 
 MOVED_SIGMAS: Final = 4.0

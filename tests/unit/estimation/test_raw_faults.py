@@ -9,7 +9,7 @@ import pytest
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, angle_error, constant, final, stepwise
 
 from modelserver.estimation.raw.localizer import RawLocalizer
-from modelserver.messages import GpsSample, ImuSample, Invalid, Rejected, SensorHeader
+from modelserver.messages import GpsSample, ImuSample, Invalid, OrientationReference, Rejected, SensorHeader
 from modelserver.transforms.pose import Pose
 
 
@@ -148,3 +148,16 @@ def test_a_vehicle_on_its_side_is_invalid(roll, tilted):
         header = SensorHeader(START + n * 10_000, "imu")
         level, _ = level.process(ImuSample(header, (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665)))
     assert (Invalid.TILTED in level.estimate(level.utime).invalid) == tilted
+
+
+def test_an_orientation_with_the_wrong_reference_is_tilted():
+    # the right orientation of a level vehicle in ENU, stated as one in NED: upside down
+    q = MOUNTS.X_base_imu.wxyz
+    for reference in (OrientationReference.ENU, OrientationReference.NED):
+        localizer = RawLocalizer.start(MOUNTS, None, ORIGIN)
+        for n in range(10):
+            header = SensorHeader(START + n * 10_000, "imu")
+            sample = ImuSample(header, (0.0, 0.0, 0.0), orientation=q, orientation_reference=reference)
+            localizer, _ = localizer.process(sample)
+        tilted = Invalid.TILTED in localizer.estimate(localizer.utime).invalid
+        assert tilted == (reference is OrientationReference.NED)

@@ -20,7 +20,7 @@ from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_
 from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.origin import OriginCapture
 from modelserver.estimation.raw import localizer as output
-from modelserver.estimation.raw import localizer as track
+from modelserver.estimation.raw import motion as track
 from modelserver.estimation.raw.localizer import StampMonitor, compute_growth
 from modelserver.estimation.raw.motion import (
     CourseResult,
