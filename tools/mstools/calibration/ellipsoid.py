@@ -8,7 +8,7 @@ A ground vehicle turns about the vertical alone. Then the horizontal part of m m
 finds what maps it to a circle; the vertical, which such a turn does not determine, is left as it is. Limit: hard iron
 found so holds for level ground; on a slope, soft iron's share of the vertical field returns.
 
-The fit is robust: a center b and a symmetric positive definite matrix A, so that |A (p - b)| = 1 for the points p. First
+Found are a center b and a symmetric positive definite matrix A, so that |A (p - b)| = 1 for the points p. First
 an algebraic fit: the quadric p'Qp + 2 q'p + c = 0 with trace Q = dimension, which is linear in the unknowns and
 invariant to rotation of the axes; refitted a few times to the nearest points (least trimmed squares). Then Gauss-Newton
 on the lengths |A (p - b)| - 1 with Tukey's weights. Points are weighted so that each direction counts equally.
