@@ -1,23 +1,23 @@
-"""Emulator of a satellite receiver: sends logs and sentences of a series of samples.
+"""Emulators of satellite receivers (NovAtel OEM4, plain NMEA) and of gpsd: logs, sentences, reports of samples.
 
-It takes the commands of a NovAtel OEM4 that a driver needs (`log`, `unlog`, `unlogall`, and some without effect here),
-and answers and prompts as it does. With `is_answering` off and `saved` logs it is a plain NMEA receiver.
+The receiver takes the commands of a NovAtel OEM4 that a driver needs (`log`, `unlog`, `unlogall`, and some without
+effect here), and answers and prompts as it does. With `is_answering` off and `saved` logs it is a plain NMEA receiver.
+gpsd answers WATCH and sends TPV, GST and SKY reports.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.emulate.sample_emulator import SampleEmulator
-from msdrivers.endpoint import HostTime, Output, Send
-from msdrivers.protocol import gps_time
-from msdrivers.protocol.nmea import fields as nmea
-from msdrivers.protocol.novatel import (
+from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea
+from msdrivers.devices.gps.novatel import (
     Body,
     HeadingLog,
     LogHeader,
@@ -27,8 +27,11 @@ from msdrivers.protocol.novatel import (
     SolutionStatus,
     TimeStatus,
     Velocity,
+    encode,
 )
-from msdrivers.protocol.novatel.frames import encode
+from msdrivers.devices.gpsd import WATCH
+from msdrivers.emulate import SampleEmulator
+from msdrivers.endpoint import HostTime, Output, Send
 
 _FIXES = {
     FixType.NONE: (PositionType.NONE, "0", "N"),
@@ -40,6 +43,7 @@ _FIXES = {
     FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
 """Position type, quality in GGA, mode in RMC and VTG."""
+
 _WGS84 = 61
 
 
@@ -52,7 +56,7 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     """Encode a sample at `utime` as a log or sentence."""
     if name in NMEA:
         return NMEA[name](sample, utime)
-    week, microseconds = gps_time.gps_of(utime)
+    week, microseconds = gps_of(utime)
     status, binary = TimeStatus.FINESTEERING, name[-1] == "b"
     header = LogHeader(name[:-1].upper(), week, microseconds // 1000, status, port, 0, 0, binary)
     return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
@@ -129,7 +133,7 @@ NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
 
 
 def _format_clock(utime: int) -> str:
-    return nmea.format_time_of_day(utime % gps_time.DAY)
+    return nmea.format_time_of_day(utime % DAY)
 
 
 def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
@@ -147,7 +151,7 @@ def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
     status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
     motion = (nmea.format_number(speed / nmea.KNOT, 4), nmea.format_number(_track_from_course(course), 4))
-    date = datetime.fromtimestamp(utime // gps_time.SECOND, UTC).strftime("%d%m%y")
+    date = datetime.fromtimestamp(utime // SECOND, UTC).strftime("%d%m%y")
     fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
     return nmea.encode("GP", "RMC", fields)
 
@@ -176,7 +180,7 @@ def _format_hdt(sample: GpsSample, utime: int) -> bytes:
 
 
 def _format_zda(sample: GpsSample, utime: int) -> bytes:
-    day = datetime.fromtimestamp(utime // gps_time.SECOND, UTC)
+    day = datetime.fromtimestamp(utime // SECOND, UTC)
     return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
 
 
@@ -193,8 +197,11 @@ NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
 
 
 _PORT = "COM1"
+
 _PROMPT = f"[{_PORT}]".encode()
+
 _MAX_COMMAND_BYTES = 200
+
 _NO_EFFECT_COMMANDS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
 """Commands that are accepted and change nothing here."""
 
@@ -312,3 +319,70 @@ class GpsEmulator(SampleEmulator[GpsSample]):
             return "Invalid trigger"
         self._logs[fields[0]] = _LogRequest(round(period * 1e6))
         return ""
+
+
+RECEIVER = "/dev/ttyACM0"
+
+LATENCY = 0.03
+"""From the instant of a sample to its reports, seconds."""
+
+_STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
+
+
+class GpsdEmulator(SampleEmulator[GpsSample]):
+    """An `Endpoint` of bytes that speaks as gpsd does. `samples` are in the order of their stamps."""
+
+    def __init__(self, samples: Iterable[GpsSample], *, has_gst: bool = True) -> None:
+        super().__init__(samples, LATENCY)
+        self._has_gst = has_gst
+        self._line = b""
+        self._is_watched = False
+
+    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
+        self._now, self._line = now, b""
+        return [self._report(**{"class": "VERSION", "release": "3.25", "proto_major": 3, "proto_minor": 15})]
+
+    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        """Process commands."""
+        self._now = now
+        *lines, self._line = (self._line + unit).split(b"\n")
+        self._line = self._line[-200:]
+        out: list[Output[bytes]] = []
+        for line in lines:
+            if line.startswith(WATCH[:7]):
+                self._is_watched = True
+                device = {"class": "DEVICE", "path": RECEIVER, "driver": "u-blox"}
+                out.append(self._report(**{"class": "DEVICES", "devices": [device]}))
+                out.append(self._report(**{"class": "WATCH", "enable": True, "json": True}))
+        return out
+
+    def _send_sample(self, sample: GpsSample) -> list[Output[bytes]]:
+        return self._report_sample(sample) if self._is_watched else []
+
+    def _report(self, **fields: Any) -> Send[bytes]:
+        self.counts[fields["class"]] += 1
+        known = {key: value for key, value in fields.items() if not (isinstance(value, float) and math.isnan(value))}
+        return Send(json.dumps(known, separators=(",", ":")).encode() + b"\r\n")
+
+    def _report_sample(self, sample: GpsSample) -> list[Output[bytes]]:
+        when = datetime.fromtimestamp(sample.header.utime // 1000 / 1e3, UTC)
+        head = {"device": RECEIVER, "time": when.isoformat(timespec="milliseconds").replace("+00:00", "Z")}
+        out: list[Output[bytes]] = [
+            self._report(
+                **{"class": "SKY"}, **head, hdop=sample.hdop, vdop=sample.vdop, pdop=sample.pdop, uSat=sample.satellites
+            )
+        ]
+        if sample.fix_type is FixType.NONE:
+            return [*out, self._report(**{"class": "TPV"}, **head, mode=1)]
+        east, north, up = sample.velocity or (math.nan,) * 3
+        mode = 2 if sample.fix_type is FixType.FIX_2D else 3
+        status = {"status": _STATUS[sample.fix_type]} if sample.fix_type in _STATUS else {}
+        motion = {"velN": north, "velE": east, "velD": -up, "speed": math.hypot(east, north)}
+        track = {"track": math.degrees(math.atan2(east, north)) % 360.0 if east == east else math.nan}
+        heights = {"altHAE": sample.height_ellipsoidal, "altMSL": sample.height_msl, "geoidSep": sample.undulation}
+        place = {"lat": sample.latitude_deg, "lon": sample.longitude_deg}
+        out.append(self._report(**{"class": "TPV"}, **head, mode=mode, **status, **place, **heights, **motion, **track))
+        if self._has_gst and sample.position_covariance is not None:
+            longitude, latitude, height = (math.sqrt(each) for each in sample.position_covariance[::4])
+            out.append(self._report(**{"class": "GST"}, **head, lat=latitude, lon=longitude, alt=height))
+        return out

@@ -12,11 +12,11 @@ from typing import Any, Final
 from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseError, UBXReader, UBXTypeError
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.emulate.sample_emulator import SampleEmulator
+from msdrivers.devices.gps import gps_of
+from msdrivers.devices.stream import FrameScanner, ParsedFrame, RejectedFrame
+from msdrivers.devices.ublox import VALSET_VERSION, UbxFormat
+from msdrivers.emulate import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
-from msdrivers.protocol import gps_time
-from msdrivers.protocol.framing import FrameScanner, ParsedFrame, RejectedFrame
-from msdrivers.protocol.ublox import VALSET_VERSION, UbxFormat
 
 PORT: Final = "UART1"
 
@@ -158,7 +158,7 @@ def _encode(name: str, **values: Any) -> bytes:
 
 
 def _get_itow(sample: GpsSample) -> int:
-    return gps_time.gps_of(sample.header.utime)[1] // 1000
+    return gps_of(sample.header.utime)[1] // 1000
 
 
 def _zero(value: float) -> float:

@@ -14,9 +14,9 @@ from typing import Any
 
 import can
 
-from msdrivers.line_settings import MULTICAST, find_channel_problem, find_interface_problem, split_group
+from msdrivers.endpoint import CanFrame
 from msdrivers.links import LinkError
-from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.registry import MULTICAST, find_channel_problem, find_interface_problem, split_group
 
 MAX_FRAMES_PER_POLL = 64
 """Frames taken at a time at most."""

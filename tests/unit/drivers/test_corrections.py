@@ -16,12 +16,19 @@ from hypothesis import strategies as st
 from pyrtcm import RTCMMessage
 from support_gps import drive, split_randomly
 
-from msdrivers.corrections import MAX_WAITING, CorrectionsClient
+from msdrivers.corrections import (
+    MAX_WAITING,
+    CorrectionsClient,
+    NtripError,
+    NtripRequest,
+    NtripSession,
+    RtcmStream,
+    compute_crc,
+    make_gga,
+)
 from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
-from msdrivers.line_settings import NtripSettings
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.ntrip import NtripError, NtripRequest, NtripSession, make_gga
-from msdrivers.protocol.rtcm import RtcmStream, compute_crc
+from msdrivers.registry import NtripSettings
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
 

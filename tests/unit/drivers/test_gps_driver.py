@@ -9,14 +9,9 @@ import pytest
 from support_gps import SECOND, START, Line, add_noise, drive, now_at, split_in_half
 
 from modelserver.messages import FixType, SensorHeader
-from msdrivers.devices.gps.driver import GpsDriver, SetupDialogue, SetupProgress
-from msdrivers.devices.gps.fixes import sample_from_novatel
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.emulate.faults import FaultInjector, InjectedFault
-from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.protocol.nmea.fields import encode as nmea
-from msdrivers.protocol.novatel import (
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings, SetupDialogue, SetupProgress, sample_from_novatel
+from msdrivers.devices.gps.nmea import encode as nmea
+from msdrivers.devices.gps.novatel import (
     CommandResponse,
     HeadingLog,
     LogHeader,
@@ -24,8 +19,12 @@ from msdrivers.protocol.novatel import (
     Position,
     PositionType,
     TimeStatus,
+    crc32,
+    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32, encode
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.gps import GpsEmulator, GpsUnit
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
 
 NMEA_UNIT = GpsUnit(
     saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), is_answering=False

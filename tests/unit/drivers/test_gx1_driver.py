@@ -11,12 +11,12 @@ from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, ro
 
 from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.transforms import so3
-from msdrivers.devices.gx1.driver import Gx1Driver, TickRateCheck
-from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
+from msdrivers.devices import gx1 as requests
+from msdrivers.devices.gx1 import CommandByte, EepromAddress, Gains
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings, HeadingSource, TickRateCheck
+from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.imu import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, requests
 
 
 def imu_samples(line: Line) -> list[ImuSample]:

@@ -16,18 +16,14 @@ from support_gps import START, Line, add_noise, split_in_half, split_randomly
 
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
-from msdrivers.devices.stream_driver import StreamDriver
-from msdrivers.devices.vectornav import VectornavDriver, VectornavSettings
-from msdrivers.devices.xsens import SampleTimeUnwrapper, XsensDriver, XsensSettings
-from msdrivers.emulate.faults import FaultInjector, parse_fault
-from msdrivers.emulate.vectornav import VectornavEmulator, VectornavUnit
-from msdrivers.emulate.xsens import XsensEmulator, XsensUnit
+from msdrivers.devices import vectornav as vn
+from msdrivers.devices import xsens
+from msdrivers.devices.stream import StreamDriver, recognize
+from msdrivers.devices.vectornav import VectornavDriver, VectornavSettings, VnBinary, VnStream, VnText
+from msdrivers.devices.xsens import ItemId, MtData, SampleTimeUnwrapper, XbusStream, XsensDriver, XsensSettings
+from msdrivers.emulate import FaultInjector, parse_fault
+from msdrivers.emulate.imu import VectornavEmulator, VectornavUnit, XsensEmulator, XsensUnit
 from msdrivers.endpoint import Endpoint, EndpointPhase
-from msdrivers.protocol import vectornav as vn
-from msdrivers.protocol import xsens
-from msdrivers.protocol.recognition import recognize
-from msdrivers.protocol.vectornav import VnBinary, VnStream, VnText
-from msdrivers.protocol.xsens import ItemId, MtData, XbusStream
 
 
 def turn(seconds: float, rate_hz: float = 200.0) -> Iterator[ImuSample]:
@@ -302,7 +298,7 @@ def test_given_its_bytes_then_the_device_is_recognized(connect: Callable[..., Li
     found = recognize(bytes(received[-4096:]))
     assert found is not None
     assert isinstance(line.driver, StreamDriver)
-    assert found.devices == (line.driver.device,)
+    assert found.device == line.driver.device
 
 
 def test_given_an_endpoint_then_the_drivers_are_some() -> None:

@@ -12,14 +12,19 @@ from hypothesis import strategies as st
 from support_gps import START, Line, split_in_half, split_randomly
 
 from modelserver.errors import ConfigError
-from msdrivers.devices.text_imu import TextImuDriver, TextImuSettings
-from msdrivers.devices.text_joints import TextJointsDriver, TextJointsSettings
-from msdrivers.emulate.text_imu import TextImuEmulator
-from msdrivers.emulate.text_joints import TextJointsEmulator
+from msdrivers.devices.text import (
+    MAX_LINE,
+    ColumnMap,
+    LineReader,
+    TextImuDriver,
+    TextImuSettings,
+    TextJointsDriver,
+    TextJointsSettings,
+)
+from msdrivers.emulate.imu import TextImuEmulator
+from msdrivers.emulate.vehicle import TextJointsEmulator
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.factory import find_unknown_joint
-from msdrivers.protocol.text_lines import MAX_LINE, ColumnMap, LineReader
-from msdrivers.settings import read_driver
+from msdrivers.settings import find_unknown_joint, read_driver
 from tests.unit.drivers.test_imu_units import turn
 
 G, DEGREE = 9.80665, math.pi / 180.0

@@ -14,15 +14,13 @@ from pyubx2 import GET, UBXMessage
 from support_gps import SECOND, START, Line, add_noise, drive, split_in_half, split_randomly
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.devices.gps.driver import GpsDriver
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
-from msdrivers.emulate.faults import FaultInjector, parse_fault
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
+from msdrivers.devices.stream import compute_fletcher, recognize, recognize_line
+from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxStream
+from msdrivers.emulate import FaultInjector, parse_fault
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.emulate.ublox import ORDER, UbloxEmulator, UbloxUnit, encode_sample
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.protocol.recognition import recognize, recognize_line
-from msdrivers.protocol.ublox import UbxStream, compute_checksum
 
 GENERATION_9 = UbloxUnit()
 GENERATION_8 = UbloxUnit(18.0, "NEO-M8N", frozenset({"NAV-COV", "NAV-RELPOSNED", "RXM-RTCM"}))
@@ -97,7 +95,7 @@ def test_given_a_type_of_fix_then_it_is_published(fix_type: FixType) -> None:
 def test_given_a_time_that_the_receiver_is_not_sure_of_then_it_is_not_used() -> None:
     pvt = bytearray(encode_sample("NAV-PVT", ALL))
     pvt[6 + 11] &= ~0x04  # fullyResolved
-    pvt[-2:] = compute_checksum(bytes(pvt[2:-2]))
+    pvt[-2:] = compute_fletcher(bytes(pvt[2:-2]))
     line = Line(UbloxDriver(UbloxSettings("gps")), UbloxEmulator(()))
     line.open()
     line.deliver(bytes(pvt) + encode_sample("NAV-EOE", ALL))
@@ -216,7 +214,7 @@ def test_given_damaged_lengths_or_payloads_then_they_are_counted() -> None:
     stream = UbxStream()
     stream.feed(b"\xb5\x62\x01\x07\xff\xff" + bytes(20))
     short = b"\x01\x07\x04\x00\x00\x00\x00\x00"
-    stream.feed(b"\xb5\x62" + short + compute_checksum(short))
+    stream.feed(b"\xb5\x62" + short + compute_fletcher(short))
     assert stream.counts["rejected.ubx_length"] == 1
     frame = bytearray(encode_sample("NAV-PVT", ALL))
     frame[20] ^= 1

@@ -29,13 +29,11 @@ from modelserver.earth.geodesy import origin_at
 from modelserver.errors import ConfigError
 from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
-from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.wheels import WheelsEmulator
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
+from msdrivers.devices.can import SignalMap, parse_dbc
+from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, WheelsDriver, WheelsSettings
+from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.vehicle import WheelsEmulator
+from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
 
 BOTH = ("front_left", "front_right")
 

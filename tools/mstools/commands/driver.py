@@ -50,8 +50,7 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
-    from msdrivers.settings import SourceMap, read_drivers
+    from msdrivers.settings import SourceMap, find_shared_lines, find_unbuildable_drivers, read_drivers
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
     drivers = found.values()
@@ -63,7 +62,7 @@ def find_misnamed(
     vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
+    from msdrivers.settings import find_backward_counters, find_unknown_joint, find_unknown_wheels
 
     wheels = vehicle.sensors.wheels
     for driver in drivers:
@@ -243,9 +242,9 @@ def _make_link(
     stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
 ) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
-    from msdrivers.factory import make_codec, make_link
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
     from msdrivers.runner import SystemTimeSource
+    from msdrivers.settings import make_codec, make_link
 
     codec = make_codec(settings)
     if play is not None:
@@ -269,9 +268,8 @@ def run(
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.server.supervision.systemd import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
-    from msdrivers.factory import make_driver
-    from msdrivers.health import DriverPublisher
-    from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.settings import make_driver
 
     kind = settings.kind
     with start.wait_on_error():

@@ -1,4 +1,7 @@
-"""Driver of a satellite receiver: configures it, publishes its fixes, diagnoses errors.
+"""Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
+
+Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
+(`FixAssembler`); NMEA epochs are used only while the position log is missing. Missing values stay nan.
 
 A NovAtel receiver is configured by commands (`SetupDialogue`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
@@ -7,32 +10,434 @@ read.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any, TypeAlias
 
-from modelserver.messages import SensorHeader
-from msdrivers.devices.gps.fixes import FixAssembler, GpsFix
-from msdrivers.devices.gps.settings import GpsSettings
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from modelserver.messages.flags import NAN
+from modelserver.transforms.so3 import Vector3
+from msdrivers.devices.gps import (
+    DAY,
+    WEEK,
+    course_from_track,
+    is_in_leap_second,
+    resolve_rollover,
+    to_covariance,
+    utime_of,
+)
+from msdrivers.devices.gps.nmea import POSITION_KINDS, EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
+from msdrivers.devices.gps.novatel import (
+    AsciiFormat,
+    BinaryFormat,
+    CommandResponse,
+    HeadingLog,
+    LogHeader,
+    NovatelLog,
+    Position,
+    PositionType,
+    Prompt,
+    PromptFormat,
+    SolutionStatus,
+    TextFormat,
+    TimeStatus,
+    Velocity,
+)
+from msdrivers.devices.stream import FrameScanner, recognize
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
-from msdrivers.protocol.nmea.epochs import POSITION_KINDS
-from msdrivers.protocol.novatel import CommandResponse, NovatelLog, Prompt
-from msdrivers.protocol.recognition import recognize
+
+PROTOCOLS = ("novatel", "nmea")
+
+FORMATS = ("binary", "ascii")
+
+POSITION_LOGS = ("BESTPOS", "RTKPOS", "PSRPOS")
+
+HEADING_LOGS = ("", "HEADING", "HEADING2")
+
+
+@dataclass(frozen=True, slots=True)
+class GpsSettings:
+    """Settings of the receiver. Seconds; raises ValueError with the key for an invalid value.
+
+    protocol: "novatel" configures the receiver by commands; "nmea" only sends `commands` and reads.
+    rate_hz: of the logs that a NovAtel receiver is asked for, 0.1 to 20. log_format: "binary" or "ascii".
+    position_log: source of the position; NMEA positions are used only while it is missing.
+    heading_log: of a dual-antenna receiver, empty for none. device_port: the receiver's port, as its commands name it.
+    commands: lines sent before the logs are asked for, e.g. "fix none"; with "nmea" they are not acknowledged.
+    bauds: the rates to try; the line is opened at the first. Empty: the line has none, or one that is right.
+    silence: timeout for fixes, after which the setup is repeated.
+    answer_timeout: for the response to a command, which is sent `attempts` times.
+    hold: how long a position waits for the velocity of its instant. gap: pause of the line after which the sentences of
+    an instant are complete.
+    delay: shortest time from a fix to the first byte of its log, mostly the receiver's processing; it cannot be
+    distinguished from the offset of the clocks. delay_sigma: its standard deviation.
+    restore_on_exit: stop the logs that were asked for when the driver leaves.
+    """
+
+    source: str
+    protocol: str = "novatel"
+    rate_hz: float = 4.0
+    log_format: str = "binary"
+    position_log: str = "BESTPOS"
+    heading_log: str = ""
+    device_port: str = "thisport"
+    commands: tuple[str, ...] = ()
+    bauds: tuple[int, ...] = ()
+    silence: float = 2.0
+    answer_timeout: float = 1.0
+    attempts: int = 3
+    hold: float = 0.1
+    gap: float = 0.04
+    restore_on_exit: bool = True
+    delay: float = 0.0
+    delay_sigma: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("protocol", self.protocol, PROTOCOLS),
+            ("log_format", self.log_format, FORMATS),
+            ("position_log", self.position_log, POSITION_LOGS),
+            ("heading_log", self.heading_log, HEADING_LOGS),
+        ):
+            if value not in known:
+                raise ValueError(f"{name}: must be one of {', '.join(filter(None, known))}, got '{value}'")
+        if not 0.1 <= self.rate_hz <= 20.0:
+            raise ValueError(f"rate_hz: must be 0.1 to 20 Hz, got {self.rate_hz:g}")
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds: must be above 0, got {self.bauds}")
+        if self.attempts < 1:
+            raise ValueError(f"attempts: must be at least 1, got {self.attempts}")
+        for command in self.commands:
+            if not command.strip() or not command.isprintable() or not command.isascii():
+                raise ValueError(f"commands: {command!r} is no line of text")
+        for name, seconds, least in (
+            ("silence", self.silence, 0.1),
+            ("answer_timeout", self.answer_timeout, 0.05),
+            ("hold", self.hold, 0.0),
+            ("gap", self.gap, 0.001),
+            ("delay", self.delay, 0.0),
+            ("delay_sigma", self.delay_sigma, 0.0),
+        ):
+            if not least <= seconds <= 3600.0:
+                raise ValueError(f"{name}: must be {least:g} to 3600 s, got {seconds:g}")
+        if self.silence < 1.5 / self.rate_hz:
+            raise ValueError(
+                f"silence: {self.silence:g} s is less than one and a half periods at {self.rate_hz:g} Hz; make it "
+                f"{2.0 / self.rate_hz:g} s or more"
+            )
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        """The names of the logs that a NovAtel receiver is asked for."""
+        if self.protocol != "novatel":
+            return ()
+        return (self.position_log, "BESTVEL", *((self.heading_log,) if self.heading_log else ()))
+
+    def make_setup_commands(self) -> tuple[str, ...]:
+        """Return the commands that set the receiver up, in order."""
+        if self.protocol != "novatel":
+            return self.commands
+        wanted = (f"log {self.device_port} {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._list_log_names())
+        return (f"unlogall {self.device_port}", *self.commands, *wanted)
+
+    def make_undo_commands(self) -> tuple[str, ...]:
+        """Return the commands that stop the logs again."""
+        return tuple(f"unlog {self.device_port} {log}" for log in self._list_log_names())
+
+    def _list_log_names(self) -> tuple[str, ...]:
+        return tuple(log.lower() + ("b" if self.log_format == "binary" else "a") for log in self.logs)
+
+
+GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
+"""Each has `start`: offset of its first byte in the stream, to find its receive time."""
+
+
+class GpsStream(FrameScanner[Any]):
+    """Parses bytes to messages in the order of their completion. Never raises; memory is bounded.
+
+    The messages do not depend on how the bytes are split, except for calls of `flush`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__((SentenceFormat(), BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat()))
+        self._epochs = EpochAssembler()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames by kind, `rejected.<reason>`, `skipped` bytes."""
+        return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
+
+    def feed(self, data: bytes) -> list[GpsMessage]:
+        """Return what `data` completes."""
+        messages: list[GpsMessage] = []
+        for each in super().feed(data):
+            messages += self._epochs.add(each) if isinstance(each, NmeaSentence) else [each]
+        return messages
+
+    def flush(self) -> list[NmeaEpoch]:
+        """Return the pending epoch: the line has been silent long enough for it to be complete."""
+        return self._epochs.flush()
+
+    def clear(self) -> None:
+        """Discard what is incomplete after the line was closed; counters and offsets continue."""
+        super().clear()
+        self._epochs.clear()
+
+
+USABLE_TIME = frozenset(TimeStatus) - {
+    TimeStatus.UNKNOWN,
+    TimeStatus.APPROXIMATE,
+    TimeStatus.COARSEADJUSTING,
+    TimeStatus.SATTIME,
+}
+"""With the other statuses the header's time may be wrong by seconds or years."""
+
+FIX_TYPES: dict[int, FixType] = {
+    PositionType[name]: fix_type
+    for fix_type, names in {
+        FixType.FIX_2D: "FIXEDHEIGHT",
+        FixType.FIX_3D: "SINGLE INS_PSRSP",
+        FixType.DEAD_RECKONING: "PROPAGATED",
+        FixType.DIFFERENTIAL: "PSRDIFF WAAS OMNISTAR INS_SBAS INS_PSRDIFF OMNISTAR_HP OMNISTAR_XP CDGPS PPP_CONVERGING "
+        "PPP INS_PPP_CONVERGING INS_PPP PPP_BASIC_CONVERGING PPP_BASIC INS_PPP_BASIC_CONVERGING INS_PPP_BASIC",
+        FixType.RTK_FLOAT: "FLOATCONV L1_FLOAT IONOFREE_FLOAT NARROW_FLOAT INS_RTKFLOAT",
+        FixType.RTK_FIXED: "WIDELANE NARROWLANE L1_INT WIDE_INT NARROW_INT RTK_DIRECT_INS INS_RTKFIXED",
+    }.items()
+    for name in names.split()
+}
+"""The others are no satellite positions: none, entered by hand (FIXEDPOS), velocity only, or unknown."""
+
+
+def sample_from_nmea(header: SensorHeader, epoch: NmeaEpoch) -> GpsSample:
+    """Convert an NMEA epoch to a sample."""
+    return GpsSample(
+        header,
+        epoch.fix_type,
+        epoch.latitude,
+        epoch.longitude,
+        height_ellipsoidal=epoch.height_msl + epoch.undulation,
+        height_msl=epoch.height_msl,
+        undulation=epoch.undulation,
+        satellites=epoch.satellites,
+        hdop=epoch.hdop,
+        vdop=epoch.vdop,
+        pdop=epoch.pdop,
+        position_covariance=to_covariance(epoch.sigma_longitude, epoch.sigma_latitude, epoch.sigma_height),
+        speed=epoch.speed,
+        course=course_from_track(epoch.track),
+        baseline_yaw=course_from_track(epoch.heading),
+    )
+
+
+def sample_from_novatel(
+    header: SensorHeader, position: Position, velocity: Velocity | None = None, heading: HeadingLog | None = None
+) -> GpsSample:
+    """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
+    # without a solution the receiver sends zeros
+    empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
+    height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
+    velocity = velocity if velocity is not None and _is_solved(velocity) else None
+    heading = heading if heading is not None and _is_solved(heading) else None
+    return GpsSample(
+        header,
+        FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
+        NAN if empty else position.latitude,
+        NAN if empty else math.remainder(position.longitude, 360.0),
+        height_ellipsoidal=height + undulation,
+        height_msl=height,
+        undulation=undulation,
+        satellites=position.used,
+        position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
+        velocity=_to_enu(velocity) if velocity else None,
+        velocity_latency=max(0.0, velocity.latency - position.solution_age) if velocity else NAN,
+        speed=velocity.horizontal if velocity else NAN,
+        course=course_from_track(velocity.track) if velocity else NAN,
+        baseline_yaw=course_from_track(heading.heading) if heading else NAN,
+        baseline_yaw_sigma=math.radians(heading.sigma_heading) if heading and heading.sigma_heading > 0.0 else NAN,
+    )
+
+
+def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
+    return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
+
+
+def _to_enu(velocity: Velocity) -> Vector3:
+    track = math.radians(velocity.track)
+    return velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical
+
+
+WGS84_DATUM = 61
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
+    than that. origin: name of the log, or NMEA."""
+
+    host_utime: int
+    device_utime: int
+    origin: str
+    solution: NmeaEpoch | Position
+    velocity: Velocity | None = None
+    heading: HeadingLog | None = None
+    delay: float = 0.0
+
+    def to_sample(self, header: SensorHeader) -> GpsSample:
+        if isinstance(self.solution, NmeaEpoch):
+            return sample_from_nmea(header, self.solution)
+        return sample_from_novatel(header, self.solution, self.velocity, self.heading)
+
+
+class FixAssembler:
+    """Assembles logs and epochs to fixes, each instant once.
+
+    logs: the names of the position log and of what belongs to it; empty for NMEA only.
+    """
+
+    def __init__(self, logs: Sequence[str], hold_ns: int, silence_ns: int) -> None:
+        self._logs, self._hold_ns, self._silence_ns = tuple(logs), hold_ns, silence_ns
+        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
+        self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
+        self._last_log: tuple[int, int] | None = None
+        self._last_log_ns: int | None = None
+        self._last_epoch: tuple[int, int | None] | None = None
+        self._last_solution = -1
+        self._problems: list[str] = []
+        self._reported: set[str] = set()
+        self.counts: Counter[str] = Counter()
+        """`repeated`: duplicate instants. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
+        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
+        `unknown_type`: fixes published as none for their type."""
+
+    def clear(self) -> None:
+        """Discard pending data: the line was closed, or the receiver has restarted."""
+        self._parts.clear()
+        self._waiting = None
+        self._last_log_ns = None
+
+    def pop_problems(self) -> list[str]:
+        found, self._problems = self._problems, []
+        return found
+
+    def _add_problem(self, text: str) -> None:
+        if text not in self._reported:
+            self._reported.add(text)
+            self._problems.append(text)
+
+    def get_deadline(self) -> int | None:
+        """Return the release time of the pending position, monotonic nanoseconds."""
+        return self._waiting[2] if self._waiting else None
+
+    def on_timer(self, now: HostTime) -> list[GpsFix]:
+        """Release a position whose hold time has passed."""
+        return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
+
+    def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process an NMEA epoch whose first byte was received at `host_utime`."""
+        if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
+            self.counts["superseded"] += 1
+            return []
+        instant = (epoch.utime, epoch.time_of_day)
+        if epoch.time_of_day is not None and instant == self._last_epoch:
+            self.counts["repeated"] += 1
+            return []
+        self._last_epoch = instant
+        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), "NMEA", epoch)]
+
+    def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process a log whose first byte was received at `host_utime`."""
+        if log.header.name not in self._logs or log.body is None:
+            return []
+        if log.header.is_secondary:
+            self.counts["rejected.secondary_antenna"] += 1
+            self._add_problem(
+                f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
+            )
+            return []
+        instant = (log.header.week, log.header.milliseconds)
+        if not isinstance(log.body, Position):
+            assert isinstance(log.body, (Velocity, HeadingLog))
+            self._parts[log.header.name] = (instant, log.body)
+            return self._release_if_complete(instant)
+        solution = instant[0] * WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
+        if instant == self._last_log or (log.body.solution_age > 0.0 and solution == self._last_solution):
+            self.counts["repeated"] += 1
+            return []
+        self._last_solution = solution
+        if log.body.datum != WGS84_DATUM:
+            self.counts["rejected.datum"] += 1
+            self._add_problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
+            return []
+        if log.body.type not in PositionType.__members__.values():
+            self.counts["unknown_type"] += 1
+            self._add_problem(
+                "the receiver names a position type that is not known here: its fixes are published as none"
+            )
+        fixes = self._release()
+        self._last_log, self._last_log_ns = instant, now.monotonic_ns
+        device = get_log_utime(log.header, now.utime)
+        fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
+        self._waiting = (fix, instant, now.monotonic_ns + self._hold_ns)
+        return fixes + self._release_if_complete(instant)
+
+    def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
+        """Release the pending position if its velocity and heading are complete."""
+        if self._waiting is None or self._waiting[1] != instant:
+            return []
+        here = {name for name, (when, _) in self._parts.items() if when == instant}
+        return self._release() if here.issuperset(self._logs[1:]) else []
+
+    def _release(self) -> list[GpsFix]:
+        if self._waiting is None:
+            return []
+        fix, instant, _ = self._waiting
+        self._waiting = None
+        for when, part in self._parts.values():
+            if when == instant:
+                fix = replace(fix, velocity=part) if isinstance(part, Velocity) else replace(fix, heading=part)
+        return [fix]
+
+
+def get_log_utime(header: LogHeader, pivot: int) -> int:
+    """Return the utime of a log; 0 if the receiver's time is not usable or within a leap second."""
+    microseconds = header.milliseconds * 1000
+    if header.time_status not in USABLE_TIME or is_in_leap_second(header.week, microseconds, pivot):
+        return 0
+    return utime_of(header.week, microseconds, pivot)
+
+
+def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
+    if epoch.time_of_day is None or epoch.is_leap_second:
+        return 0
+    if epoch.utime:
+        return resolve_rollover(epoch.utime, pivot)
+    # without a date: the day that is nearest to the host's clock
+    days = round((pivot - epoch.time_of_day) / DAY)
+    return max(0, days * DAY + epoch.time_of_day)
+
 
 QUOTED_BYTES = 24
 """Quoted bytes of the beginning."""
+
 EXAMINED_BYTES = 4096
 """Bytes of the beginning by which another device is recognized."""
+
 MAX_NAMES = 6
+
 MIN_FLAWED_SENTENCES = 2
 """Fewer flawed sentences may be chance."""
+
 _ADDRESS = re.compile(rb"\$([A-Z]{2}[A-Z]{3}|P[A-Z]{3,5}),")
+
 _FLAWS = {
     "rejected.nmea_incomplete": "without checksum",
     "rejected.nmea_field": "with a right checksum and a field that cannot be",
 }
+
 _REMEDIES = {
     _FLAWS["rejected.nmea_incomplete"]: "switch its checksums on",
     _FLAWS["rejected.nmea_field"]: "compare its sentences with NMEA 0183, it writes them otherwise",
@@ -105,7 +510,7 @@ class LineMonitor:
             if kind.startswith("rejected.")
         )
         if (protocol := recognize(self._first_bytes)) is not None:
-            return f"{protocol.name}: write device: {protocol.devices[0]}"
+            return f"{protocol.name}: write device: {protocol.device}"
         broken = f" ({rejected} damaged ones)" if rejected else ""
         text = f"{self._bytes_received} bytes that are neither NovAtel logs nor NMEA sentences"
         return f"{text}{broken}, beginning {self._first_bytes[:QUOTED_BYTES]!r}"
@@ -209,8 +614,10 @@ class SetupDialogue:
 
 
 _SECOND_NS = 1_000_000_000
+
 _WARNING_INTERVAL_NS = 60 * _SECOND_NS
 """Rate limit of the warning that no receiver was found."""
+
 _MAX_ARRIVALS = 4096
 """Number of chunks whose receive times are stored: more than an epoch has bytes."""
 

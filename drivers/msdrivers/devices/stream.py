@@ -1,36 +1,287 @@
-"""Common part of the drivers of devices that are configured, and then stream: search, setup, silence, status.
+"""Devices that stream bytes: framing, recognition, and the common driver: search, setup, silence, status.
 
-The device is asked who it is; without an answer the next baud rate is tried. Then it gets its configuration step by
-step, each acknowledged. It is set up again when nothing has arrived for `silence`: a restarted device may have lost its
-configuration. One that streams without answering is used as it is.
+Framing: the scanner searches the next start byte and lets its format check the frame there: length, checksum, values.
+After a rejected frame the search continues one byte further, so that a valid frame that began inside a damaged one is
+found. The buffer is bounded: every format rejects a frame that would be longer than its limit.
+
+Recognition: which device speaks on a line, by frames with a valid checksum.
+
+Driver (`StreamDriver`): the device is asked who it is; without an answer the next baud rate is tried. Then it gets its
+configuration step by step, each acknowledged. It is set up again when nothing has arrived for `silence`: a restarted
+device may have lost its configuration. One that streams without answering is used as it is.
 """
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
+from binascii import crc_hqx
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Final, Generic, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import xor
+from typing import ClassVar, Final, Generic, NamedTuple, Protocol, TypeVar
 
 from modelserver.messages import Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices.ranges import check_ranges
+from msdrivers.devices import check_ranges
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.framing import FrameScanner
-from msdrivers.protocol.recognition import recognize_line
-from msdrivers.protocol.setup_step import SetupStep
+
+M = TypeVar("M")
+"""The decoded message of a device's protocol."""
+
+M_co = TypeVar("M_co", covariant=True)
+
+
+MAX_NAMES: Final = 64
+"""Largest number of names; further ones are counted as `other`."""
+
+MAX_NAME_LENGTH: Final = 48
+"""Longer names are truncated."""
+
+
+class BoundedCounter(Counter[str]):
+    """Counts by name; once `MAX_NAMES` are known, a new one is counted as `other` of its kind.
+
+    The kind is the part before the first dot: `novatel.id 4711B` becomes `novatel.other`.
+    """
+
+    def add(self, name: str) -> None:
+        """Count one more of `name`."""
+        name = name[:MAX_NAME_LENGTH]
+        if name not in self and len(self) >= MAX_NAMES:
+            # one `other` for each kind; kinds are this program's own words
+            name = f"{name.partition('.')[0]}.other"
+        self[name] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class ParsedFrame(Generic[M_co]):
+    """A valid frame: its end in the buffer, its kind for the counters, its message (None: valid but not used here)."""
+
+    end: int
+    kind: str
+    message: M_co | None
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedFrame:
+    """No valid frame starts here. An empty reason means chance: a byte that only looked like a start."""
+
+    reason: str
+
+
+NO_FRAME = RejectedFrame("")
+
+
+class FrameFormat(Protocol[M_co]):
+    """A frame format."""
+
+    @property
+    def start_bytes(self) -> bytes:
+        """First bytes of a frame; formats of one scanner share none."""
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[M_co] | RejectedFrame | None:
+        """Parse the frame at `at`, `start` bytes after the beginning of the stream; None: more bytes are needed."""
+
+
+class FrameScanner(Generic[M]):
+    """Finds the frames of several formats in a byte stream; `feed` never raises."""
+
+    def __init__(self, formats: Sequence[FrameFormat[M]]) -> None:
+        self._formats = {lead: each for each in formats for lead in each.start_bytes}
+        self._start_pattern = re.compile(b"[" + re.escape(bytes(self._formats)) + b"]")
+        self._buffer = bytearray()
+        self._offset = 0
+        self._skipped = 0
+        self._frames = BoundedCounter()
+        self._rejected: Counter[str] = Counter()
+
+    @property
+    def offset(self) -> int:
+        """Number of bytes fed so far."""
+        return self._offset + len(self._buffer)
+
+    @property
+    def pending_bytes(self) -> int:
+        """Number of buffered bytes of an incomplete frame."""
+        return len(self._buffer)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames by kind, `rejected.<reason>`, and `skipped`: bytes in no frame, ends of lines not counted."""
+        rejected = {f"rejected.{reason}": number for reason, number in self._rejected.items()}
+        return {**self._frames, **rejected, "skipped": self._skipped}
+
+    def reject(self, reason: str) -> None:
+        """Count a message that was rejected for its content."""
+        self._rejected[reason] += 1
+
+    def clear(self) -> None:
+        """Discard the incomplete frame after an interruption; counters and offsets continue."""
+        self._skip(0, len(self._buffer))
+        self._offset += len(self._buffer)
+        self._buffer.clear()
+
+    def feed(self, data: bytes) -> list[M]:
+        """Return the messages that `data` completes, in stream order."""
+        buffer = self._buffer
+        buffer += data
+        messages = []
+        at = 0
+        while found := self._start_pattern.search(buffer, at):
+            if found.start() > at:
+                self._skip(at, found.start())
+                at = found.start()
+            try:
+                verdict = self._formats[buffer[at]].scan(buffer, at, self._offset + at)
+            except Exception:
+                verdict = RejectedFrame("error")
+            if verdict is None:
+                break
+            if isinstance(verdict, RejectedFrame):
+                if verdict.reason:
+                    self._rejected[verdict.reason] += 1
+                self._skip(at, at + 1)
+                at += 1
+                continue
+            self._frames.add(verdict.kind)
+            if verdict.message is not None:
+                messages.append(verdict.message)
+            at = verdict.end
+        else:
+            self._skip(at, len(buffer))
+            at = len(buffer)
+        self._offset += at
+        del buffer[:at]
+        return messages
+
+    def _skip(self, begin: int, end: int) -> None:
+        part = self._buffer[begin:end]
+        self._skipped += len(part) - part.count(b"\r") - part.count(b"\n")
+
+
+MIN_FRAMES: Final = 2
+"""Fewer valid frames may be chance."""
+
+
+class KnownProtocol(NamedTuple):
+    """A protocol: its name, the kind of device that reads it, and a function that counts valid frames."""
+
+    name: str
+    device: str
+    count: Callable[[bytes], int]
+
+
+def compute_fletcher(data: bytes) -> bytes:
+    """Return Fletcher's checksum of 2 bytes, as UBX messages have it."""
+    a = b = 0
+    for byte in data:
+        a = (a + byte) & 0xFF
+        b = (b + a) & 0xFF
+    return bytes((a, b))
+
+
+def _count_ubx(data: bytes) -> int:
+    number = 0
+    for found in re.finditer(rb"\xb5\x62", data):
+        begin = found.end()
+        end = begin + 4 + int.from_bytes(data[begin + 2 : begin + 4], "little")
+        number += end + 2 <= len(data) and compute_fletcher(data[begin:end]) == data[end : end + 2]
+    return number
+
+
+def _count_xbus(data: bytes) -> int:
+    number = 0
+    for found in re.finditer(rb"\xfa[\xff\x01].", data, re.DOTALL):
+        size, begin = data[found.end() : found.end() + 1], found.end() + 1
+        if size == b"\xff":
+            size, begin = data[begin : begin + 2], begin + 2
+        end = begin + int.from_bytes(size, "big") + 1
+        number += end <= len(data) and sum(data[found.start() + 1 : end]) & 0xFF == 0
+    return number
+
+
+_SENTENCE: Final = re.compile(rb"\$([A-Z]{2,6}[^*\r\n]{0,200})\*([0-9A-Fa-f]{2})")
+
+_VECTORNAV: Final = re.compile(rb"\$VN[A-Z]{3},[^*\r\n]{0,200}\*[0-9A-Fa-f]{2}")
+
+_NOVATEL_ASCII: Final = re.compile(rb"#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
+
+
+def _count_nmea(data: bytes) -> int:
+    return sum(
+        reduce(xor, body, 0) == int(checksum, 16)
+        for body, checksum in _SENTENCE.findall(data)
+        if not body.startswith(b"VN")
+    )
+
+
+def _count_vectornav(data: bytes) -> int:
+    # binary output: FA, groups, then fields of a length that the groups give; CRC-16 over all after FA is 0
+    number, at = len(_VECTORNAV.findall(data)), 0
+    while (at := data.find(b"\xfa", at)) >= 0:
+        for size in range(8, min(200, len(data) - at)):
+            if size > 20 and data[at + size : at + size + 1] == b"\xfa" and crc_hqx(data[at + 1 : at + size], 0) == 0:
+                number += 1
+                at += size - 1
+                break
+        at += 1
+        if number >= MIN_FRAMES:
+            break
+    return number
+
+
+def _count_novatel(data: bytes) -> int:
+    return data.count(b"\xaa\x44\x12\x1c") + len(_NOVATEL_ASCII.findall(data))
+
+
+PROTOCOLS: Final = (
+    KnownProtocol("UBX messages of a u-blox receiver", "ublox", _count_ubx),
+    KnownProtocol("NovAtel logs", "novatel", _count_novatel),
+    KnownProtocol("Xbus messages of an Xsens unit", "xsens", _count_xbus),
+    KnownProtocol("messages of a VectorNav unit", "vectornav", _count_vectornav),
+    KnownProtocol("NMEA sentences", "nmea", _count_nmea),
+)
+
+
+def recognize(data: bytes) -> KnownProtocol | None:
+    """Return the protocol with the most valid frames; None if there is none beyond chance."""
+    best = max(PROTOCOLS, key=lambda each: each.count(data))
+    return best if best.count(data) >= MIN_FRAMES else None
+
+
+def recognize_line(data: bytes, device: str) -> str:
+    """Describe what a line carries for a driver of `device`, with what to write in the vehicle file."""
+    if not data:
+        return "received nothing: check power, cable and port"
+    found = recognize(data)
+    if found is None:
+        return f"received {len(data)} bytes that no driver knows, beginning {data[:24]!r}: check port and baud rate"
+    if device == found.device:
+        return f"received {found.name}"
+    return f"received {found.name}: write device: {found.device}"
+
+
+@dataclass(frozen=True, slots=True)
+class SetupStep:
+    """A configuration message, which the device acknowledges. `is_optional`: its rejection does not matter."""
+
+    frame: bytes
+    what: str
+    is_optional: bool = False
+
 
 EXAMINED_BYTES: Final = 4096
 """First bytes of a line by which another device is recognized."""
 
 SECOND_NS: Final = 1_000_000_000
+
 WARNING_INTERVAL_NS: Final = 60 * SECOND_NS
 """Rate limit of the warning that no device was found."""
 
 _MAX_ARRIVALS: Final = 4096
-
-M = TypeVar("M")
-"""The decoded message of a device's protocol."""
 
 
 class StreamSettings(Protocol):
