@@ -9,10 +9,9 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from importlib import import_module
 from ipaddress import ip_address
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
@@ -258,116 +257,37 @@ class DeviceKind:
     takes_corrections: bool = False
 
 
-def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
-    """Import the settings and the driver of a kind by their names below `msdrivers.devices`."""
-    kind, make = (resolve_name(f"msdrivers.devices.{name}") for name in (settings, driver))
-    return DeviceModules(kind, lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])))
+def _load(module: str, prefix: str, has_dbc: bool = False) -> Callable[[], DeviceModules]:
+    """Return a function that imports the settings and the driver of a kind, below `msdrivers.devices`."""
+
+    def load() -> DeviceModules:
+        device = import_module(f"msdrivers.devices.{module}")
+        make = getattr(device, f"{prefix}Driver")
+        return DeviceModules(
+            getattr(device, f"{prefix}Settings"),
+            lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])),
+        )
+
+    return load
 
 
-_load_gps = partial(_load, "gps.driver:GpsSettings", "gps.driver:GpsDriver")
+def _emulate(
+    module: str, make: Callable[[Any, EmulatorInputs], Endpoint[Any]], has_own_faults: bool = False
+) -> Callable[[EmulatorInputs], Endpoint[Any]]:
+    """Return a function that imports a module below `msdrivers.emulate` and makes the emulator of a kind.
 
-_load_ublox = partial(_load, "ublox:UbloxSettings", "ublox:UbloxDriver")
+    has_own_faults: the emulator applies the faults itself.
+    """
 
-_load_vectornav = partial(_load, "vectornav:VectornavSettings", "vectornav:VectornavDriver")
+    def make_emulator(inputs: EmulatorInputs) -> Endpoint[Any]:
+        emulators = import_module(f"msdrivers.emulate.{module}")
+        # one series for the device before and after a restart
+        inputs = inputs._replace(samples=iter(inputs.samples))
+        if has_own_faults:
+            return make(emulators, inputs)
+        return FaultInjector(lambda: make(emulators, inputs), inputs.faults)
 
-_load_xsens = partial(_load, "xsens:XsensSettings", "xsens:XsensDriver")
-
-_load_gpsd = partial(_load, "gpsd:GpsdSettings", "gpsd:GpsdDriver")
-
-_load_text_imu = partial(_load, "text:TextImuSettings", "text:TextImuDriver")
-
-_load_text_joints = partial(_load, "text:TextJointsSettings", "text:TextJointsDriver")
-
-_load_gx1 = partial(_load, "gx1.driver:Gx1Settings", "gx1.driver:Gx1Driver")
-
-_load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
-
-_load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
-
-_load_axis = partial(_load, "axis:AxisSettings", "axis:AxisDriver")
-
-
-def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-
-    unit = GpsUnit()
-    if wanted.settings.protocol == "nmea":
-        period = 1.0 / wanted.settings.rate_hz
-        saved = tuple(f"log com1 {sentence} ontime {period:g}" for sentence in ("gpgga", "gprmc", "gpgst"))
-        unit = GpsUnit(saved=saved, is_answering=False)
-    # one series for the receiver before and after a restart
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: GpsEmulator(samples, unit), wanted.faults)
-
-
-def _make_ublox_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.ublox import UbloxEmulator, UbloxUnit
-
-    unit = UbloxUnit()
-    # one series for the receiver before and after a restart
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: UbloxEmulator(samples, unit), wanted.faults)
-
-
-def _make_gpsd_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gps import GpsdEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: GpsdEmulator(samples), wanted.faults)
-
-
-def _make_text_imu_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.imu import TextImuEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: TextImuEmulator(samples, wanted.settings), wanted.faults)
-
-
-def _make_text_joints_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vehicle import TextJointsEmulator
-
-    return FaultInjector(lambda: TextJointsEmulator(wanted.settings), wanted.faults)
-
-
-def _make_vectornav_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.imu import VectornavEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: VectornavEmulator(samples), wanted.faults)
-
-
-def _make_xsens_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.imu import XsensEmulator, XsensUnit
-
-    unit = XsensUnit(field_strength=wanted.settings.field_strength or 5e-5)
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: XsensEmulator(samples, unit), wanted.faults)
-
-
-def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.imu import Gx1Emulator, Gx1Unit
-
-    return Gx1Emulator(wanted.samples, unit=Gx1Unit(faults=wanted.faults))
-
-
-def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vehicle import WheelsEmulator
-
-    database = _load_dbc(wanted.settings, wanted.folder)
-    return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, wanted.faults)
-
-
-def _make_vehicle_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vehicle import VehicleEmulator
-
-    settings, database = wanted.settings, _load_dbc(wanted.settings, wanted.folder)
-    return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=wanted.faults)
-
-
-def _make_axis_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vehicle import AxisEmulator
-
-    return AxisEmulator(wanted.settings.registers, faults=wanted.faults)
+    return make_emulator
 
 
 def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
@@ -400,8 +320,8 @@ _KINDS = (
         "u-blox receiver, by its protocol UBX",
         GpsSample,
         _BYTE_LINES,
-        _load_ublox,
-        _make_ublox_emulator,
+        _load("ublox", "Ublox"),
+        _emulate("gps", lambda emulators, inputs: emulators.UbloxEmulator(inputs.samples)),
         38400,
         takes_corrections=True,
     ),
@@ -411,8 +331,8 @@ _KINDS = (
             text,
             GpsSample,
             _BYTE_LINES,
-            _load_gps,
-            _make_gps_emulator,
+            _load("gps.driver", "Gps"),
+            _emulate("gps", lambda emulators, inputs: emulators.make_gps_emulator(inputs.settings, inputs.samples)),
             baud,
             presets={"protocol": name},
             takes_corrections=True,
@@ -422,14 +342,27 @@ _KINDS = (
             ("nmea", "receiver that speaks NMEA 0183", 4800),
         )
     ),
-    DeviceKind("gpsd", "gpsd, by its JSON reports", GpsSample, (TcpSettings,), _load_gpsd, _make_gpsd_emulator),
+    DeviceKind(
+        "gpsd",
+        "gpsd, by its JSON reports",
+        GpsSample,
+        (TcpSettings,),
+        _load("gpsd", "Gpsd"),
+        _emulate("gps", lambda emulators, inputs: emulators.GpsdEmulator(inputs.samples)),
+    ),
     DeviceKind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_gx1,
-        _make_gx1_emulator,
+        _load("gx1.driver", "Gx1"),
+        _emulate(
+            "imu",
+            lambda emulators, inputs: emulators.Gx1Emulator(
+                inputs.samples, unit=emulators.Gx1Unit(faults=inputs.faults)
+            ),
+            True,
+        ),
         38400,
         faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
         has_z_down=True,
@@ -439,8 +372,8 @@ _KINDS = (
         "VectorNav VN-100 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_vectornav,
-        _make_vectornav_emulator,
+        _load("vectornav", "Vectornav"),
+        _emulate("imu", lambda emulators, inputs: emulators.VectornavEmulator(inputs.samples)),
         115200,
         has_z_down=True,
     ),
@@ -449,8 +382,13 @@ _KINDS = (
         "Xsens MTi inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_xsens,
-        _make_xsens_emulator,
+        _load("xsens", "Xsens"),
+        _emulate(
+            "imu",
+            lambda emulators, inputs: emulators.XsensEmulator(
+                inputs.samples, field_strength=inputs.settings.field_strength or 5e-5
+            ),
+        ),
         115200,
     ),
     DeviceKind(
@@ -458,8 +396,8 @@ _KINDS = (
         "inertial unit that sends lines of text",
         ImuSample,
         _BYTE_LINES,
-        _load_text_imu,
-        _make_text_imu_emulator,
+        _load("text", "TextImu"),
+        _emulate("imu", lambda emulators, inputs: emulators.TextImuEmulator(inputs.samples, inputs.settings)),
         115200,
         example=(
             "columns: 7   # MEASURE: the columns of a line: time, force x y z, rate x y z",
@@ -478,8 +416,14 @@ _KINDS = (
         "wheels on a CAN bus, by a DBC file",
         WheelsSample,
         (CanSettings,),
-        _load_wheels,
-        _make_wheels_emulator,
+        _load("wheels", "Wheels", True),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.WheelsEmulator(
+                inputs.settings.wheels, _load_dbc(inputs.settings, inputs.folder), inputs.samples, inputs.faults
+            ),
+            True,
+        ),
         faults=_CAN_FAULTS,
     ),
     DeviceKind(
@@ -487,8 +431,18 @@ _KINDS = (
         "vehicle controller on a CAN bus, by a DBC file",
         VehicleStatusSample,
         (CanSettings,),
-        _load_vehicle,
-        _make_vehicle_emulator,
+        _load("vehicle", "Vehicle", True),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.VehicleEmulator(
+                _load_dbc(inputs.settings, inputs.folder),
+                inputs.settings.status,
+                inputs.settings.command,
+                samples=inputs.samples,
+                faults=inputs.faults,
+            ),
+            True,
+        ),
         command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
     ),
@@ -497,8 +451,8 @@ _KINDS = (
         "pan-tilt head or other joints that send lines of text",
         JointsSample,
         _BYTE_LINES,
-        _load_text_joints,
-        _make_text_joints_emulator,
+        _load("text", "TextJoints"),
+        _emulate("vehicle", lambda emulators, inputs: emulators.TextJointsEmulator(inputs.settings)),
         115200,
         follows_samples=False,
     ),
@@ -507,8 +461,12 @@ _KINDS = (
         "nodding axis behind Modbus/TCP",
         JointsSample,
         (ModbusSettings,),
-        _load_axis,
-        _make_axis_emulator,
+        _load("axis", "Axis"),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.AxisEmulator(inputs.settings.registers, faults=inputs.faults),
+            True,
+        ),
         follows_samples=False,
         faults={
             **FAULT_AMOUNTS,

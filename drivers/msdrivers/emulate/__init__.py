@@ -297,8 +297,12 @@ class SampleEmulator(ABC, Generic[S]):
         """What was sent and received, by kind."""
 
     @abstractmethod
-    def _send_sample(self, sample: S) -> Sequence[Output[bytes]]:
-        """Return what the device sends for a sample."""
+    def _encode(self, sample: S) -> bytes:
+        """Return what the device sends for a sample; empty for nothing."""
+
+    def _answer(self, unit: bytes) -> Iterable[bytes]:
+        """Yield the answers to received bytes."""
+        return ()
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """The host's end of the line is open; a device does not notice."""
@@ -307,14 +311,15 @@ class SampleEmulator(ABC, Generic[S]):
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         self._now = now
-        return []
+        return [Send(each) for each in self._answer(unit) if each]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Send the samples up to now."""
         self._now = now
         out: list[Output[bytes]] = []
         while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:
-            out += self._send_sample(self._next)
+            if data := self._encode(self._next):
+                out.append(Send(data))
             self._next = next(self._samples, None)
         return out
 

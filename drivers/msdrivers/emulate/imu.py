@@ -28,24 +28,17 @@ from msdrivers.emulate import FaultQueue, InjectedFault, SampleEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 
 
-@dataclass(frozen=True, slots=True)
-class VectornavUnit:
-    """A unit. baud: of its line, by which it rejects too much output. celsius: its temperature.
-
-    start_ns: its clock at its first sample.
-    """
-
-    baud: int = 115200
-    celsius: float = 31.5
-    start_ns: int = 5_000_000_000
-
-
 class VectornavEmulator(SampleEmulator[ImuSample]):
-    """An `Endpoint` of bytes that speaks as the unit does. `samples` are in the order of their stamps."""
+    """An `Endpoint` of bytes that speaks as a VN-100 does. `samples` are in the order of their stamps."""
 
-    def __init__(self, samples: Iterable[ImuSample], unit: VectornavUnit | None = None) -> None:
-        self._unit = VectornavUnit() if unit is None else unit
+    CELSIUS = 31.5
+    START_NS = 5_000_000_000
+    """Its clock at its first sample."""
+
+    def __init__(self, samples: Iterable[ImuSample], baud: int = 115200) -> None:
+        """`baud` is that of its line, by which it rejects too much output."""
         super().__init__(samples)
+        self._baud = baud
         self._first_utime: int | None = None
         self._stream = VnStream()
         self._text_hz = {1: 40, 2: 0}
@@ -53,24 +46,14 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
         self._divisor = 0
         self._sent_us: int | None = None
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process commands."""
-        self._now = now
-        out: list[Output[bytes]] = []
+    def _answer(self, unit: bytes) -> Iterator[bytes]:
         # a command ends with its line; a following byte completes it here
         for message in self._stream.feed(unit):
             if isinstance(message, VnText):
                 error = self._execute(message.words)
                 self.counts["rejected" if error else "accepted"] += 1
-                out.append(Send(vn.encode_text(f"ERR,{error:02X}" if error else self._answer(message.words))))
-        return out
-
-    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
-        data = self._encode(sample)
-        return [Send(data)] if data else []
-
-    def _answer(self, words: tuple[str, ...]) -> str:
-        return "RRG,01,VN-100T-CR" if words[0] == "RRG" else ",".join(words)
+                answer = "RRG,01,VN-100T-CR" if message.words[0] == "RRG" else ",".join(message.words)
+                yield vn.encode_text(f"ERR,{error:02X}" if error else answer)
 
     def _execute(self, words: tuple[str, ...]) -> int:
         """Apply a command; return the code of an error, 0 for none."""
@@ -86,7 +69,7 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
         if register == 6:
             port = rest[0] if rest else 1
             before, self._text_hz[port] = self._text_hz.get(port, 0), 40 if value else 0
-            if self._compute_load() > self._unit.baud:
+            if self._compute_load() > self._baud:
                 self._text_hz[port] = before
                 return 0x0C
             return 0
@@ -108,7 +91,7 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
             if mask >> bit & 1
         )
         self._divisor = rest[0] if port else 0
-        if self._compute_load() > self._unit.baud:
+        if self._compute_load() > self._baud:
             self._keys, self._divisor = before
             return 0x0C
         return 0
@@ -130,7 +113,7 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
             field, force, rate = sample.magnetic_field, sample.specific_force, sample.angular_velocity
             values = ((0.0,) * 3, [x / vn.GAUSS for x in field or (0.0,) * 3], force or (0.0,) * 3, rate or (0.0,) * 3)
             return vn.encode_text("YMR," + ",".join(f"{number:+.4f}" for each in values for number in each))
-        time_ns = self._unit.start_ns + (utime - self._first_utime) * 1000
+        time_ns = self.START_NS + (utime - self._first_utime) * 1000
         return vn.encode_binary({key: self._encode_field(key, sample, time_ns) for key in self._keys})
 
     def _encode_field(self, key: tuple[int, int], sample: ImuSample, time_ns: int) -> bytes:
@@ -147,7 +130,7 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
         elif key == vn.MAGNETIC and sample.magnetic_field is not None:
             numbers = [each / vn.GAUSS for each in sample.magnetic_field]
         elif key == vn.TEMPERATURE:
-            numbers = (self._unit.celsius,)
+            numbers = (self.CELSIUS,)
         size = FIELD_BYTES[key[0]][key[1]]
         return (
             bytes(size) if numbers is None else struct.pack(f"<{size // 4}f", *(_to_finite(each) for each in numbers))
@@ -158,44 +141,36 @@ def _to_finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class XsensUnit:
-    """A unit. has_orientation: whether it is more than an IMU. most_hz: its greatest rate. baud: of its line.
-
-    field_strength: the field that it reports as 1, tesla. ticks: its clock at its first sample. stored: outputs that it
-    has from an earlier configuration, with which it starts in measurement.
-    """
-
-    has_orientation: bool = True
-    most_hz: int = 400
-    baud: int = 921600
-    field_strength: float = 5e-5
-    ticks: int = 12_345
-    wrap: int = 1 << 32
-    celsius: float = 28.0
-    stored: tuple[tuple[int, int], ...] = ((ItemId.PACKET_COUNTER, 0xFFFF), (ItemId.QUATERNION, 100))
-
-
 class XsensEmulator(SampleEmulator[ImuSample]):
-    """An `Endpoint` of bytes that speaks as the unit does. `samples` are in the order of their stamps."""
+    """An `Endpoint` of bytes that speaks as an MTi does. `samples` are in the order of their stamps."""
 
-    def __init__(self, samples: Iterable[ImuSample], unit: XsensUnit | None = None) -> None:
-        self._unit = XsensUnit() if unit is None else unit
+    MAX_HZ = 400
+    CELSIUS = 28.0
+    FIRST_TICKS = 12_345
+    """Its clock at its first sample."""
+
+    def __init__(
+        self,
+        samples: Iterable[ImuSample],
+        baud: int = 921600,
+        has_orientation: bool = True,
+        field_strength: float = 5e-5,
+    ) -> None:
+        """`baud` is that of its line; has_orientation: it is more than an IMU; `field_strength` it reports as 1, tesla.
+
+        It starts in measurement, with the outputs of an earlier configuration.
+        """
         super().__init__(samples)
+        self._baud, self._has_orientation, self._field_strength = baud, has_orientation, field_strength
         self._stream = XbusStream()
-        self._outputs = dict(self._unit.stored)
+        self._outputs = {int(ItemId.PACKET_COUNTER): xsens.AS_SENT, int(ItemId.QUATERNION): 100}
         self._is_measuring = True
         self._counter = 0
         self._first_utime: int | None = None
         self._sent: dict[int, int] = {}
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        self._now = now
-        return [Send(each) for message in self._stream.feed(unit) if (each := self._execute(message))]
-
-    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
-        data = self._encode(sample)
-        return [Send(data)] if data else []
+    def _answer(self, unit: bytes) -> list[bytes]:
+        return [self._execute(message) for message in self._stream.feed(unit)]
 
     def _execute(self, message: XbusMessage) -> bytes:
         if message.id == MessageId.GO_TO_CONFIG:
@@ -219,13 +194,13 @@ class XsensEmulator(SampleEmulator[ImuSample]):
     def _find_error(self, pairs: Sequence[tuple[int, int]]) -> int:
         """Return the code of what is wrong with outputs and their rates, 0 for nothing."""
         for item, rate in pairs:
-            if item == ItemId.QUATERNION and not self._unit.has_orientation:
+            if item == ItemId.QUATERNION and not self._has_orientation:
                 return 0x21
-            if rate != xsens.AS_SENT and rate > self._unit.most_hz:
+            if rate != xsens.AS_SENT and rate > self.MAX_HZ:
                 return 0x21
         hertz = max((rate for _, rate in pairs if rate != xsens.AS_SENT), default=0)
         size = 5 + sum(3 + _SIZES.get(item, 4) for item, _ in pairs)
-        return 0x29 if size * 10 * hertz > self._unit.baud else 0
+        return 0x29 if size * 10 * hertz > self._baud else 0
 
     def _encode(self, sample: ImuSample) -> bytes:
         utime = sample.header.utime
@@ -240,7 +215,7 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         self._sent.update(dict.fromkeys(due, utime))
         self._counter = (self._counter + 1) & 0xFFFF
         self.counts["packets"] += 1
-        ticks = (self._unit.ticks + round((utime - self._first_utime) * 1e-6 / xsens.TICK)) % self._unit.wrap
+        ticks = (self.FIRST_TICKS + round((utime - self._first_utime) * 1e-6 / xsens.TICK)) % (1 << 32)
         items: list[tuple[int, bytes]] = []
         for item, rate in self._outputs.items():
             if rate == xsens.AS_SENT or item in due:
@@ -262,13 +237,13 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         if item == ItemId.STATUS_WORD:
             return (0x3).to_bytes(4, "big")
         if item == ItemId.TEMPERATURE:
-            numbers = (self._unit.celsius,)
+            numbers = (self.CELSIUS,)
         elif item == ItemId.ACCELERATION:
             numbers = sample.specific_force
         elif item == ItemId.RATE_OF_TURN:
             numbers = sample.angular_velocity
         elif item == ItemId.MAGNETIC_FIELD and sample.magnetic_field is not None:
-            numbers = [each / self._unit.field_strength for each in sample.magnetic_field]
+            numbers = [each / self._field_strength for each in sample.magnetic_field]
         elif item == ItemId.QUATERNION:
             numbers = sample.orientation
         return None if numbers is None else struct.pack(f">{len(numbers)}f", *numbers)
@@ -292,11 +267,8 @@ class TextImuEmulator(SampleEmulator[ImuSample]):
         self._settings = settings
         self._first_utime: int | None = None
 
-    def _send_sample(self, sample: ImuSample) -> list[Output[bytes]]:
-        self.counts["lines"] += 1
-        return [Send(self._encode(sample))]
-
     def _encode(self, sample: ImuSample) -> bytes:
+        self.counts["lines"] += 1
         self._first_utime = sample.header.utime if self._first_utime is None else self._first_utime
         values = {name: self._get_value(sample, name) for name in self._settings.fields}
         return encode_line(self._settings, values)
