@@ -6,6 +6,8 @@ found. The buffer is bounded: every format rejects a frame that would be longer 
 
 Recognition: which device speaks on a line, by frames with a valid checksum.
 
+Setup (`ScriptRunner`): a script of requests and pauses, repeated after timeouts.
+
 Driver (`StreamDriver`): the device is asked who it is; without an answer the next baud rate is tried. Then it gets its
 configuration step by step, each acknowledged. It is set up again when nothing has arrived for `silence`: a restarted
 device may have lost its configuration. One that streams without answering is used as it is.
@@ -17,11 +19,11 @@ import re
 from abc import ABC, abstractmethod
 from binascii import crc_hqx
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import xor
-from typing import ClassVar, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from modelserver.messages import Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
@@ -265,6 +267,142 @@ def recognize_line(data: bytes, device: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class RequestStep:
+    """Send a request and await its reply, `attempts` times for `timeout` seconds; then raise NoReplyError."""
+
+    frame: bytes
+    timeout: float = 0.5
+    attempts: int = 3
+
+    @property
+    def what(self) -> str:
+        return "the request"
+
+
+@dataclass(frozen=True, slots=True)
+class PauseStep:
+    """Wait; a reply that arrives meanwhile is not used."""
+
+    seconds: float
+
+
+Step: TypeAlias = RequestStep | PauseStep | Output[bytes]
+T = TypeVar("T")
+ScriptPart: TypeAlias = Generator[Step, Any, T]
+"""A part of a script that finds a value. A request returns its reply."""
+Script: TypeAlias = ScriptPart[None]
+
+
+class NoReplyError(Exception):
+    """A request was not answered."""
+
+
+class ScriptRunner:
+    """Executes the setup of a device, a script: a generator that yields steps and is sent the replies.
+
+    The script knows neither clock nor line. After a retry more than one reply may arrive: the runner waits for them
+    before it goes on, each as late as the first, so that none passes for the reply to the next request.
+    """
+
+    def __init__(self) -> None:
+        self.step: Step | None = None
+        self._script: Script | None = None
+        self._deadline_ns = self._attempt = 0
+        self._reply: Any = None
+
+    def _prepare(self, step: RequestStep | PauseStep) -> None:
+        """Get ready for a step that waits: it begins, or its request is sent again."""
+
+    @property
+    def is_running(self) -> bool:
+        return self._script is not None
+
+    @property
+    def is_requesting(self) -> bool:
+        return isinstance(self.step, RequestStep)
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When to call `on_timer`; None if no step waits for time."""
+        return self._deadline_ns if isinstance(self.step, RequestStep | PauseStep) else None
+
+    def start(self, script: Script, now: HostTime) -> list[Output[bytes]]:
+        self.stop()
+        self._script = script
+        return self._advance(partial(next, script), now)
+
+    def stop(self) -> None:
+        if self._script is not None:
+            self._script.close()
+        self._script = self.step = None
+
+    def reopen(self, now: HostTime) -> list[Output[bytes]] | None:
+        """Continue a script that has requested the reopening of the line; None if none has."""
+        return self._resume(None, now) if isinstance(self.step, Reopen) else None
+
+    def on_reply(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
+        """Complete the request under way."""
+        step = self.step
+        if not isinstance(step, RequestStep):
+            return []
+        if self._attempt == 1:
+            return self._resume(reply, now)
+        self._wait(PauseStep(self._attempt * step.timeout), now, reply)
+        return []
+
+    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
+        """Process a timeout."""
+        due, step = self.deadline_ns, self.step
+        if due is None or now.monotonic_ns < due:
+            return []
+        if not isinstance(step, RequestStep):
+            return self._resume(self._reply, now)
+        if self._attempt < step.attempts:
+            return [self._send_request(step, now)]
+        assert self._script is not None
+        error = NoReplyError(f"{step.what} was sent {step.attempts} times and not answered")
+        return self._advance(partial(self._script.throw, error), now)
+
+    def _resume(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
+        assert self._script is not None
+        return self._advance(partial(self._script.send, reply), now)
+
+    def _advance(self, resume: Callable[[], Step], now: HostTime) -> list[Output[bytes]]:
+        """Continue to the next step that waits; return the outputs until there."""
+        script, self.step = self._script, None
+        assert script is not None
+        outputs: list[Output[bytes]] = []
+        while True:
+            try:
+                step = resume()
+            except StopIteration:
+                self._script = None
+                return outputs
+            if isinstance(step, RequestStep):
+                self.step, self._attempt = step, 0
+                return [*outputs, self._send_request(step, now)]
+            if isinstance(step, PauseStep):
+                self._wait(step, now)
+                return outputs
+            outputs.append(step)
+            if isinstance(step, Reopen):
+                self.step = step
+                return outputs
+            resume = partial(next, script)
+
+    def _wait(self, step: PauseStep, now: HostTime, reply: Any = None) -> None:
+        self.step, self._reply = step, reply
+        self._deadline_ns = now.monotonic_ns + round(step.seconds * 1e9)
+        self._prepare(step)
+
+    def _send_request(self, step: RequestStep, now: HostTime) -> Send[bytes]:
+        self._attempt += 1
+        self._deadline_ns = now.monotonic_ns + round(step.timeout * 1e9)
+        self._prepare(step)
+        return Send(step.frame)
+
+
+@dataclass(frozen=True, slots=True)
 class SetupStep:
     """A configuration message, which the device acknowledges. `is_optional`: its rejection does not matter."""
 
@@ -327,30 +465,28 @@ def check_stream_settings(settings: StreamSettings) -> None:
 class StreamDriver(ABC, Generic[M]):
     """An `Endpoint` of bytes at the host's end of a device's line."""
 
-    device: ClassVar[str]
+    device: str
     """Name in the vehicle file."""
-    description: ClassVar[str]
+    description: str
     """What is looked for, e.g. "u-blox receiver"."""
-    awaited: ClassVar[str]
+    awaited: str
     """What it streams, e.g. "NAV-PVT"."""
 
     def __init__(self, settings: StreamSettings, stream: FrameScanner[M]) -> None:
         self._settings, self._stream = settings, stream
         self.max_silence = settings.silence
-        self._bauds = settings.bauds
         self._phase, self._reported = EndpointPhase.WAITING, ""
+        self._setup = ScriptRunner()
         self._product = ""
-        self._steps: tuple[SetupStep, ...] = ()
-        self._index = self._attempt = 0
-        self._is_identifying = False
-        self._answer_deadline_ns: int | None = None
+        self._setup_step: SetupStep | None = None
+        self._now = HostTime(0, 0)
         self._silence_deadline_ns = 0
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
         self._first_bytes = b""
         self._baud_index = 0
         self._tried: list[str] = []
         self._next_warning_ns = 0
-        self._seq = self._seq_at_setup = 0
+        self._seq = 0
         self._counts: Counter[str] = Counter()
 
     # --- what a device defines ---
@@ -374,6 +510,17 @@ class StreamDriver(ABC, Generic[M]):
         """Do what the device's own deadline is for."""
         return []
 
+    def _describe_wait(self) -> str:
+        return f"waiting for an answer: {self.description}"
+
+    def _describe_input(self) -> str:
+        """Describe what was received since the last search, with what to do."""
+        return recognize_line(self._first_bytes, self.device)
+
+    def _explain_absence(self) -> str:
+        """Explain that no device was found, by what was tried."""
+        return f"no {self.description} answers on this line: {'; '.join(self._tried)}"
+
     # --- endpoint ---
 
     @property
@@ -383,18 +530,19 @@ class StreamDriver(ABC, Generic[M]):
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Discard incomplete data and ask the device who it is."""
+        self._now = now
         self._stream.clear()
         self._arrivals.clear()
         self._on_start()
-        # no new status within a search over the baud rates
-        searching = self._tried or self._phase is EndpointPhase.SILENT
-        status = (
-            [] if searching else self._set_status(EndpointPhase.WAITING, f"waiting for an answer: {self.description}")
-        )
-        return [*status, *self._identify(now)]
+        if (out := self._setup.reopen(now)) is not None:
+            return out
+        is_silent = self._phase is EndpointPhase.SILENT
+        status = [] if is_silent else self._set_status(EndpointPhase.WAITING, self._describe_wait())
+        return [*status, *self._setup.start(self._run_setup(), now)]
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process received bytes."""
+        self._now = now
         self._arrivals.append((self._stream.offset, now.utime))
         if len(self._first_bytes) < EXAMINED_BYTES:
             self._first_bytes += unit[: EXAMINED_BYTES - len(self._first_bytes)]
@@ -402,22 +550,19 @@ class StreamDriver(ABC, Generic[M]):
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Do what is due."""
+        self._now = now
         out: list[Output[bytes]] = []
         extra = self._get_extra_deadline()
         if extra is not None and now.monotonic_ns >= extra:
             out += self._on_extra_timer(now)
-        if self._answer_deadline_ns is not None:
-            return [*out, *(self._on_unanswered(now) if now.monotonic_ns >= self._answer_deadline_ns else [])]
-        if now.monotonic_ns >= self._silence_deadline_ns:
-            text = f"no {self.awaited} for {self._settings.silence:g} s, setting the device up again"
-            out += [*self._set_status(EndpointPhase.SILENT, text), *self._identify(now)]
-        return out
+        if self._setup.is_running:
+            return [*out, *self._setup.on_timer(now)]
+        return [*out, *(self._on_silence(now) if now.monotonic_ns >= self._silence_deadline_ns else [])]
 
     def get_deadline(self) -> int | None:
         """Return when to call `on_timer`, monotonic nanoseconds."""
-        answer, extra = self._answer_deadline_ns, self._get_extra_deadline()
-        deadline = self._silence_deadline_ns if answer is None else answer
-        return deadline if extra is None else min(deadline, extra)
+        deadline = self._setup.deadline_ns if self._setup.is_running else self._silence_deadline_ns
+        return min((each for each in (deadline, self._get_extra_deadline()) if each is not None), default=None)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
         return []
@@ -426,42 +571,29 @@ class StreamDriver(ABC, Generic[M]):
 
     def _on_identity(self, product: str, steps: Sequence[SetupStep], now: HostTime) -> list[Output[bytes]]:
         """Begin the setup of a device that has answered."""
-        if not self._is_identifying:
-            return []
-        self._is_identifying, self._tried = False, []
-        self._product, self._steps, self._index, self._attempt = product, tuple(steps), 0, 0
-        words = f"{product} answers, setting it up"
-        return [*self._set_status(EndpointPhase.CONFIGURING, words), *self._send_step(now)]
+        return [] if self._setup_step else self._setup.on_reply((product, steps), now)
 
     @property
     def _step(self) -> SetupStep | None:
-        is_waiting = not self._is_identifying and self._answer_deadline_ns is not None
-        return self._steps[self._index] if is_waiting and self._index < len(self._steps) else None
+        """The step whose acknowledgement is awaited."""
+        return self._setup_step if self._setup.is_requesting else None
 
     def _on_acknowledgement(self, now: HostTime, error: str = "") -> list[Output[bytes]]:
         """Go on to the next step; `error`: why the device rejected this one."""
-        step = self._step
-        if step is None:
-            return []
-        out: list[Output[bytes]] = []
-        if error and step.is_optional:
-            self._counts["optional_rejected"] += 1
-        elif error:
-            text = f"the device rejected {step.what}: {error}"
-            out += self._set_status(EndpointPhase.CONFIGURING, text, is_warning=True)
-        self._index, self._attempt = self._index + 1, 0
-        return [*out, *self._send_step(now)]
+        return self._setup.on_reply(error, now) if self._step else []
 
     def _make_header(self, host_utime: int, device_utime: int) -> SensorHeader:
         self._seq += 1
         return SensorHeader(0, self._settings.source, self._seq - 1, host_utime, device_utime)
 
-    def _publish(self, sample: Sample, now: HostTime, tick: float = 1e-6) -> list[Output[bytes]]:
+    def _publish(self, sample: Sample, now: HostTime, tick: float = 1e-6, delay: float = 0.0) -> list[Output[bytes]]:
+        """Publish a sample; `delay`: seconds by which it is older than the settings state."""
         self._counts["samples"] += 1
         self._tried = []
-        self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * SECOND_NS)
-        out: list[Output[bytes]] = [MeasuredSample(sample, self._settings.delay, self._settings.delay_sigma, tick)]
-        if self._answer_deadline_ns is None and self._phase is not EndpointPhase.STREAMING:
+        self._restart_silence_timer()
+        delay += self._settings.delay
+        out: list[Output[bytes]] = [MeasuredSample(sample, delay, self._settings.delay_sigma, tick)]
+        if not self._setup.is_running and self._phase is not EndpointPhase.STREAMING:
             out += self._set_status(EndpointPhase.STREAMING, f"{self._product or 'a device'}, receiving {self.awaited}")
         return out
 
@@ -487,56 +619,60 @@ class StreamDriver(ABC, Generic[M]):
 
     # --- setup ---
 
-    def _identify(self, now: HostTime) -> list[Output[bytes]]:
-        self._is_identifying, self._steps, self._index, self._attempt = True, (), 0, 1
-        self._seq_at_setup, self._first_bytes = self._seq, b""
-        self._answer_deadline_ns = now.monotonic_ns + round(self._settings.answer_timeout * SECOND_NS)
-        return [Send(self._make_identification())]
-
-    def _send_step(self, now: HostTime) -> list[Output[bytes]]:
-        """Send the next step; after the last one samples must come."""
-        if self._index == len(self._steps):
-            self._wait_for_samples(now)
+    def _run_setup(self) -> Script:
+        """Find the device and configure it; then samples must come."""
+        while True:
+            self._setup_step, self._first_bytes, seq = None, b"", self._seq
+            try:
+                self._product, steps = yield self._make_request(self._make_identification())
+                break
+            except NoReplyError:
+                if self._seq > seq:
+                    use = "a device that does not answer commands is used as it is; can the line send to it?"
+                    text = f"it sends {self.awaited} but answers nothing: {use}"
+                    yield from self._set_status(EndpointPhase.STREAMING, text)
+                    self._restart_silence_timer()
+                    return
+                yield from self._try_next_baud()
+        self._tried = []
+        yield from self._set_status(EndpointPhase.CONFIGURING, f"{self._product} answers, setting it up")
+        for step in steps:
+            self._setup_step = step
+            try:
+                error = yield self._make_request(step.frame)
+            except NoReplyError:
+                self._counts["unanswered"] += 1
+                error = "" if step.is_optional else "no answer"
+            if error and step.is_optional:
+                self._counts["optional_rejected"] += 1
+            elif error:
+                text = f"the device rejected {step.what}: {error}"
+                yield from self._set_status(EndpointPhase.CONFIGURING, text, is_warning=True)
+        if self._phase is not EndpointPhase.STREAMING:
             text = f"{self._product} is set up, waiting for {self.awaited}"
-            return [] if self._phase is EndpointPhase.STREAMING else self._set_status(EndpointPhase.CONFIGURING, text)
-        self._attempt += 1
-        self._answer_deadline_ns = now.monotonic_ns + round(self._settings.answer_timeout * SECOND_NS)
-        return [Send(self._steps[self._index].frame)]
+            yield from self._set_status(EndpointPhase.CONFIGURING, text)
+        self._restart_silence_timer()
 
-    def _wait_for_samples(self, now: HostTime) -> None:
-        self._answer_deadline_ns, self._is_identifying = None, False
-        self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * SECOND_NS)
+    def _make_request(self, frame: bytes) -> RequestStep:
+        return RequestStep(frame, self._settings.answer_timeout, self._settings.attempts)
 
-    def _on_unanswered(self, now: HostTime) -> list[Output[bytes]]:
-        """Repeat a message without an answer; after the last attempt use what arrives, else try the next baud rate."""
-        if self._attempt < self._settings.attempts:
-            if not self._is_identifying:
-                return self._send_step(now)
-            self._attempt += 1
-            self._answer_deadline_ns = now.monotonic_ns + round(self._settings.answer_timeout * SECOND_NS)
-            return [Send(self._make_identification())]
-        if not self._is_identifying:
-            self._counts["unanswered"] += 1
-            return self._on_acknowledgement(now, "" if self._steps[self._index].is_optional else "no answer")
-        self._wait_for_samples(now)
-        if self._seq > self._seq_at_setup:
-            text = f"it sends {self.awaited} but answers nothing: using what it sends; can the line send to it?"
-            return self._set_status(EndpointPhase.STREAMING, text)
-        return self._try_next_baud(now)
+    def _restart_silence_timer(self) -> None:
+        self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)
 
-    def _try_next_baud(self, now: HostTime) -> list[Output[bytes]]:
-        found = recognize_line(self._first_bytes, self.device)
-        baud = self._bauds[self._baud_index] if self._bauds else None
+    def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
+        text = f"no {self.awaited} for {self._settings.silence:g} s, setting the device up again"
+        return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
+
+    def _try_next_baud(self) -> Script:
+        bauds, found = self._settings.bauds, self._describe_input()
+        baud = bauds[self._baud_index] if bauds else None
         self._tried.append(f"at {baud} baud {found}" if baud else found)
-        out: list[Output[bytes]] = []
-        if len(self._tried) >= max(1, len(self._bauds)):
+        if len(self._tried) >= max(1, len(bauds)):
             # the text differs with the noise: rate limit
-            if self._phase is not EndpointPhase.SILENT or now.monotonic_ns >= self._next_warning_ns:
-                self._next_warning_ns = now.monotonic_ns + WARNING_INTERVAL_NS
-                text = f"no {self.description} answers on this line: {'; '.join(self._tried)}"
-                out += self._set_status(EndpointPhase.SILENT, text)
+            if self._phase is not EndpointPhase.SILENT or self._now.monotonic_ns >= self._next_warning_ns:
+                self._next_warning_ns = self._now.monotonic_ns + WARNING_INTERVAL_NS
+                yield from self._set_status(EndpointPhase.SILENT, self._explain_absence())
             self._tried = []
-        if len(self._bauds) < 2:
-            return [*out, *self._identify(now)]
-        self._baud_index = (self._baud_index + 1) % len(self._bauds)
-        return [*out, Reopen(f"no {self.description} at {baud} baud, {found}", self._bauds[self._baud_index])]
+        if len(bauds) > 1:
+            self._baud_index = (self._baud_index + 1) % len(bauds)
+            yield Reopen(f"no {self.description} at {baud} baud, {found}", bauds[self._baud_index])

@@ -3,7 +3,7 @@
 Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
 (`FixAssembler`); NMEA epochs are used only while the position log is missing. Missing values stay nan.
 
-A NovAtel receiver is configured by commands (`SetupDialogue`); without an answer the next baud rate is tried. Without
+A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
 read.
 """
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Any, TypeAlias
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
@@ -47,8 +46,8 @@ from msdrivers.devices.gps.novatel import (
     TimeStatus,
     Velocity,
 )
-from msdrivers.devices.stream import FrameScanner, recognize
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
+from msdrivers.devices.stream import EXAMINED_BYTES, SECOND_NS, FrameScanner, Script, SetupStep, StreamDriver, recognize
+from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 PROTOCOLS = ("novatel", "nmea")
 
@@ -423,8 +422,6 @@ def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
 QUOTED_BYTES = 24
 """Quoted bytes of the beginning."""
 
-EXAMINED_BYTES = 4096
-"""Bytes of the beginning by which another device is recognized."""
 
 MAX_NAMES = 6
 
@@ -516,228 +513,76 @@ class LineMonitor:
         return f"{text}{broken}, beginning {self._first_bytes[:QUOTED_BYTES]!r}"
 
 
-def explain_missing_receiver(wanted: str, attempts: Sequence[tuple[int | None, str]]) -> str:
-    """Explain that no receiver was found: attempts, received data, remedy."""
-    tried = "; ".join(f"{f'at {baud} baud ' if baud else ''}received {what}" for baud, what in attempts)
-    if all(what == "nothing" for _, what in attempts):
-        advice = "check the receiver's power, the cable, and that the port is the right one"
-    elif any("write device: " in what for _, what in attempts):
-        advice = "another device is on this port"
-    elif all("bytes that are neither" in what or what == "nothing" for _, what in attempts):
-        advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
-    else:
-        advice = (
-            "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
-            "(else set protocol: nmea), and `device_port`"
-        )
-    return f"no {wanted} on this line: {tried}; {advice}"
+class GpsDriver(StreamDriver[GpsMessage]):
+    """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`.
 
-
-class SetupProgress(Enum):
-    """State of the dialogue."""
-
-    IDLE = "idle"
-    RUNNING = "asking"
-    DONE = "done"
-    TIMED_OUT = "unanswered"
-
-
-class SetupDialogue:
-    """Sends commands and awaits their responses, one at a time. Times are monotonic nanoseconds.
-
-    After a retry more than one response may arrive. Before the next command the dialogue waits for them, so that none
-    is taken for the response to that command.
+    Further counts: what was left out and why, `restarts`.
     """
 
-    def __init__(self, commands: Sequence[str], answer_ns: int, attempts: int) -> None:
-        self._commands, self._timeout_ns, self._attempts = tuple(commands), answer_ns, attempts
-        self._index = self._attempt = 0
-        self._is_settling = False
-        """A command was sent more than once; further responses may arrive."""
-        self.deadline_ns: int | None = None
-        self._last_answer_ns: int | None = None
-        self.progress = SetupProgress.IDLE
-        self.rejected: list[tuple[str, str]] = []
-        """Rejected commands and the receiver's error texts."""
-
-    def start(self, now_ns: int) -> bytes:
-        """Start from the first command; return the bytes to send, with an end of line first to flush partial input."""
-        self._index = self._attempt = 0
-        self._is_settling = False
-        self.rejected = []
-        self._last_answer_ns = None
-        return b"\r\n" + self._send_command(now_ns)
-
-    def stop(self) -> None:
-        self.progress, self.deadline_ns = SetupProgress.IDLE, None
-
-    def on_response(self, answer: CommandResponse, now_ns: int) -> bytes:
-        """Process a response; return the next bytes to send, or none."""
-        self._last_answer_ns = now_ns
-        if self.progress is not SetupProgress.RUNNING or self._is_settling:
-            return b""
-        if not answer.is_ok:
-            self.rejected.append((self._commands[self._index], answer.error))
-        self._index += 1
-        tries, self._attempt = self._attempt, 0
-        if self._index == len(self._commands):
-            self.progress, self.deadline_ns = SetupProgress.DONE, None
-            return b""
-        if tries > 1:
-            # each as late as this one; they would pass for answers to the next command
-            self._is_settling = True
-            self.deadline_ns = now_ns + tries * self._timeout_ns
-            return b""
-        return self._send_command(now_ns)
-
-    def on_timer(self, now_ns: int) -> bytes:
-        """Repeat the command after a timeout; stop after the last attempt."""
-        if self.deadline_ns is None or now_ns < self.deadline_ns:
-            return b""
-        self._is_settling = False
-        if self._attempt >= self._attempts:
-            self.progress, self.deadline_ns = SetupProgress.TIMED_OUT, None
-            return b""
-        return self._send_command(now_ns)
-
-    def expects_prompt(self, now_ns: int) -> bool:
-        """Return whether a prompt belongs to a response, and is not that of a restarted receiver."""
-        return self.progress is SetupProgress.RUNNING or (
-            self._last_answer_ns is not None and now_ns - self._last_answer_ns < self._timeout_ns
-        )
-
-    def _send_command(self, now_ns: int) -> bytes:
-        self.progress = SetupProgress.RUNNING
-        self._attempt += 1
-        self.deadline_ns = now_ns + self._timeout_ns
-        return self._commands[self._index].encode("ascii") + b"\r\n"
-
-
-_SECOND_NS = 1_000_000_000
-
-_WARNING_INTERVAL_NS = 60 * _SECOND_NS
-"""Rate limit of the warning that no receiver was found."""
-
-_MAX_ARRIVALS = 4096
-"""Number of chunks whose receive times are stored: more than an epoch has bytes."""
-
-
-class GpsDriver:
-    """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`."""
+    _settings: GpsSettings
+    _stream: GpsStream
 
     def __init__(self, settings: GpsSettings) -> None:
-        self._settings = settings
-        self.max_silence = settings.silence
-        self._novatel = settings.protocol == "novatel"
-        self._stream = GpsStream()
-        self._fixes = FixAssembler(settings.logs, round(settings.hold * _SECOND_NS), self._silence_ns)
-        self._setup = SetupDialogue(
-            settings.make_setup_commands(), round(settings.answer_timeout * _SECOND_NS), settings.attempts
-        )
+        super().__init__(settings, GpsStream())
+        self._is_novatel = settings.protocol == "novatel"
+        self.device = settings.protocol
+        self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
+        self.awaited = settings.position_log
+        self._fixes = FixAssembler(settings.logs, round(settings.hold * SECOND_NS), round(settings.silence * SECOND_NS))
         self._monitor = LineMonitor()
-        self._attempts: list[tuple[int | None, str]] = []
-        self._baud_index = 0
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
-        self._phase = EndpointPhase.WAITING
-        self._reported = ""
-        self._origin = ""
-        self._sequence = 0
         self._last_byte_ns: int | None = None
-        self._timeout_ns = 0
-        self._samples_before = 0
-        self._next_warning_ns = 0
-        self._counts: Counter[str] = Counter()
+        self._answered_ns: int | None = None
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Frames by kind, `rejected.<reason>`, bytes `skipped`, `samples`, and what was left out and why."""
-        return {**self._stream.counts, **self._counts, **self._fixes.counts}
+        return {**super().counts, **self._fixes.counts}
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Discard incomplete data and set the receiver up."""
-        self._stream.clear()
+    def _make_identification(self) -> bytes:
+        # an end of line first, to flush partial input
+        return b"\r\n" + _encode_command(self._settings.make_setup_commands()[0])
+
+    def _on_start(self) -> None:
         self._fixes.clear()
-        self._arrivals.clear()
         self._last_byte_ns = None
         self._monitor.reset(self._stream.counts)
-        # no new status within a search over the baud rates
-        searching = self._attempts or (self._phase is EndpointPhase.SILENT and len(self._settings.bauds) > 1)
-        at = f" at {self._current_baud} baud" if self._current_baud else ""
-        status = [] if searching else self._set_status(EndpointPhase.WAITING, f"waiting for a receiver{at}")
-        return [*status, *self._start_setup(now)]
+
+    def _describe_wait(self) -> str:
+        bauds = self._settings.bauds
+        return "waiting for a receiver" + (f" at {bauds[self._baud_index]} baud" if bauds else "")
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process received bytes."""
-        self._arrivals.append((self._stream.offset, now.utime))
         self._monitor.add(unit)
         self._last_byte_ns = now.monotonic_ns
-        return [output for message in self._stream.feed(unit) for output in self._on_message(message, now)]
+        return super().on_receive(unit, now)
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Do what is due."""
+    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Stop the requested logs if the settings demand it."""
+        self._setup.stop()
+        commands = self._settings.make_undo_commands() if self._settings.restore_on_exit else ()
+        return [Send(_encode_command(each)) for each in commands]
+
+    def _get_extra_deadline(self) -> int | None:
+        return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)
+
+    def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         if self._gap_ns is not None and now.monotonic_ns >= self._gap_ns:
             self._last_byte_ns = None
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
-        out += self._publish_fixes(self._fixes.on_timer(now), now)
-        if again := self._setup.on_timer(now.monotonic_ns):
-            out.append(Send(again))
-        elif self._setup.progress is SetupProgress.TIMED_OUT:
-            out += self._on_setup_timeout(now)
-        elif self._setup.progress is not SetupProgress.RUNNING and now.monotonic_ns >= self._timeout_ns:
-            out += self._on_data_timeout(now)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
-        asking = self._setup.progress is SetupProgress.RUNNING
-        timeout = None if asking else self._timeout_ns
-        times = (self._gap_ns, self._fixes.get_deadline(), self._setup.deadline_ns, timeout)
-        return min((each for each in times if each is not None), default=None)
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Stop the requested logs if the settings demand it."""
-        self._setup.stop()
-        if not self._settings.restore_on_exit:
-            return []
-        return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.make_undo_commands()]
-
-    @property
-    def _current_baud(self) -> int | None:
-        return self._settings.bauds[self._baud_index] if self._settings.bauds else None
-
-    @property
-    def _silence_ns(self) -> int:
-        return round(self._settings.silence * _SECOND_NS)
+        return out + self._publish_fixes(self._fixes.on_timer(now), now)
 
     @property
     def _gap_ns(self) -> int | None:
-        return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * _SECOND_NS)
-
-    def _set_status(self, phase: EndpointPhase, text: str, *, is_warning: bool = False) -> list[Output[bytes]]:
-        """Report a status unless it is unchanged."""
-        if (phase, text) == (self._phase, self._reported):
-            return []
-        self._phase, self._reported = phase, text
-        return [EndpointStatus(phase, text, is_warning)]
-
-    def _start_setup(self, now: HostTime) -> list[Output[bytes]]:
-        """Start the setup; a plain NMEA receiver only gets the commands of the settings."""
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        self._samples_before = self._counts["samples"]
-        if self._novatel:
-            return [Send(self._setup.start(now.monotonic_ns))]
-        return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.commands]
+        return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * SECOND_NS)
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
             return self._on_command_response(message, now)
         if isinstance(message, Prompt):
             return self._on_prompt(message, now)
-        # the receive time of the message's first byte
-        start = message.start
-        arrival = next((utime for offset, utime in reversed(self._arrivals) if offset <= start), self._arrivals[0][1])
+        arrival = self._find_arrival(message.start, now)
         if isinstance(message, NovatelLog):
             return self._publish_fixes(self._fixes.add_log(message, arrival, now), now)
         return self._publish_fixes(self._fixes.add_epoch(message, arrival, now), now)
@@ -745,95 +590,83 @@ class GpsDriver:
     def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         for fix in fixes:
-            header = SensorHeader(0, self._settings.source, self._sequence, fix.host_utime, fix.device_utime)
-            self._sequence += 1
-            self._counts["samples"] += 1
-            self._timeout_ns = now.monotonic_ns + self._silence_ns
             self._monitor.reset(self._stream.counts)
-            self._attempts = []
-            delay = self._settings.delay + fix.delay
-            out.append(MeasuredSample(fix.to_sample(header), delay, self._settings.delay_sigma))
-            present = (self._phase, self._origin)
-            if self._setup.progress is not SetupProgress.RUNNING and present != (EndpointPhase.STREAMING, fix.origin):
+            if self._phase is EndpointPhase.STREAMING and fix.origin != self.awaited:
                 out += self._set_status(EndpointPhase.STREAMING, f"receiving {fix.origin}")
-            self._origin = fix.origin
+            self.awaited = fix.origin
+            header = self._make_header(fix.host_utime, fix.device_utime)
+            out += self._publish(fix.to_sample(header), now, delay=fix.delay)
         for problem in self._fixes.pop_problems():
             out += self._set_status(self._phase, problem)
         return out
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
-        asked = self._setup.progress is SetupProgress.RUNNING
-        rejected = len(self._setup.rejected)
-        following = self._setup.on_response(answer, now.monotonic_ns)
-        if not asked:
-            return []
-        out: list[Output[bytes]] = []
-        if self._phase is not EndpointPhase.CONFIGURING:
-            out += self._set_status(EndpointPhase.CONFIGURING, "a NovAtel receiver answers, setting it up")
-        if len(self._setup.rejected) > rejected:
-            command, words = self._setup.rejected[-1]
-            fix = "check the settings `commands`, `device_port` and the logs"
-            text = f"the receiver rejected '{command}': {words}; {fix}"
-            out += self._set_status(EndpointPhase.CONFIGURING, text, is_warning=True)
-        if following:
-            return [*out, Send(following)]
-        if self._setup.progress is SetupProgress.RUNNING:
-            return out
-        # set up: from now on its logs must come
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        if not self._setup.rejected:
-            out += self._set_status(EndpointPhase.CONFIGURING, f"set up, waiting for {self._settings.position_log}")
-        return out
+        self._answered_ns = now.monotonic_ns
+        if self._setup_step is None:
+            commands = self._settings.make_setup_commands()[1:]
+            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
+            return self._on_identity("a NovAtel receiver", steps, now)
+        fix = "check the settings `commands`, `device_port` and the logs"
+        return self._on_acknowledgement(now, f"{answer.error}; {fix}" if answer.error else "")
 
     def _on_prompt(self, prompt: Prompt, now: HostTime) -> list[Output[bytes]]:
-        if not self._novatel or self._setup.expects_prompt(now.monotonic_ns):
+        """Set up again after a restart: a prompt that belongs to no response."""
+        answered_ns, timeout_ns = self._answered_ns, round(self._settings.answer_timeout * SECOND_NS)
+        is_expected = answered_ns is not None and now.monotonic_ns - answered_ns < timeout_ns
+        if not self._is_novatel or self._setup.is_running or is_expected:
             return []
         self._counts["restarts"] += 1
         self._fixes.clear()
         text = f"the receiver has restarted (prompt [{prompt.port}] without a command), setting it up again"
-        return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._start_setup(now)]
+        return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._setup.start(self._run_setup(), now)]
 
-    def _on_setup_timeout(self, now: HostTime) -> list[Output[bytes]]:
-        """Use a receiver that sends fixes without answering commands, else try the next baud rate."""
-        self._setup.stop()
-        if self._counts["samples"] > self._samples_before:
-            return self._set_status(
-                EndpointPhase.STREAMING,
-                "the receiver sends fixes but does not answer commands: using what it sends unasked; "
-                "check that the line can send to it",
-            )
-        return self._try_next_baud(now)
+    def _run_setup(self) -> Script:
+        """Configure the receiver; a plain NMEA receiver only gets the commands of the settings."""
+        if self._is_novatel:
+            yield from super()._run_setup()
+            return
+        for command in self._settings.commands:
+            yield Send(_encode_command(command))
+        self._restart_silence_timer()
 
-    def _on_data_timeout(self, now: HostTime) -> list[Output[bytes]]:
+    def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
         """Repeat the setup if data arrives (a restart loses the logs), else try the next baud rate."""
-        counts, monitor = self._stream.counts, self._monitor
+        counts, monitor, seconds = self._stream.counts, self._monitor, self._settings.silence
         is_streaming = self._phase is EndpointPhase.STREAMING
         if not (is_streaming or monitor.list_valid_kinds(counts) or monitor.find_flaw(counts)):
-            return self._try_next_baud(now)
-        if self._novatel:
-            missing = f"no {self._settings.position_log} for {self._settings.silence:g} s"
-            text = f"{missing}, received {monitor.describe(counts)} since, setting the receiver up again"
+            return self._setup.start(self._run_search(), now)
+        if self._is_novatel:
+            received = f"received {monitor.describe(counts)} since"
+            text = f"no {self._settings.position_log} for {seconds:g} s, {received}, setting the receiver up again"
         else:
-            text = monitor.explain_missing_fix(counts, self._settings.silence)
-        out = self._set_status(EndpointPhase.SILENT, text)
+            text = monitor.explain_missing_fix(counts, seconds)
         monitor.reset(counts)
-        return [*out, *self._start_setup(now)]
+        return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
-    def _try_next_baud(self, now: HostTime) -> list[Output[bytes]]:
+    def _run_search(self) -> Script:
+        yield from self._try_next_baud()
+        yield from self._run_setup()
+
+    def _describe_input(self) -> str:
         received = self._monitor.describe(self._stream.counts)
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        self._attempts.append((self._current_baud, received))
-        out: list[Output[bytes]] = []
-        if len(self._attempts) >= max(1, len(self._settings.bauds)):
-            wanted = "NovAtel receiver" if self._novatel else "NMEA receiver"
-            # the text differs with the noise: rate limit
-            if self._phase is not EndpointPhase.SILENT or now.monotonic_ns >= self._next_warning_ns:
-                self._next_warning_ns = now.monotonic_ns + _WARNING_INTERVAL_NS
-                out += self._set_status(EndpointPhase.SILENT, explain_missing_receiver(wanted, self._attempts))
-            self._attempts = []
         self._monitor.reset(self._stream.counts)
-        if len(self._settings.bauds) < 2:
-            return [*out, *self._start_setup(now)]
-        before = self._current_baud
-        self._baud_index = (self._baud_index + 1) % len(self._settings.bauds)
-        return [*out, Reopen(f"no receiver at {before} baud, received {received}", self._current_baud)]
+        return f"received {received}"
+
+    def _explain_absence(self) -> str:
+        tried = self._tried
+        if all("received nothing" in each for each in tried):
+            advice = "check the receiver's power, the cable, and that the port is the right one"
+        elif any("write device: " in each for each in tried):
+            advice = "another device is on this port"
+        elif all("bytes that are neither" in each or "received nothing" in each for each in tried):
+            advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
+        else:
+            advice = (
+                "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
+                "(else set protocol: nmea), and `device_port`"
+            )
+        return f"no {self.description} on this line: {'; '.join(tried)}; {advice}"
+
+
+def _encode_command(command: str) -> bytes:
+    return command.encode("ascii") + b"\r\n"

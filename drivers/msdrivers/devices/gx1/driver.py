@@ -1,9 +1,7 @@
 """Driver of a MicroStrain 3DM-GX1: finds the device, configures it, streams one measurement and polls others.
 
-Setup: a script is a generator that yields steps (request, pause, collect, send, status, reopen) and is sent the
-replies. It knows neither clock nor line: `ScriptRunner` advances it by the times and replies that it gets. A request is
-repeated after its timeout; after a retry the runner waits for the other replies, so that none passes for the next
-reply.
+Setup: a script (`ScriptRunner`) finds the device, stops what it streams, reads its gains and its timer, and starts the
+stream.
 
 Time: the samples carry the device's unwrapped ticks. The length of a tick comes from the EEPROM's timer words, which
 take effect only after a power cycle, so `TickRateCheck` compares it with the host's clock and disables the device's
@@ -18,11 +16,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
@@ -36,10 +33,20 @@ from msdrivers.devices.gx1 import (
     EepromAddress,
     Gains,
     Gx1Packet,
+    Gx1Parser,
     format_version,
     is_unit,
 )
-from msdrivers.devices.stream import recognize
+from msdrivers.devices.stream import (
+    EXAMINED_BYTES,
+    NoReplyError,
+    PauseStep,
+    RequestStep,
+    Script,
+    ScriptPart,
+    ScriptRunner,
+    recognize,
+)
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 
 
@@ -116,9 +123,6 @@ class Gx1Settings:
 QUOTED_BYTES = 32
 """Number of received bytes that are quoted."""
 
-EXAMINED_BYTES = 4096
-"""Number of received bytes by which another device is recognized."""
-
 
 class Gx1Reply(NamedTuple):
     """A valid reply and its unwrapped ticks; -1 without ticks."""
@@ -131,7 +135,7 @@ class Gx1Receiver:
     """Parses bytes to valid replies: expected, with right checksum, plausible ticks and content."""
 
     def __init__(self) -> None:
-        self.parser = gx1.Gx1Parser(self._validate)
+        self.parser = Gx1Parser(self._validate)
         self.ticks = gx1.TickUnwrapper()
         self.now = HostTime(0, 0)
         self.messages: Counter[str] = Counter()
@@ -212,172 +216,61 @@ def _is_plausible(packet: gx1.Gx1Packet) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class RequestStep:
-    """Send a request and wait for its reply, `attempts` times for `timeout` seconds; then raise NoReplyError.
+class CommandStep(RequestStep):
+    """A request and the first word of its reply, None for any."""
 
-    value: expected first word of the reply, None for any.
-    """
-
-    request: bytes
-    timeout: float = 0.5
-    attempts: int = 3
     value: int | None = None
 
     @property
     def command(self) -> int:
-        return self.request[0]
+        return self.frame[0]
 
-    def is_answered_by(self, packet: gx1.Gx1Packet) -> bool:
+    @property
+    def what(self) -> str:
+        return f"the request '{CommandByte(self.command).name.lower().replace('_', ' ')}'"
+
+    def is_answered_by(self, packet: Gx1Packet) -> bool:
         return packet.command == self.command and (self.value is None or packet.words[0] == self.value)
 
 
 @dataclass(frozen=True, slots=True)
-class PauseStep:
-    """Wait; discard the input."""
+class CollectStep(PauseStep):
+    """Collect the unrequested replies to some commands."""
 
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class CollectStep:
-    """Collect for `seconds` the unrequested replies to some commands."""
-
-    seconds: float
     commands: frozenset[int]
-
-
-Step: TypeAlias = RequestStep | PauseStep | CollectStep | Send[bytes] | EndpointStatus | Reopen
-
-T = TypeVar("T")
-
-ScriptPart: TypeAlias = Generator[Step, tuple[gx1.Gx1Packet, ...], T]
-"""A part of a script that finds a value."""
-
-Script: TypeAlias = ScriptPart[None]
-
-
-class NoReplyError(Exception):
-    """A request was not answered."""
-
-    def __init__(self, command: int, tries: int):
-        self.command = command
-        name = gx1.CommandByte(command).name.lower().replace("_", " ")
-        super().__init__(f"the request '{name}' was sent {tries} times and not answered")
 
 
 def report(text: str) -> EndpointStatus:
     return EndpointStatus(EndpointPhase.CONFIGURING, text)
 
 
-class ScriptRunner:
-    """Executes a script step by step."""
+class Gx1ScriptRunner(ScriptRunner):
+    """Executes a script and lets the parser expect the replies."""
 
-    def __init__(self, link: Gx1Receiver, script: Callable[[], Script]):
-        """`script` makes the script's generator."""
-        self._link, self._make_script = link, script
-        self._script: Script | None = None
-        self._step: Step | None = None
-        self._deadline_ns = 0
-        self._attempt = 0
-        self._collected: list[gx1.Gx1Packet] = []
+    def __init__(self, parser: Gx1Parser):
+        super().__init__()
+        self._parser = parser
 
-    @property
-    def is_running(self) -> bool:
-        return self._script is not None
-
-    @property
-    def deadline_ns(self) -> int | None:
-        """When to call `on_timer`; None if no step waits for time."""
-        return self._deadline_ns if isinstance(self._step, RequestStep | PauseStep | CollectStep) else None
-
-    def on_open(self, now: HostTime) -> list[Output[bytes]]:
-        """Continue a script that requested the reopening, else start it."""
-        if self._script is not None and isinstance(self._step, Reopen):
-            return self._resume((), now)
-        return self.start(now)
-
-    def start(self, now: HostTime) -> list[Output[bytes]]:
-        self.stop()
-        self._script = self._make_script()
-        return self._advance(partial(next, self._script), now)
-
-    def stop(self) -> None:
-        if self._script is not None:
-            self._script.close()
-        self._script = self._step = None
-
-    def on_reply(self, reply: Gx1Reply, now: HostTime) -> list[Output[bytes]]:
+    def on_packet(self, packet: Gx1Packet, now: HostTime) -> list[Output[bytes]]:
         """Process a reply."""
-        step, packet = self._step, reply.packet
+        step = self.step
         if isinstance(step, CollectStep):
-            self._collected.append(packet)
-        elif isinstance(step, RequestStep) and step.is_answered_by(packet):
-            if self._attempt == 1:
-                return self._resume((packet,), now)
-            # the other tries may be answered yet, each as late as this one, and would pass for replies to what is
-            # asked next
-            self._wait(PauseStep(self._attempt * step.timeout), now)
-            self._collected.append(packet)
-        elif isinstance(step, RequestStep) and packet.command == step.command:
-            self._link.parser.expect(packet.command)
+            self._reply.append(packet)
+        elif isinstance(step, CommandStep) and step.is_answered_by(packet):
+            return self.on_reply(packet, now)
+        elif isinstance(step, CommandStep) and packet.command == step.command:
+            self._parser.expect(packet.command)
         return []
 
-    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
-        """Process a timeout."""
-        due = self.deadline_ns
-        if due is None or now.monotonic_ns < due:
-            return []
-        step = self._step
-        if not isinstance(step, RequestStep):
-            return self._resume(tuple(self._collected), now)
-        if self._attempt < step.attempts:
-            return [self._send_request(step, now)]
-        assert self._script is not None
-        return self._advance(partial(self._script.throw, NoReplyError(step.command, step.attempts)), now)
-
-    def _resume(self, packets: tuple[gx1.Gx1Packet, ...], now: HostTime) -> list[Output[bytes]]:
-        assert self._script is not None
-        return self._advance(partial(self._script.send, packets), now)
-
-    def _advance(self, resume: Callable[[], Step], now: HostTime) -> list[Output[bytes]]:
-        """Continue to the next step that waits; return the outputs until there."""
-        self._link.now = now
-        self._step = None
-        outputs: list[Output[bytes]] = []
-        while True:
-            try:
-                step = resume()
-            except StopIteration:
-                self._script = None
-                return outputs
-            if isinstance(step, Send | EndpointStatus | Reopen):
-                outputs.append(step)
-            if isinstance(step, Send | EndpointStatus):
-                assert self._script is not None
-                resume = partial(self._script.send, ())
-                continue
-            self._step = step
-            if isinstance(step, RequestStep):
-                self._attempt = 0
-                outputs.append(self._send_request(step, now))
-            elif isinstance(step, PauseStep | CollectStep):
-                self._wait(step, now)
-            return outputs
-
-    def _wait(self, step: PauseStep | CollectStep, now: HostTime) -> None:
-        self._step = step
-        self._deadline_ns = now.monotonic_ns + round(step.seconds * 1e9)
-        self._collected.clear()
-        self._link.parser.clear()
+    def _prepare(self, step: RequestStep | PauseStep) -> None:
+        if isinstance(step, CommandStep):
+            self._parser.cancel(step.command)
+            self._parser.expect(step.command)
+        else:
+            self._parser.clear()
         if isinstance(step, CollectStep):
-            self._link.parser.set_streamed(*step.commands)
-
-    def _send_request(self, step: RequestStep, now: HostTime) -> Send[bytes]:
-        self._attempt += 1
-        self._deadline_ns = now.monotonic_ns + round(step.timeout * 1e9)
-        self._link.parser.cancel(step.command)
-        self._link.parser.expect(step.command)
-        return Send(step.request)
+            self._reply = []
+            self._parser.set_streamed(*step.commands)
 
 
 LISTEN_S = 0.3
@@ -470,7 +363,7 @@ def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPar
         # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
         yield Send(gx1.STOP)
         yield PauseStep(flush)
-    yield RequestStep(gx1.STOP, value=0)
+    yield CommandStep(gx1.STOP, value=0)
     if found.found_stream is None:
         found.found_stream = 0
     # what was listened to may have been noise that looked like replies
@@ -478,8 +371,8 @@ def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPar
 
 
 def _read_identity() -> ScriptPart[str]:
-    (serial,) = yield RequestStep(gx1.make_poll(gx1.CommandByte.SERIAL))
-    (firmware,) = yield RequestStep(gx1.make_poll(gx1.CommandByte.FIRMWARE))
+    serial = yield CommandStep(gx1.make_poll(gx1.CommandByte.SERIAL))
+    firmware = yield CommandStep(gx1.make_poll(gx1.CommandByte.FIRMWARE))
     return f"3DM-GX1 serial {serial.unsigned}, firmware {format_version(firmware.unsigned)}"
 
 
@@ -502,7 +395,7 @@ def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
     """Read words of the EEPROM, unsigned."""
     words: tuple[int, ...] = ()
     for address in addresses:
-        (reply,) = yield RequestStep(gx1.make_read_eeprom(address))
+        reply = yield CommandStep(gx1.make_read_eeprom(address))
         words = (*words, reply.unsigned)
     return words
 
@@ -744,7 +637,7 @@ class Gx1Driver:
         self.tick_s = settings.tick or 0.0
         """Seconds of a tick; 0 before that is known."""
         self._link = Gx1Receiver()
-        self._script = ScriptRunner(self._link, self._run_setup)
+        self._script = Gx1ScriptRunner(self._link.parser)
         self._line_state = LineState(list(settings.bauds))
         self._gains = Gains(1, 1, 1)
         self._device = "3DM-GX1"
@@ -760,14 +653,16 @@ class Gx1Driver:
 
     def on_open(self, now: HostTime) -> list[Output[bytes]]:
         """Begin, or go on at another baud rate."""
-        return self._script.on_open(now)
+        self._link.now = now
+        outputs = self._script.reopen(now)
+        return self._script.start(self._run_setup(), now) if outputs is None else outputs
 
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
         """Process received bytes."""
         outputs: list[Output[bytes]] = []
         for reply in self._link.feed(unit, now):
             if self._script.is_running:
-                outputs += self._script.on_reply(reply, now)
+                outputs += self._script.on_packet(reply.packet, now)
             else:
                 outputs += self._on_streamed_reply(reply, now)
         return outputs
@@ -851,7 +746,7 @@ class Gx1Driver:
         yield report("capturing the gyro biases: keep the vehicle still")
         self._bias_pending = False
         try:
-            yield RequestStep(gx1.make_poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_CAPTURE_TIMEOUT_S, attempts=1)
+            yield CommandStep(gx1.make_poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_CAPTURE_TIMEOUT_S, attempts=1)
         except NoReplyError:
             text = f"the gyro bias capture timed out after {BIAS_CAPTURE_TIMEOUT_S:g} s; using the previous biases"
         else:
@@ -861,7 +756,7 @@ class Gx1Driver:
     def _start_stream(self) -> ScriptPart[None]:
         message = self.settings.message
         self._link.set_streamed(message)
-        yield RequestStep(gx1.make_stream(message), value=message)
+        yield CommandStep(gx1.make_stream(message), value=message)
         self._link.set_streamed(message)
         now_ns = self._link.now.monotonic_ns
         self._link.reset_input()
@@ -943,4 +838,4 @@ class Gx1Driver:
     def _restart(self, now: HostTime, why: str) -> list[Output[bytes]]:
         self._counts["restarts"] += 1
         status = EndpointStatus(EndpointPhase.SILENT, f"{self._device}: {why}; repeating the setup")
-        return [status, *self._script.start(now)]
+        return [status, *self._script.start(self._run_setup(), now)]
