@@ -26,7 +26,7 @@ from msdrivers.devices.stream import (
     ParsedFrame,
     RejectedFrame,
     StreamDriver,
-    check_stream_settings,
+    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -113,11 +113,10 @@ class GpsdStream(FrameScanner[GpsdReport]):
         super().__init__((GpsdFormat(),))
 
 
-@dataclass(frozen=True, slots=True)
-class GpsdSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsdSettings(StreamSettings):
     """Settings of gpsd. Raises ValueError with the key for an invalid value."""
 
-    source: str
     receiver: str = ""
     """Path of the receiver at gpsd's machine, e.g. /dev/ttyACM0, where gpsd has several; empty: all."""
     hold: float = 0.02
@@ -134,13 +133,8 @@ class GpsdSettings:
     """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, hold=(0.0, 2.0))
-
-    @property
-    def bauds(self) -> tuple[int, ...]:
-        """None: gpsd owns the receiver's line."""
-        return ()
 
 
 class GpsdDriver(StreamDriver[GpsdReport]):

@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from binascii import crc_hqx
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial, reduce
 from operator import xor
 from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
@@ -422,44 +422,32 @@ WARNING_INTERVAL_NS: Final = 60 * SECOND_NS
 _MAX_ARRIVALS: Final = 4096
 
 
-class StreamSettings(Protocol):
-    """Settings that these drivers have in common."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamSettings:
+    """Settings that these devices have in common. Raises ValueError with the key for an invalid value."""
 
-    @property
-    def source(self) -> str:
-        """Source of the samples."""
+    source: str = field(kw_only=False)
+    silence: float = 0.5
+    """Timeout for samples, seconds, after which the setup is repeated."""
+    answer_timeout: float = 0.5
+    """Timeout for an answer, seconds."""
+    attempts: int = 3
+    """How often an unanswered message is sent."""
+    delay: float = 0.0
+    """From the measurement to the instant that the device states, seconds."""
+    delay_sigma: float = 0.0
+    """Standard deviation of `delay`, seconds."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, silence=(0.05, 3600.0), answer_timeout=(0.05, 60.0), attempts=(1, 100))
+        check_ranges(self, delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds are above 0, got {self.bauds}")
 
     @property
     def bauds(self) -> tuple[int, ...]:
-        """Baud rates to try; empty: the line has none."""
-
-    @property
-    def silence(self) -> float:
-        """Timeout for samples, seconds."""
-
-    @property
-    def answer_timeout(self) -> float:
-        """Timeout for an answer, seconds."""
-
-    @property
-    def attempts(self) -> int:
-        """How often an unanswered message is sent."""
-
-    @property
-    def delay(self) -> float:
-        """Time from the measurement to the device's time, seconds."""
-
-    @property
-    def delay_sigma(self) -> float:
-        """Its standard deviation, seconds."""
-
-
-def check_stream_settings(settings: StreamSettings) -> None:
-    """Raise ValueError with the key for a setting out of range."""
-    check_ranges(settings, silence=(0.05, 3600.0), answer_timeout=(0.05, 60.0), attempts=(1, 100))
-    check_ranges(settings, delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
-    if any(baud <= 0 for baud in settings.bauds):
-        raise ValueError(f"bauds are above 0, got {settings.bauds}")
+        """Baud rates to try; the line is opened at the first. Empty: the line has none."""
+        return ()
 
 
 class StreamDriver(ABC, Generic[M]):

@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from modelserver.errors import quote, suggest_name
 from modelserver.messages import NAN, ImuSample, JointSample, JointsSample, Sample, SensorHeader
@@ -52,28 +52,38 @@ class ColumnMap(Strict):
         check_factor(self.scale, "scale")
 
 
-class LineDescription(Protocol):
-    """What a line looks like."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TextSettings(Strict):
+    """Settings that these devices have in common. Raises ValueError with the key for an invalid value."""
+
+    source: str
+    columns: int
+    """Number of columns of a line; others are rejected."""
+    separator: str = ","
+    """What separates columns; empty: spaces or tabs."""
+    starts_with: str = ""
+    """What a line with measurements begins with, such as a name in column 0; other lines are not used."""
+    checksum: str = "none"
+    """`xor`: a line ends with * and the exclusive-or of the characters before, as in NMEA; `none`."""
+    silence: float = 1.0
+    """Timeout for usable lines, seconds."""
+    delay: float = 0.0
+    """From the measurement to the device's time, or to the arrival of the line's first byte, seconds."""
+    delay_sigma: float = 0.005
+    """Its standard deviation, seconds."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, columns=(1, 256), silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
+        if self.checksum not in ("none", "xor"):
+            raise ValueError(f"checksum is none or xor, got {quote(self.checksum)}")
+        for name, column in self.mapped.items():
+            if column.column >= self.columns:
+                raise ValueError(f"fields: {name} is in column {column.column}, but a line has {self.columns}, from 0")
 
     @property
-    def fields(self) -> Mapping[str, ColumnMap]:
+    def mapped(self) -> Mapping[str, ColumnMap]:
         """The columns by what they are."""
-
-    @property
-    def columns(self) -> int:
-        """Number of columns."""
-
-    @property
-    def separator(self) -> str:
-        """What separates columns; empty: spaces or tabs."""
-
-    @property
-    def starts_with(self) -> str:
-        """What a line begins with."""
-
-    @property
-    def checksum(self) -> str:
-        """`xor` or `none`."""
+        raise NotImplementedError
 
 
 class LineReader:
@@ -103,10 +113,10 @@ class LineReader:
         return lines
 
 
-def encode_line(description: LineDescription, values: Mapping[str, float]) -> bytes:
+def encode_line(description: TextSettings, values: Mapping[str, float]) -> bytes:
     """Return the line of some fields in SI units; columns without a field are 0."""
     columns = ["0"] * description.columns
-    for name, each in description.fields.items():
+    for name, each in description.mapped.items():
         columns[each.column] = f"{(values[name] - each.offset) / each.scale:.9g}"
     if description.starts_with:
         columns[0] = description.starts_with
@@ -119,36 +129,6 @@ def encode_line(description: LineDescription, values: Mapping[str, float]) -> by
 EXAMINED_BYTES: Final = 4096
 
 _SECOND_NS: Final = 1_000_000_000
-
-
-class TextSettings(LineDescription, Protocol):
-    """Settings that these drivers have in common."""
-
-    @property
-    def source(self) -> str:
-        """Source of the samples."""
-
-    @property
-    def silence(self) -> float:
-        """Timeout for usable lines, seconds."""
-
-    @property
-    def delay(self) -> float:
-        """From the measurement to the device's time, or to the arrival of the line's first byte, seconds."""
-
-    @property
-    def delay_sigma(self) -> float:
-        """Its standard deviation, seconds."""
-
-
-def check_text_settings(settings: TextSettings) -> None:
-    """Raise ValueError with the key for a setting out of range."""
-    check_ranges(settings, columns=(1, 256), silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
-    if settings.checksum not in ("none", "xor"):
-        raise ValueError(f"checksum is none or xor, got {quote(settings.checksum)}")
-    for name, column in settings.fields.items():
-        if column.column >= settings.columns:
-            raise ValueError(f"fields: {name} is in column {column.column}, but a line has {settings.columns}, from 0")
 
 
 class TextDriver(ABC):
@@ -258,7 +238,7 @@ class TextDriver(ABC):
             return None
         try:
             values = {
-                name: float(columns[each.column]) * each.scale + each.offset for name, each in settings.fields.items()
+                name: float(columns[each.column]) * each.scale + each.offset for name, each in settings.mapped.items()
             }
         except ValueError:
             self.counts["rejected.number"] += 1
@@ -276,28 +256,13 @@ VECTORS: Final = {"specific_force": 400.0, "angular_velocity": 60.0, "magnetic_f
 FIELDS: Final = (*(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz"), "temperature", "time")
 
 
-@dataclass(frozen=True, slots=True)
-class TextImuSettings(Strict):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TextImuSettings(TextSettings):
     """Settings of a unit that sends lines of text. Raises ValueError with the key for an invalid value."""
 
-    source: str
     fields: Mapping[str, ColumnMap]
     """Columns by what they are: specific_force_x, _y, _z (m/s2), angular_velocity_x, _y, _z (rad/s),
     magnetic_field_x, _y, _z (tesla), temperature (degrees Celsius), time (seconds of the unit's clock)."""
-    columns: int
-    """Number of columns of a line; others are rejected."""
-    separator: str = ","
-    """What separates columns; empty: spaces or tabs."""
-    starts_with: str = ""
-    """What a line with measurements begins with, such as a name in column 0; other lines are not used."""
-    checksum: str = "none"
-    """`xor`: a line ends with * and the exclusive-or of the characters before, as in NMEA; `none`."""
-    silence: float = 1.0
-    """Timeout for usable lines, seconds."""
-    delay: float = 0.0
-    """From the measurement to the unit's time, or to the arrival of the line's first byte, seconds."""
-    delay_sigma: float = 0.005
-    """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
         for name in self.fields:
@@ -306,7 +271,7 @@ class TextImuSettings(Strict):
                 raise ValueError(
                     f"fields: {quote(name)} is unknown; {f'write {near[0]}' if near else ', '.join(FIELDS)}"
                 )
-        check_text_settings(self)
+        TextSettings.__post_init__(self)
         for vector in VECTORS:
             known = [axis for axis in "xyz" if f"{vector}_{axis}" in self.fields]
             if len(known) in (1, 2) and not (vector == "angular_velocity" and known == ["z"]):
@@ -314,6 +279,10 @@ class TextImuSettings(Strict):
                 raise ValueError(f"fields: {vector}_{missing} is missing beside {vector}_{known[0]}")
         if not any(f"{vector}_z" in self.fields for vector in ("specific_force", "angular_velocity")):
             raise ValueError("fields: has specific_force_x, _y, _z, angular_velocity_x, _y, _z, or both")
+
+    @property
+    def mapped(self) -> Mapping[str, ColumnMap]:
+        return self.fields
 
 
 class TextImuDriver(TextDriver):
@@ -350,40 +319,25 @@ MAX_POSITION: Final = 1000.0
 """Radians or meters; a joint beyond is none."""
 
 
-@dataclass(frozen=True, slots=True)
-class TextJointsSettings(Strict):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TextJointsSettings(TextSettings):
     """Settings of a device that sends joints as lines of text. Raises ValueError with the key for an invalid value."""
 
-    source: str
     joints: Mapping[str, ColumnMap]
     """Columns by the names of the constraints in the geometry; radians or meters."""
-    columns: int
-    """Number of columns of a line; others are rejected."""
     time: ColumnMap | None = None
     """Column of the device's clock, seconds."""
     sigma: float = 0.0
     """Standard deviation of a position, radians or meters; 0: that of the joint in the geometry."""
-    separator: str = ","
-    """What separates columns; empty: spaces or tabs."""
-    starts_with: str = ""
-    """What a line with positions begins with; other lines are not used."""
-    checksum: str = "none"
-    """`xor`: a line ends with * and the exclusive-or of the characters before, as in NMEA; `none`."""
-    silence: float = 1.0
-    """Timeout for usable lines, seconds."""
-    delay: float = 0.0
-    """From the measurement to the device's time, or to the arrival of the line's first byte, seconds."""
-    delay_sigma: float = 0.005
-    """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.joints) <= 64:
             raise ValueError(f"joints has 1 to 64 joints, got {len(self.joints)}")
-        check_text_settings(self)
+        TextSettings.__post_init__(self)
         check_ranges(self, sigma=(0.0, 10.0))
 
     @property
-    def fields(self) -> Mapping[str, ColumnMap]:
+    def mapped(self) -> Mapping[str, ColumnMap]:
         return {**self.joints, **({} if self.time is None else {TIME: self.time})}
 
 

@@ -40,7 +40,7 @@ from msdrivers.devices.stream import (
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    check_stream_settings,
+    StreamSettings,
     compute_fletcher,
 )
 from msdrivers.endpoint import HostTime, Output
@@ -240,21 +240,16 @@ MOVING: Final = 0.3
 """Speed over ground above which a vehicle moves, m/s."""
 
 
-@dataclass(frozen=True, slots=True)
-class UbloxSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UbloxSettings(StreamSettings):
     """Settings of a u-blox receiver. Raises ValueError with the key for an invalid value."""
 
-    source: str
     rate_hz: float = 5.0
     """Fixes per second, 0.1 to 25; what a product reaches depends on its constellations."""
     bauds: tuple[int, ...] = (38400, 9600, 115200, 460800)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
     silence: float = 2.0
     """Timeout for fixes, seconds, after which the setup is repeated."""
-    answer_timeout: float = 0.5
-    """Timeout for the answer to a configuration message, seconds."""
-    attempts: int = 3
-    """How often an unanswered message is sent."""
     hold: float = 0.1
     """How long a position waits for the other messages of its epoch, seconds."""
     delay: float = 0.0
@@ -263,7 +258,7 @@ class UbloxSettings:
     """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, rate_hz=(0.1, 25.0), hold=(0.0, 10.0))
         if self.silence < 1.5 / self.rate_hz:
             raise ValueError(f"silence is at least 1.5 periods, {1.5 / self.rate_hz:g} s, got {self.silence:g}")

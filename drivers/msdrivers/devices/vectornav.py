@@ -28,7 +28,7 @@ from msdrivers.devices.stream import (
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    check_stream_settings,
+    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -218,11 +218,10 @@ MAX_RATE, MAX_ACCELERATION = 40.0, 400.0
 """Beyond the ranges of the unit, 2000 deg/s and 16 g, with room: rad/s, m/s2."""
 
 
-@dataclass(frozen=True, slots=True)
-class VectornavSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VectornavSettings(StreamSettings):
     """Settings of a VN-100. Raises ValueError with the key for an invalid value."""
 
-    source: str
     rate_hz: float = 100.0
     """Samples per second: 800 divided by a whole number. 115200 baud carry 140 Hz."""
     unit_port: int = 1
@@ -231,19 +230,11 @@ class VectornavSettings:
     """What the yaw of its orientation is measured against: `magnetic`, or `none` where its magnetometers are off."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    silence: float = 0.5
-    """Timeout for samples, seconds, after which the setup is repeated."""
     answer_timeout: float = 0.3
     """Timeout for an answer, seconds."""
-    attempts: int = 3
-    """How often an unanswered command is sent."""
-    delay: float = 0.0
-    """From the measurement to the instant that the unit states, seconds."""
-    delay_sigma: float = 0.0
-    """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
         if self.heading not in ("magnetic", "none"):
             raise ValueError(f"heading is magnetic or none, got '{self.heading}'")

@@ -25,7 +25,7 @@ from msdrivers.devices.stream import (
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    check_stream_settings,
+    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -248,11 +248,10 @@ MAX_ACCELERATION: Final = 400.0
 """Beyond the ranges of the units, with room: rad/s, m/s2."""
 
 
-@dataclass(frozen=True, slots=True)
-class XsensSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class XsensSettings(StreamSettings):
     """Settings of an MTi. Raises ValueError with the key for an invalid value."""
 
-    source: str
     rate_hz: int = 100
     """Samples per second, 1 to 400; a 1-series unit reaches 100, and 115200 baud carry 130."""
     field_strength: float = 0.0
@@ -261,19 +260,11 @@ class XsensSettings:
     """What the yaw of its orientation is measured against: `magnetic`, `none` (VRU), or `true` (with declination)."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400, 2000000)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    silence: float = 0.5
-    """Timeout for samples, seconds, after which the setup is repeated."""
-    answer_timeout: float = 0.5
-    """Timeout for an answer, seconds."""
     attempts: int = 5
     """How often an unanswered message is sent: some units do not answer after power-up."""
-    delay: float = 0.0
-    """From the measurement to the instant that the unit states, seconds."""
-    delay_sigma: float = 0.0
-    """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1, 400), field_strength=(0.0, 1e-3))
         if self.heading not in _YAW_SOURCES:
             raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")

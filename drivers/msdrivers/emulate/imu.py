@@ -21,7 +21,7 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 from msdrivers.devices import gx1, xsens
 from msdrivers.devices import vectornav as vn
 from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, Gx1Request, RequestParser
-from msdrivers.devices.text import LineDescription, encode_line
+from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vectornav import FIELD_BYTES, VnStream, VnText
 from msdrivers.devices.xsens import ItemId, MessageId, XbusMessage, XbusStream
 from msdrivers.emulate import FaultQueue, InjectedFault, SampleEmulator
@@ -262,7 +262,7 @@ CELSIUS = 25.0
 class TextImuEmulator(SampleEmulator[ImuSample]):
     """An `Endpoint` of bytes that sends a line for each sample. `samples` are in the order of their stamps."""
 
-    def __init__(self, samples: Iterable[ImuSample], settings: LineDescription) -> None:
+    def __init__(self, samples: Iterable[ImuSample], settings: TextSettings) -> None:
         super().__init__(samples)
         self._settings = settings
         self._first_utime: int | None = None
@@ -270,7 +270,7 @@ class TextImuEmulator(SampleEmulator[ImuSample]):
     def _encode(self, sample: ImuSample) -> bytes:
         self.counts["lines"] += 1
         self._first_utime = sample.header.utime if self._first_utime is None else self._first_utime
-        values = {name: self._get_value(sample, name) for name in self._settings.fields}
+        values = {name: self._get_value(sample, name) for name in self._settings.mapped}
         return encode_line(self._settings, values)
 
     def _get_value(self, sample: ImuSample, name: str) -> float:

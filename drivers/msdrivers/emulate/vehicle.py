@@ -16,7 +16,7 @@ from typing import Final
 from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
-from msdrivers.devices.text import LineDescription, encode_line
+from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
 from msdrivers.emulate import CanEmulator, FaultQueue, InjectedFault
@@ -452,7 +452,7 @@ SWEEP_S: Final = 8.0
 class TextJointsEmulator:
     """An `Endpoint` of bytes that sends a line every `PERIOD_US`."""
 
-    def __init__(self, settings: LineDescription) -> None:
+    def __init__(self, settings: TextSettings) -> None:
         self._settings = settings
         self._first: HostTime | None = None
         self._sent = 0
@@ -486,7 +486,7 @@ class TextJointsEmulator:
     def get_values(self, seconds: float) -> dict[str, float]:
         """Return the fields of a line, `seconds` after the first."""
         values = {}
-        for number, name in enumerate(self._settings.fields):
+        for number, name in enumerate(self._settings.mapped):
             period = SWEEP_S * (2.0 / 3.0) ** number
             values[name] = 1.0 + seconds if name == "time" else AMPLITUDE * math.sin(math.tau * seconds / period)
         return values

@@ -228,7 +228,9 @@ UBX_BYTES = b"".join(encode_ubx(name, ALL) for name in ORDER) * 3
 
 def collect_nmea() -> bytes:
     saved = tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gprmc"))
-    line = Line(GpsDriver(GpsSettings("gps", "nmea")), GpsEmulator(drive(5.0), GpsUnit(saved, is_answering=False)))
+    line = Line(
+        GpsDriver(GpsSettings("gps", protocol="nmea")), GpsEmulator(drive(5.0), GpsUnit(saved, is_answering=False))
+    )
     data = bytearray()
     line.to_host = lambda chunk: [data.extend(chunk) or chunk]  # type: ignore[func-returns-value]
     line.open().run(4.0)
@@ -237,7 +239,7 @@ def collect_nmea() -> bytes:
 
 def test_given_ubx_bytes_on_the_line_of_another_driver_then_its_status_names_the_device_to_write() -> None:
     for protocol in ("nmea", "novatel"):
-        line = Line(GpsDriver(GpsSettings("gps", protocol)), UbloxEmulator(()))
+        line = Line(GpsDriver(GpsSettings("gps", protocol=protocol)), UbloxEmulator(()))
         line.open()
         for _ in range(40):
             line.deliver(UBX_BYTES)

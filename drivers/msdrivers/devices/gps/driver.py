@@ -46,7 +46,16 @@ from msdrivers.devices.gps.novatel import (
     TimeStatus,
     Velocity,
 )
-from msdrivers.devices.stream import EXAMINED_BYTES, SECOND_NS, FrameScanner, Script, SetupStep, StreamDriver, recognize
+from msdrivers.devices.stream import (
+    EXAMINED_BYTES,
+    SECOND_NS,
+    FrameScanner,
+    Script,
+    SetupStep,
+    StreamDriver,
+    StreamSettings,
+    recognize,
+)
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 PROTOCOLS = ("novatel", "nmea")
@@ -58,8 +67,8 @@ POSITION_LOGS = ("BESTPOS", "RTKPOS", "PSRPOS")
 HEADING_LOGS = ("", "HEADING", "HEADING2")
 
 
-@dataclass(frozen=True, slots=True)
-class GpsSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsSettings(StreamSettings):
     """Settings of the receiver. Seconds; raises ValueError with the key for an invalid value.
 
     protocol: "novatel" configures the receiver by commands; "nmea" only sends `commands` and reads.
@@ -77,7 +86,6 @@ class GpsSettings:
     restore_on_exit: stop the logs that were asked for when the driver leaves.
     """
 
-    source: str
     protocol: str = "novatel"
     rate_hz: float = 4.0
     log_format: str = "binary"
@@ -88,7 +96,6 @@ class GpsSettings:
     bauds: tuple[int, ...] = ()
     silence: float = 2.0
     answer_timeout: float = 1.0
-    attempts: int = 3
     hold: float = 0.1
     gap: float = 0.04
     restore_on_exit: bool = True
