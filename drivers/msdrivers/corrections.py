@@ -77,7 +77,6 @@ class RtcmFormat:
     start_bytes = bytes((PREAMBLE,))
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[RtcmFrame] | RejectedFrame | None:
-        """Parse the frame at `at`."""
         if len(buffer) < at + HEADER_BYTES:
             return None
         if buffer[at + 1] & 0xFC:
@@ -121,7 +120,6 @@ class NtripRequest:
     password: str = ""
 
     def encode(self) -> bytes:
-        """Return the bytes of the request."""
         lines = [
             f"GET /{self.mountpoint} HTTP/1.1",
             f"Host: {self.host}",

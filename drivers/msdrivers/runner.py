@@ -7,6 +7,8 @@ Reconnect: the wait doubles from `min_backoff` to `max_backoff` with 20 % jitter
 5 s. Errors of the endpoint are counted and logged and the driver continues; errors of the link close the line.
 
 Health (`HealthReporter`): regular reports to DRIVER_HEALTH, and changes of status to the log, both rate limited.
+
+Signed commands (`DriveVerifier`) are verified before they reach the endpoint: a stranger on the bus cannot drive.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ import logging
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from modelserver.messages import NAN, DriverHealth, DriverPhase, Sample, VehicleCommand
-from modelserver.wire.codec import encode
+from modelserver.errors import WireError
+from modelserver.messages import NAN, DriverHealth, DriverPhase, Envelope, Sample, VehicleCommand
+from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.wire.codec import decode, encode
 from msdrivers.device_clock import DeviceClock, Stamper
 from msdrivers.endpoint import (
     CommandableEndpoint,
@@ -96,7 +100,6 @@ class HealthReporter:
 
     @property
     def state(self) -> tuple[DriverPhase, str]:
-        """Phase and status text."""
         phase, text = self._phase, self._text
         # an endpoint that reports silence itself knows the cause better
         if self.is_silent and phase is not DriverPhase.SILENT:
@@ -495,7 +498,6 @@ class Runner(Generic[U]):
             self._count_error("report")
 
     def make_health(self, now: HostTime) -> DriverHealth:
-        """Return the driver's health report."""
         phase, text = self._reporter.state
         clock = self._stamper.clock
         return DriverHealth(
@@ -526,3 +528,52 @@ class Runner(Generic[U]):
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._close_line()
         self._set_status(DriverPhase.CLOSED, self._close_reason)
+
+
+COMMAND_TYPE = "vehicle_command_t"
+
+
+class CommandDeniedError(Exception):
+    """A denied command: the name of its counter, and why."""
+
+    def __init__(self, reason: str, text: str):
+        super().__init__(text)
+        self.reason = reason
+
+
+class DriveVerifier:
+    """Verifies envelopes with commands for `channel` (without the vehicle's `prefix`).
+
+    `started_ns`: when the driver started, monotonic; a command that an earlier run could have accepted is denied.
+    """
+
+    def __init__(self, keys: Iterable[Key], prefix: str, channel: str, window_s: float, started_ns: int):
+        self._keys = {key.name: key for key in keys}
+        self._prefix, self._channel = prefix, channel
+        self._window_us = round(window_s * 1e6)
+        self._started_ns = started_ns
+        self._freshness = Freshness()
+
+    def verify(self, data: bytes, now: HostTime) -> VehicleCommand:
+        """Return the command in an envelope. Raises CommandDeniedError."""
+        try:
+            envelope: Envelope = decode("signed_t", data)
+        except WireError as error:
+            raise CommandDeniedError(error.reason, f"no signed message: {error}") from None
+        key = self._keys.get(envelope.key_name)
+        if key is None:
+            raise CommandDeniedError("unknown_key", "signed with a key that is not in the vehicle's key file")
+        if not has_valid_signature(key, self._prefix, envelope):
+            raise CommandDeniedError("bad_signature", "its signature is wrong: another key, or another vehicle")
+        if envelope.channel != self._channel:
+            raise CommandDeniedError("channel", f"it was signed for another channel than {self._channel}")
+        uptime_us = (now.monotonic_ns - self._started_ns) // 1000
+        check = check_freshness(self._freshness, envelope, now.utime, uptime_us, self._window_us)
+        self._freshness = check.freshness
+        if check.reason:
+            raise CommandDeniedError(check.reason, check.message)
+        try:
+            command: VehicleCommand = decode(COMMAND_TYPE, envelope.payload)
+        except WireError as error:
+            raise CommandDeniedError(error.reason, str(error)) from None
+        return command

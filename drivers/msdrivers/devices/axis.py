@@ -279,7 +279,6 @@ class NodSetup:
         self._step = next(self._steps, None)
 
     def cancel(self) -> None:
-        """Discard the remaining steps."""
         self._step = None
 
     @property
@@ -310,7 +309,6 @@ class NodSetup:
         return self._warning
 
     def make_restore_requests(self) -> list[WriteRegisters]:
-        """Make the requests that restore the registers."""
         if not self.found or self.found.keys() != self._registers.keys():
             return []
         degrees = {name: self._registers[name].to_degrees(words) for name, words in self.found.items()}
@@ -445,7 +443,6 @@ class AxisDriver:
         self._seq = 0
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        """Begin: set the nodding up, then read."""
         self._is_open, self._pending = True, None
         self._readings.clear()
         self._reported.clear()
@@ -457,7 +454,6 @@ class AxisDriver:
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        """Process a reply or a failure."""
         if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
@@ -502,7 +498,6 @@ class AxisDriver:
         return outputs + self._send_next(now)
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         if not self._is_open:
             return None
         if self._pending is not None:

@@ -69,11 +69,9 @@ class SignalMap(Strict):
             raise ValueError(f"offset is a number, got {self.offset:g}")
 
     def to_si(self, physical: float) -> float:
-        """Return the number in SI units of the signal's physical value."""
         return physical * self.scale + self.offset
 
     def from_si(self, value: float) -> float:
-        """Return the signal's physical value of a number in SI units."""
         return (value - self.offset) / self.scale
 
 
@@ -328,7 +326,6 @@ class CanFrameAssembler:
         self.clear()
 
     def clear(self) -> None:
-        """Discard the incomplete instant."""
         self._pending: dict[FrameKey, dict[str, float]] = {}
         self._started_ns = self._utime = 0
 
@@ -571,7 +568,6 @@ class CanDriver(ABC):
         return [*flaws, EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")]
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Process a received frame."""
         if unit.is_error:
             return self._on_error_frame(unit)
         self._received += 1
@@ -599,7 +595,6 @@ class CanDriver(ABC):
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         deadlines = (self._assembler.get_deadline(), self._silence_deadline_ns)
         return min((each for each in deadlines if each is not None), default=None)
 
@@ -611,7 +606,6 @@ class CanDriver(ABC):
         """Make the samples of complete and expired instants."""
 
     def _on_usable(self, now: HostTime, text: str) -> list[Output[CanFrame]]:
-        """Record usable data; report `text` at the first."""
         self._restart_silence_timer(now)
         if self.phase is EndpointPhase.STREAMING:
             return []

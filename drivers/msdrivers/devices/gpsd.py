@@ -91,7 +91,6 @@ class GpsdFormat:
     start_bytes = b"{"
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[GpsdReport] | RejectedFrame | None:
-        """Parse the line at `at`."""
         end = buffer.find(b"\n", at, at + MAX_LINE)
         if end < 0:
             return None if len(buffer) - at < MAX_LINE else RejectedFrame("length")

@@ -50,7 +50,6 @@ class BoundedCounter(Counter[str]):
     """
 
     def add(self, name: str) -> None:
-        """Count one more of `name`."""
         name = name[:MAX_NAME_LENGTH]
         if name not in self and len(self) >= MAX_NAMES:
             # one `other` for each kind; kinds are this program's own words
@@ -351,7 +350,6 @@ class ScriptRunner:
         return []
 
     def on_timer(self, now: HostTime) -> list[Output[bytes]]:
-        """Process a timeout."""
         due, step = self.deadline_ns, self.step
         if due is None or now.monotonic_ns < due:
             return []
@@ -529,7 +527,6 @@ class StreamDriver(ABC, Generic[M]):
         return [*status, *self._setup.start(self._run_setup(), now)]
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process received bytes."""
         self._now = now
         self._arrivals.append((self._stream.offset, now.utime))
         if len(self._first_bytes) < EXAMINED_BYTES:
@@ -537,7 +534,6 @@ class StreamDriver(ABC, Generic[M]):
         return [output for message in self._stream.feed(unit) for output in self._on_message(message, now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Do what is due."""
         self._now = now
         out: list[Output[bytes]] = []
         extra = self._get_extra_deadline()
@@ -548,7 +544,6 @@ class StreamDriver(ABC, Generic[M]):
         return [*out, *(self._on_silence(now) if now.monotonic_ns >= self._silence_deadline_ns else [])]
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         deadline = self._setup.deadline_ns if self._setup.is_running else self._silence_deadline_ns
         return min((each for each in (deadline, self._get_extra_deadline()) if each is not None), default=None)
 

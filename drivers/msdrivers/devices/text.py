@@ -157,14 +157,12 @@ class TextDriver(ABC):
         """Return the largest magnitude of a field."""
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Wait for lines."""
         self._reader.clear()
         self._first_bytes = self._last_line = b""
         self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * _SECOND_NS)
         return self._set_status(EndpointPhase.WAITING, "waiting for lines of text")
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process received bytes."""
         if len(self._first_bytes) < EXAMINED_BYTES:
             self._first_bytes += unit[: EXAMINED_BYTES - len(self._first_bytes)]
         out: list[Output[bytes]] = []
@@ -173,14 +171,12 @@ class TextDriver(ABC):
         return out
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Report silence."""
         if self._silence_deadline_ns is None or now.monotonic_ns < self._silence_deadline_ns:
             return []
         self._silence_deadline_ns = None
         return self._set_status(EndpointPhase.SILENT, self._explain_silence())
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         return self._silence_deadline_ns
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:

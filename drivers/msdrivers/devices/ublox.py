@@ -93,7 +93,6 @@ class UbxFormat:
     start_bytes = SYNC[:1]
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[UbxMessage] | RejectedFrame | None:
-        """Parse the frame at `at`."""
         if len(buffer) < at + HEADER_BYTES:
             return None if buffer[at : at + 2] == SYNC[: len(buffer) - at] else NO_FRAME
         if buffer[at : at + 2] != SYNC:
@@ -185,7 +184,6 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
 
 
 def make_version_poll() -> bytes:
-    """Return the request for MON-VER."""
     return _encode(UBXMessage("MON", "MON-VER", 2))
 
 

@@ -99,7 +99,6 @@ class VnBinaryFormat:
     start_bytes = bytes((SYNC,))
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[VnMessage] | RejectedFrame | None:
-        """Parse the message at `at`."""
         if len(buffer) < at + 2:
             return None
         groups = [bit + 1 for bit in range(8) if buffer[at + 1] >> bit & 1]
@@ -133,7 +132,6 @@ class VnTextFormat:
     start_bytes = b"$"
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[VnMessage] | RejectedFrame | None:
-        """Parse the message at `at`."""
         head = bytes(buffer[at : at + 3])
         if not b"$VN".startswith(head):
             return NO_FRAME

@@ -322,12 +322,23 @@ class _ActiveCommand(NamedTuple):
     until_ns: int
 
 
-class CommandedDriver(CanDriver):
-    """Base of a driver that accepts commands and sends their frames, if the settings have any; see the module."""
+class VehicleDriver(CanDriver):
+    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings`.
 
-    def __init__(self, settings: VehicleSettings, database: CanDatabase, needed: Mapping[FrameKey, str]):
-        """Bind the signals of the command. Raises ConfigError for unknown or unsuitable ones."""
+    A status is published if its fault word and its count of rejections were received or are not mapped; missing
+    numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
+    """
+
+    def __init__(self, settings: VehicleSettings, database: CanDatabase):
+        """Bind the signals of status and command. Raises ConfigError for unknown or unsuitable ones."""
+        place = f"drivers.{settings.source}"
+        self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
+        signals = self._status.signals if self._status is not None else {}
+        needed = {signal.key: signal.message for signal in signals.values()}
         super().__init__(database, needed, settings.silence, settings.window)
+        self.max_silence = settings.silence if signals else math.inf
+        self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
+        self._mode: VehicleMode | None = None
         self.settings = settings
         self._signals: BoundCommand | None = None
         self._command_key: FrameKey | None = None
@@ -341,7 +352,7 @@ class CommandedDriver(CanDriver):
         self._warned_until_ns: dict[str, int] = {}
         if settings.command is None:
             return
-        place, limits = f"drivers.{settings.source}", settings.limits
+        limits = settings.limits
         self._signals = bind_command(settings.command, database, f"{place}.command")
         self._command_key = self._signals.forward_speed.key
         forward, backward = (
@@ -355,7 +366,7 @@ class CommandedDriver(CanDriver):
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start; discard the active command and send stop instead: no command survives a reconnect."""
         outputs = super().on_open(now)
-        self._active = None
+        self._active, self._mode = None, None
         return [*outputs, self._make_frame(now)] if self._is_transmitting else outputs
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
@@ -427,7 +438,6 @@ class CommandedDriver(CanDriver):
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         is_sending = self._is_transmitting and not self.is_bus_off
         deadlines = (super().get_deadline(), self._next_ns if is_sending else None)
         until_ns = self._active.until_ns if self._active is not None and is_sending else None
@@ -491,7 +501,6 @@ class CommandedDriver(CanDriver):
         return replace(command, forward_speed=speed, steering_angle=angle), " and ".join(exceeded)
 
     def _make_frame(self, now: HostTime) -> Send[CanFrame]:
-        """Make the next frame of the active command, or of stop without one."""
         assert self._signals is not None
         is_stop = self._active is None
         self.counts["stops_sent"] += is_stop
@@ -506,29 +515,6 @@ class CommandedDriver(CanDriver):
             return []
         self._warned_until_ns[reason] = now.monotonic_ns + _WARNING_INTERVAL_NS
         return [EndpointStatus(self.phase, text, is_warning=True)]
-
-
-class VehicleDriver(CommandedDriver):
-    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings`.
-
-    A status is published if its fault word and its count of rejections were received or are not mapped; missing
-    numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
-    """
-
-    def __init__(self, settings: VehicleSettings, database: CanDatabase):
-        """Bind the signals. Raises ConfigError for unknown or unsuitable ones."""
-        place = f"drivers.{settings.source}.status"
-        self._status = bind_status(settings.status, database, place) if settings.status else None
-        signals = self._status.signals if self._status is not None else {}
-        super().__init__(settings, database, {signal.key: signal.message for signal in signals.values()})
-        self.max_silence = settings.silence if signals else math.inf
-        self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
-        self._mode: VehicleMode | None = None
-
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start; no command survives a reconnect, stop is sent instead."""
-        self._mode = None
-        return super().on_open(now)
 
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         status = self._status

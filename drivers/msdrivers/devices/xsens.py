@@ -105,7 +105,6 @@ class XbusFormat:
     start_bytes = bytes((PREAMBLE,))
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[XbusMessage] | RejectedFrame | None:
-        """Parse the message at `at`."""
         if len(buffer) < at + 4:
             return None if len(buffer) < at + 2 or buffer[at + 1] in BUS_IDS else NO_FRAME
         if buffer[at + 1] not in BUS_IDS:

@@ -324,7 +324,6 @@ class SampleEmulator(ABC, Generic[S]):
         return out
 
     def get_deadline(self) -> int | None:
-        """Return when the next sample is due."""
         if self._now is None or self._next is None:
             return None
         return self._now.monotonic_ns + (self._next.header.utime + self._latency_us - self._now.utime) * 1000

@@ -70,7 +70,7 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
 
 
 def _nan_to_zero(value: float) -> float:
-    return 0.0 if value != value else value
+    return value if math.isfinite(value) else 0.0
 
 
 def _get_height_msl(sample: GpsSample) -> float:
@@ -518,10 +518,6 @@ def _get_itow(sample: GpsSample) -> int:
     return gps_of(sample.header.utime)[1] // 1000
 
 
-def _zero(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
-
-
 def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
     # the second is the nearest one, nano what is missing to it
     second = (sample.header.utime + 500_000) // 1_000_000
@@ -529,7 +525,7 @@ def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
     fix, is_differential, carrier = _UBX_FIXES[sample.fix_type]
     east, north, up = sample.velocity or (0.0, 0.0, 0.0)
     P, V = sample.position_covariance, sample.velocity_covariance
-    height, msl = _get_heights(sample)
+    height, msl = _nan_to_zero(sample.height_ellipsoidal), _nan_to_zero(_get_height_msl(sample))
     return {
         "iTOW": _get_itow(sample),
         **{name: getattr(when, name) for name in ("year", "month", "day", "hour", "second")},
@@ -541,8 +537,8 @@ def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
         "diffSoln": is_differential,
         "carrSoln": carrier,
         "numSV": max(sample.satellites, 0),
-        "lat": _zero(sample.latitude_deg),
-        "lon": _zero(sample.longitude_deg),
+        "lat": _nan_to_zero(sample.latitude_deg),
+        "lon": _nan_to_zero(sample.longitude_deg),
         "height": round(1e3 * height),
         "hMSL": round(1e3 * msl),
         "hAcc": 0 if P is None else round(1e3 * math.sqrt(P[0] + P[4])),
@@ -553,21 +549,15 @@ def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
         "gSpeed": round(1e3 * math.hypot(east, north)),
         "headMot": math.degrees(math.atan2(east, north)) % 360.0,
         "sAcc": 100 if V is None else round(1e3 * math.sqrt(V[0] + V[4])),
-        "pDOP": min(_zero(sample.pdop), 99.0),
+        "pDOP": min(_nan_to_zero(sample.pdop), 99.0),
         "invalidLlh": int(fix == 0),
     }
 
 
-def _get_heights(sample: GpsSample) -> tuple[float, float]:
-    """Return the height above the ellipsoid and above mean sea level."""
-    height = _zero(sample.height_ellipsoidal)
-    return height, sample.height_msl if math.isfinite(sample.height_msl) else height - _zero(sample.undulation)
-
-
 def _fill_precise(sample: GpsSample) -> dict[str, Any]:
     # each number is a coarse one and the hundredths, or tenths, that are missing to it
-    height, msl = _get_heights(sample)
-    places = [_split(1e9 * _zero(value), 100) for value in (sample.longitude_deg, sample.latitude_deg)]
+    height, msl = _nan_to_zero(sample.height_ellipsoidal), _nan_to_zero(_get_height_msl(sample))
+    places = [_split(1e9 * _nan_to_zero(value), 100) for value in (sample.longitude_deg, sample.latitude_deg)]
     heights = [_split(1e4 * value, 10) for value in (height, msl)]
     coarse, fine = zip(*places, *heights, strict=True)
     is_invalid = int(sample.fix_type is FixType.NONE)
@@ -585,7 +575,7 @@ def _split(value: float, parts: int) -> tuple[int, int]:
 
 def _fill_dop(sample: GpsSample) -> dict[str, Any]:
     dops = {"pDOP": sample.pdop, "vDOP": sample.vdop, "hDOP": sample.hdop}
-    return {"iTOW": _get_itow(sample), **{name: min(_zero(value), 99.0) for name, value in dops.items()}}
+    return {"iTOW": _get_itow(sample), **{name: min(_nan_to_zero(value), 99.0) for name, value in dops.items()}}
 
 
 def _fill_cov(sample: GpsSample) -> dict[str, Any]:
@@ -602,12 +592,12 @@ def _fill_cov(sample: GpsSample) -> dict[str, Any]:
 def _fill_relative(sample: GpsSample) -> dict[str, Any]:
     """The vector from the moving base to this antenna: the baseline points the other way."""
     is_known = math.isfinite(sample.baseline_yaw)
-    yaw = _zero(sample.baseline_yaw) + math.pi
+    yaw = _nan_to_zero(sample.baseline_yaw) + math.pi
     return {
         "version": 1,
         "iTOW": _get_itow(sample),
         "relPosHeading": (90.0 - math.degrees(yaw)) % 360.0,
-        "accHeading": math.degrees(_zero(sample.baseline_yaw_sigma)),
+        "accHeading": math.degrees(_nan_to_zero(sample.baseline_yaw_sigma)),
         "carrSoln": 2 if is_known else 0,
         **dict.fromkeys(("gnssFixOK", "relPosValid", "relPosHeadingValid", "isMoving"), int(is_known)),
     }

@@ -469,7 +469,6 @@ class Gx1Emulator:
         return [EndpointStatus(phase, f"3DM-GX1 {self.unit.serial} emulated")]
 
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
-        """Process received bytes."""
         outputs = self.on_timer(now)
         if now.monotonic_ns < max(self._clock.started_ns, self._faults.silent_until_ns):
             return outputs
@@ -479,7 +478,6 @@ class Gx1Emulator:
         return outputs + self._pop_sent(now.monotonic_ns)
 
     def on_timer(self, now: HostTime) -> list[Output[bytes]]:
-        """Do what is due."""
         if self._opened_ns is None:
             return []
         self._utime_offset_us = now.utime - now.monotonic_ns // 1000
@@ -489,7 +487,6 @@ class Gx1Emulator:
         return self._pop_sent(now.monotonic_ns)
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         if self._opened_ns is None:
             return None
         instants = [self._clock.instant_of(self._tick)]

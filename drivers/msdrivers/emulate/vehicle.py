@@ -175,7 +175,6 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         return super().on_open(now)
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Process a command."""
         outputs = self.on_timer(now)
         command = self._command
         is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
@@ -321,7 +320,6 @@ class AxisEmulator:
         return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        """Answer a request."""
         for fault, due in self._faults.pop_due(now.monotonic_ns):
             self._apply_fault(fault, due)
         if self._faults.is_silent(now.monotonic_ns) or not isinstance(unit, ReadRegisters | WriteRegisters):
@@ -333,11 +331,9 @@ class AxisEmulator:
         return [*self._faults.filter_units((reply,), now.monotonic_ns)]
 
     def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        """Do nothing: it only answers."""
         return []
 
     def get_deadline(self) -> int | None:
-        """Return None: it only answers."""
         return None
 
     def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
@@ -477,7 +473,6 @@ class TextJointsEmulator:
         return [Send(encode_line(self._settings, self.get_values(due * PERIOD_US * 1e-6)))]
 
     def get_deadline(self) -> int | None:
-        """Return when the next line is due."""
         return None if self._first is None else self._first.monotonic_ns + self._sent * PERIOD_US * 1000
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:

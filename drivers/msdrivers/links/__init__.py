@@ -67,7 +67,6 @@ class LinkWrapper(Generic[U]):
 
     @property
     def description(self) -> str:
-        """Path or address of the wrapped link."""
         return self._link.description
 
     @property
@@ -75,7 +74,6 @@ class LinkWrapper(Generic[U]):
         return self._link.baud
 
     def open(self, baud: int | None = None) -> None:
-        """Open the wrapped link. Raises LinkError."""
         self._link.open(baud)
 
     def close(self) -> None:
@@ -90,7 +88,6 @@ class GuardedLink(LinkWrapper[U]):
         self._on_error = on_error
 
     def open(self, baud: int | None = None) -> None:
-        """Open the line. Raises LinkError."""
         with self._guard("open"):
             self._link.open(baud)
 
@@ -102,12 +99,10 @@ class GuardedLink(LinkWrapper[U]):
             self._on_error("link.close")
 
     def poll(self, timeout: float) -> Sequence[U]:
-        """Return received units. Raises LinkError."""
         with self._guard("poll"):
             return self._link.poll(timeout)
 
     def send(self, unit: U) -> None:
-        """Send a unit. Raises LinkError."""
         with self._guard("send"):
             self._link.send(unit)
 
@@ -224,7 +219,6 @@ class TcpLink(DescriptorLink):
             connection.close()
 
     def fileno(self) -> int:
-        """Return the connection's descriptor. Raises LinkError if it is not open."""
         if self._socket is None:
             raise LinkError(self.description, "the line is not open")
         return self._socket.fileno()
@@ -245,7 +239,6 @@ class TcpServerLink(DescriptorLink):
         """Number of clients so far."""
 
     def open(self, baud: int | None = None) -> None:
-        """Listen. Raises LinkError if the port is in use."""
         if self._server is not None:
             return
         host, port = self._address
@@ -263,7 +256,6 @@ class TcpServerLink(DescriptorLink):
         self.description = f"tcp {host}:{self._address[1]}"
 
     def close(self) -> None:
-        """Disconnect and stop listening."""
         self.disconnect_client()
         if self._server is not None:
             self._server.close()

@@ -78,7 +78,6 @@ class CanLink:
             raise self._explain_error(error) from None
 
     def close(self) -> None:
-        """Close the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
             with contextlib.suppress(Exception):
@@ -106,7 +105,6 @@ class CanLink:
         return frames
 
     def send(self, unit: CanFrame) -> None:
-        """Send a frame. Raises LinkError."""
         message = can.Message(
             arbitration_id=unit.arbitration_id,
             data=unit.data,

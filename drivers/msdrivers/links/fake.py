@@ -46,7 +46,6 @@ class FakeLink(Generic[U]):
         self.is_open = False
 
     def open(self, baud: int | None = None) -> None:
-        """Open it, where it is not away."""
         self._check()
         self.baud = baud or self.baud
         self.opened_bauds.append(baud)

@@ -106,7 +106,6 @@ class ModbusLink(LinkWrapper[bytes]):
         return f"modbus {self._link.description.removeprefix('tcp ')} unit {self._unit_id}"
 
     def open(self, baud: int | None = None) -> None:
-        """Connect. Raises LinkError."""
         self._framer.clear()
         self._pending.clear()
         super().open(baud)

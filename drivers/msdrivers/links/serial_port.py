@@ -188,7 +188,6 @@ class SerialLink(DescriptorLink):
             port.close()
 
     def fileno(self) -> int:
-        """Return the port's descriptor. Raises LinkError if it is not open."""
         if self._serial is None:
             raise LinkError(self.description, "the port is not open")
         return self._serial.fileno()
@@ -279,7 +278,6 @@ class PtyLink(DescriptorLink):
         return self._emulator_fd
 
     def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return what the driver sent. Raises LinkError."""
         return tuple(self._apply_baud(data) for data in super().poll(timeout))
 
     def send(self, unit: bytes) -> None:

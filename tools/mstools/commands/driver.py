@@ -324,7 +324,7 @@ def subscribe_commands(
     from modelserver.wire.channels import DRIVE_SIGNED, to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.provider import handle_message
-    from msdrivers.signed_commands import COMMAND_TYPE, CommandDeniedError, DriveVerifier
+    from msdrivers.runner import COMMAND_TYPE, CommandDeniedError, DriveVerifier
 
     prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
     plain = f"{prefix}{channel}"

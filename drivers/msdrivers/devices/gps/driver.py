@@ -174,11 +174,9 @@ class GpsStream(FrameScanner[Any]):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Frames by kind, `rejected.<reason>`, `skipped` bytes."""
         return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
 
     def feed(self, data: bytes) -> list[GpsMessage]:
-        """Return what `data` completes."""
         messages: list[GpsMessage] = []
         for each in super().feed(data):
             messages += self._epochs.add(each) if isinstance(each, NmeaSentence) else [each]
@@ -219,7 +217,6 @@ FIX_TYPES: dict[int, FixType] = {
 
 
 def sample_from_nmea(header: SensorHeader, epoch: NmeaEpoch) -> GpsSample:
-    """Convert an NMEA epoch to a sample."""
     return GpsSample(
         header,
         epoch.fix_type,
@@ -335,7 +332,6 @@ class FixAssembler:
             self._problems.append(text)
 
     def get_deadline(self) -> int | None:
-        """Return the release time of the pending position, monotonic nanoseconds."""
         return self._waiting[2] if self._waiting else None
 
     def on_timer(self, now: HostTime) -> list[GpsFix]:
@@ -461,7 +457,6 @@ class LineMonitor:
         self._counts_at_reset = dict(counts)
 
     def add(self, data: bytes) -> None:
-        """Record received data."""
         self._bytes_received += len(data)
         if len(self._first_bytes) < EXAMINED_BYTES:
             self._first_bytes = (self._first_bytes + data)[:EXAMINED_BYTES]
@@ -498,7 +493,6 @@ class LineMonitor:
         return f"{text}; {_REMEDIES[flaw]}" if flaw else text
 
     def describe(self, counts: Mapping[str, int]) -> str:
-        """Describe the received data."""
         if not self._bytes_received:
             return "nothing"
         kinds, names = self.list_valid_kinds(counts), ", ".join(sorted(self._names))
@@ -558,7 +552,6 @@ class GpsDriver(StreamDriver[GpsMessage]):
         return "waiting for a receiver" + (f" at {bauds[self._baud_index]} baud" if bauds else "")
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process received bytes."""
         self._monitor.add(unit)
         self._last_byte_ns = now.monotonic_ns
         return super().on_receive(unit, now)

@@ -203,7 +203,6 @@ class SentenceFormat:
     _sum = re.compile("[0-9A-Fa-f]{2}")
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[NmeaSentence] | RejectedFrame | None:
-        """See `framing.FrameFormat`."""
         body = self._body.match(buffer, at, at + MAX_SENTENCE_BYTES)
         assert body is not None
         end = body.end()

@@ -362,7 +362,6 @@ class BodyLayout:
         return self._check(values)
 
     def pack(self, body: Body) -> bytes:
-        """Encode a body in binary."""
         values: list[Any] = list(body)
         for n, _, pack in self._converted:
             values[n] = pack(values[n])
@@ -374,7 +373,6 @@ class BodyLayout:
         return self._check([each.parse(text) for each, text in columns if each.parse is not None])
 
     def format(self, body: Body) -> list[str]:
-        """Encode a body as ASCII fields."""
         values = iter(body)
         return [each.text if each.parse is None else each.format(next(values)) for each in self._columns]
 
@@ -490,7 +488,6 @@ class BinaryFormat:
     start_bytes = b"\xaa"
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[NovatelLog] | RejectedFrame | None:
-        """See `framing.FrameFormat`."""
         available = len(buffer) - at
         if available < 4:
             return None if b"\xaa\x44".startswith(buffer[at : at + 2]) else NO_FRAME
@@ -539,7 +536,6 @@ class AsciiFormat:
     _sum = re.compile(rb"[0-9A-Fa-f]{8}")
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[NovatelLog] | RejectedFrame | None:
-        """See `framing.FrameFormat`."""
         if len(buffer) == at + 1:
             return None
         begin = self._begin.match(buffer, at, at + _MAX_NAME_BYTES)
@@ -609,7 +605,6 @@ class TextFormat:
     _longest = 256
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[CommandResponse] | RejectedFrame | None:
-        """See `framing.FrameFormat`."""
         line = self._line.match(buffer, at, at + self._longest)
         assert line is not None
         end = line.end()
@@ -635,7 +630,6 @@ class PromptFormat:
     _part = re.compile(rb"\[[A-Z]*\d{0,2}")
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[Prompt] | RejectedFrame | None:
-        """See `framing.FrameFormat`."""
         prompt = self._prompt.match(buffer, at)
         if prompt is not None:
             return ParsedFrame(prompt.end(), "novatel.prompt", Prompt(start, prompt[1].decode("ascii")))

@@ -164,7 +164,6 @@ class Gx1Receiver:
         self.parser.set_streamed(*((command,) if command else ()))
 
     def reset(self) -> None:
-        """Forget expected replies and ticks."""
         self.set_streamed(0)
         self.parser.clear()
         self.ticks.reset()
@@ -175,7 +174,6 @@ class Gx1Receiver:
         self._first_bytes, self.bytes_received = b"", 0
 
     def describe_input(self) -> str:
-        """Describe the input since `reset_input`."""
         if not self.bytes_received:
             return "nothing"
         if (protocol := recognize(self._first_bytes)) is not None:
@@ -252,7 +250,6 @@ class Gx1ScriptRunner(ScriptRunner):
         self._parser = parser
 
     def on_packet(self, packet: Gx1Packet, now: HostTime) -> list[Output[bytes]]:
-        """Process a reply."""
         step = self.step
         if isinstance(step, CollectStep):
             self._reply.append(packet)
@@ -602,7 +599,6 @@ class TickRateCheck:
         return True
 
     def describe(self) -> str:
-        """Describe the result."""
         expected = f"{self._tick_s * 1e3:.4g} ms"
         if self.is_consistent:
             return f"the device's ticks take {expected} again, as they should: its time is used"
@@ -658,7 +654,6 @@ class Gx1Driver:
         return self._script.start(self._run_setup(), now) if outputs is None else outputs
 
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
-        """Process received bytes."""
         outputs: list[Output[bytes]] = []
         for reply in self._link.feed(unit, now):
             if self._script.is_running:
@@ -684,7 +679,6 @@ class Gx1Driver:
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         if self._script.is_running:
             return self._script.deadline_ns
         return min(self._silence_deadline_ns(), self._polls.deadline_ns)
