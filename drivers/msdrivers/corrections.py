@@ -33,9 +33,7 @@ from msdrivers.registry import NtripSettings, split_address
 from msdrivers.runner import Runner
 
 PREAMBLE: Final = 0xD3
-
 HEADER_BYTES: Final = 3
-
 CRC_BYTES: Final = 3
 
 _POLYNOMIAL: Final = 0x1864CFB
@@ -106,7 +104,6 @@ class RtcmStream(FrameScanner[RtcmFrame]):
 
 
 MAX_HEADER: Final = 8192
-
 MAX_CHUNK: Final = 1 << 20
 
 
@@ -237,19 +234,14 @@ def make_gga(
 log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S: Final = 5.0
-
 POLL_S: Final = 0.2
 """Longest wait for bytes: so long does the thread take to end."""
-
 SILENCE_S: Final = 30.0
 """After this time without a byte the connection is given up."""
-
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 """Delays before another attempt, doubled each time."""
-
 MAX_WAITING: Final = 256
 """Frames that wait for the driver; of more the oldest are lost: old corrections are of no use."""
-
 DAY_US: Final = 86_400_000_000
 
 

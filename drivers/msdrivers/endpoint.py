@@ -174,7 +174,6 @@ def make_bus_off_frame() -> CanFrame:
 
 
 MAX_READ = 125
-
 MAX_WRITE = 123
 """Registers in one request."""
 

@@ -41,11 +41,8 @@ from msdrivers.raw_log import BYTES_CODEC, UnitCodec
 from msdrivers.registry import KINDS, DeviceKind, EmulatorInputs, LineSettings, NtripSettings, TcpSettings, get_line_key
 
 _LIST_ERRORS = ("tuple_type", "list_type")
-
 _SECTION_ERRORS = ("dataclass_type", "dict_type")
-
 _CHOICE_ERRORS = ("literal_error", "enum")
-
 _EXPECTED = {
     "float_type": "a number",
     "finite_number": "a finite number",

@@ -360,22 +360,15 @@ MAX_DBC_CHARS: Final = 8 << 20
 """Largest DBC file in characters."""
 
 _WRONG_FILE_FIX = "is this the DBC file of the vehicle, saved as plain text?"
-
 _FIX = "correct it there"
-
 _BYTE_ORDER_MARKS = ("\ufeff", "\u00ef\u00bb\u00bf")
 """As text, and read as Latin-1."""
 
 _KEYWORD = re.compile(r"\s*(BO_|SG_|[A-Z][A-Z_]*_)\b")
-
 _MESSAGE = re.compile(r"\s*BO_\s+(\d+)\s+(\w+)\s*:")
-
 _OF_MESSAGE = re.compile(r"\s*(VAL_|SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\b|\s*BA_\s+\"VFrameFormat\"\s+BO_\s+(\d+)\b")
-
 _FRAME_FORMAT = re.compile(r"\s*BA_DEF_(DEF_)?\s+(BO_\s+)?\"VFrameFormat\"")
-
 _PLACE = re.compile(r"at line (\d+)")
-
 _HEAD: Final = 'VERSION ""\nNS_ :\nBS_:\nBU_:\n'
 
 

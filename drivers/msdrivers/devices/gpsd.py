@@ -38,9 +38,7 @@ WATCH: Final = b'?WATCH={"enable":true,"json":true}\n'
 USED: Final = frozenset({"TPV", "SKY", "GST", "VERSION", "DEVICES", "WATCH", "ERROR"})
 
 _STATUS: Final = {2: FixType.DIFFERENTIAL, 3: FixType.RTK_FIXED, 4: FixType.RTK_FLOAT}
-
 _DEAD_RECKONING: Final = (5, 6)
-
 _NO_MEASUREMENT: Final = (7, 8)
 """A surveyed position of a time receiver, and a simulation."""
 

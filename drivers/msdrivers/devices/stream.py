@@ -205,9 +205,7 @@ def _count_xbus(data: bytes) -> int:
 
 
 _SENTENCE: Final = re.compile(rb"\$([A-Z]{2,6}[^*\r\n]{0,200})\*([0-9A-Fa-f]{2})")
-
 _VECTORNAV: Final = re.compile(rb"\$VN[A-Z]{3},[^*\r\n]{0,200}\*[0-9A-Fa-f]{2}")
-
 _NOVATEL_ASCII: Final = re.compile(rb"#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
 
 
@@ -413,7 +411,6 @@ EXAMINED_BYTES: Final = 4096
 """First bytes of a line by which another device is recognized."""
 
 SECOND_NS: Final = 1_000_000_000
-
 WARNING_INTERVAL_NS: Final = 60 * SECOND_NS
 """Rate limit of the warning that no device was found."""
 

@@ -127,7 +127,6 @@ def encode_line(description: TextSettings, values: Mapping[str, float]) -> bytes
 
 
 EXAMINED_BYTES: Final = 4096
-
 _SECOND_NS: Final = 1_000_000_000
 
 

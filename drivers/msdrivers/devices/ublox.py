@@ -46,9 +46,7 @@ from msdrivers.devices.stream import (
 from msdrivers.endpoint import HostTime, Output
 
 SYNC: Final = b"\xb5\x62"
-
 HEADER_BYTES: Final = 6
-
 CHECKSUM_BYTES: Final = 2
 
 MAX_PAYLOAD: Final = 4096
@@ -66,7 +64,6 @@ USED: Final = frozenset(
 """Messages that are decoded; the others are counted."""
 
 REQUIRED_OUTPUT: Final = ("NAV_PVT",)
-
 OPTIONAL_OUTPUT: Final = ("NAV_EOE", "NAV_DOP", "NAV_COV", "NAV_HPPOSLLH", "NAV_RELPOSNED", "RXM_RTCM")
 """Messages that a receiver is asked for. Not every product has the optional ones."""
 
@@ -74,7 +71,6 @@ PORTS: Final = ("UART1", "USB")
 """Ports of the receiver that messages are switched on at: which one this line is, the receiver does not state."""
 
 _RAM: Final = 1
-
 _NO_TRANSACTION: Final = 0
 
 

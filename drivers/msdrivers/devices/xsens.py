@@ -30,9 +30,7 @@ from msdrivers.devices.stream import (
 from msdrivers.endpoint import HostTime, Output
 
 PREAMBLE: Final = 0xFA
-
 BUS_IDS: Final = (0xFF, 0x01)
-
 MAX_DATA: Final = 2048
 
 
@@ -69,9 +67,7 @@ class ItemId(IntEnum):
 
 
 FRAME_MASK: Final = 0x000C
-
 FRAME_ENU, FRAME_NED = 0x0, 0x4
-
 FORMAT_MASK: Final = 0x0003
 
 TICK: Final = 1e-4
@@ -195,7 +191,6 @@ def _read_double(data: bytes) -> float:
 
 
 _SIZES: Final = (4, 4, 6, 8)
-
 _READERS: Final = (_read_float, _read_fixed_12_20, _read_fixed_16_32, _read_double)
 
 
@@ -242,7 +237,6 @@ ERRORS: Final = {
 """Meaning of the code in an error message."""
 
 MAX_RATE: Final = 60.0
-
 MAX_ACCELERATION: Final = 400.0
 """Beyond the ranges of the units, with room: rad/s, m/s2."""
 

@@ -50,7 +50,6 @@ _FIXES = {
     FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
 """Position type, quality in GGA, mode in RMC and VTG."""
-
 _WGS84 = 61
 
 
@@ -204,11 +203,8 @@ NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
 
 
 _PORT = "COM1"
-
 _PROMPT = f"[{_PORT}]".encode()
-
 _MAX_COMMAND_BYTES = 200
-
 _NO_EFFECT_COMMANDS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
 """Commands that are accepted and change nothing here."""
 

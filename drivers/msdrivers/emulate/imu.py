@@ -367,7 +367,6 @@ class UnitClock:
 
 
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
-
 _NED_FROM_ENU: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """Rotation by 180 degrees about the axis between east and north."""
 

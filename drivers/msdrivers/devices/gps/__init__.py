@@ -14,13 +14,9 @@ from modelserver.transforms.so3 import Matrix3
 
 SECOND = 1_000_000
 """Microseconds."""
-
 DAY = 86_400 * SECOND
-
 WEEK = 7 * DAY
-
 ROLLOVER = 1024 * WEEK
-
 GPS_EPOCH = (date(1980, 1, 6) - date(1970, 1, 1)).days * DAY
 """utime of the beginning of GPS time."""
 
@@ -31,7 +27,6 @@ _LEAP_DATES = sorted(
 """Days before whose beginning a second was inserted, since 1980 (IERS Bulletin C; none after 2017 up to 2026)."""
 
 _LEAP_UTC = tuple((day - date(1970, 1, 1)).days * DAY for day in _LEAP_DATES)
-
 _LEAP_GPS = tuple(utime - GPS_EPOCH + (number + 1) * SECOND for number, utime in enumerate(_LEAP_UTC))
 """GPS microseconds at which UTC's day begins after each inserted second."""
 

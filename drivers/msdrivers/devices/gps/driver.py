@@ -59,11 +59,8 @@ from msdrivers.devices.stream import (
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 PROTOCOLS = ("novatel", "nmea")
-
 FORMATS = ("binary", "ascii")
-
 POSITION_LOGS = ("BESTPOS", "RTKPOS", "PSRPOS")
-
 HEADING_LOGS = ("", "HEADING", "HEADING2")
 
 
@@ -427,17 +424,13 @@ QUOTED_BYTES = 24
 
 
 MAX_NAMES = 6
-
 MIN_FLAWED_SENTENCES = 2
 """Fewer flawed sentences may be chance."""
-
 _ADDRESS = re.compile(rb"\$([A-Z]{2}[A-Z]{3}|P[A-Z]{3,5}),")
-
 _FLAWS = {
     "rejected.nmea_incomplete": "without checksum",
     "rejected.nmea_field": "with a right checksum and a field that cannot be",
 }
-
 _REMEDIES = {
     _FLAWS["rejected.nmea_incomplete"]: "switch its checksums on",
     _FLAWS["rejected.nmea_field"]: "compare its sentences with NMEA 0183, it writes them otherwise",

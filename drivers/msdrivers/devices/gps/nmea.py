@@ -35,16 +35,12 @@ from msdrivers.devices.stream import NO_FRAME, ParsedFrame, RejectedFrame
 
 KNOT = 1852.0 / 3600.0
 """Meters per second."""
-
 KMH = 1.0 / 3.6
 
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
-
 _CLOCK = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
-
 _ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
-
 _UNIX_DAY = date(1970, 1, 1).toordinal()
 
 
@@ -400,19 +396,14 @@ def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
 
 POSITION_KINDS = ("GGA", "GNS", "RMC", "GLL")
 """Sentences with a position, the most detailed first."""
-
 _MOTION = frozenset({"VTG", "HDT"})
 """Sentences with the receiver's motion but without a time: of another instant their content is wrong."""
-
 _MIN_LESSONS = 2
 """Number of cycles that determine the order of sentences."""
-
 _TIMED = frozenset({*POSITION_KINDS, "GST"})
 """Sentences whose time is that of the fix. ZDA's is the clock's, which in some receivers is seconds ahead."""
-
 _MAX_SENTENCES = 64
 """Largest number of sentences in an epoch."""
-
 _MIN_STABLE_US = SECOND
 """How long cycles must be equal; sentences that are not sent each instant are mostly sent once a second."""
 

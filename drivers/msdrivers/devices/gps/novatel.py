@@ -312,9 +312,7 @@ def _decode_letter(number: int) -> str:
 
 
 _SOLUTION = (_enumeration(SolutionStatus), _enumeration(PositionType))
-
 _COUNTS = (_Column("B", partial(parse_integer, most=0xFF)),) * 2
-
 _STATION = _Column(
     "4s",
     str,
@@ -322,23 +320,17 @@ _STATION = _Column(
     lambda raw: raw.partition(b"\0")[0].decode("ascii", "replace"),
     lambda text: text.encode("ascii"),
 )
-
 _DATUM = _Column(
     "I",
     lambda word: DATUMS.get(word, 0),
     lambda number: next((name for name, each in DATUMS.items() if each == number), "USER"),
 )
-
 _ZONE = (_Column("I", partial(parse_integer, most=0xFFFF_FFFF)), _Column("I", str, str, _decode_letter, ord))
-
 _RESERVED = _Column("4x", text="0.0")
-
 _TAIL = (_Column("x", text="0"),) * 3 + (_Column("x", text="00"),) * 3
 """Counts of observations and masks that end several logs."""
-
 _FIX = (_DATUM, *(_real("f", 4),) * 3, _STATION, *(_real("f", 3),) * 2, *_COUNTS, *_TAIL)
 """What BESTPOS and BESTUTM have after the place: datum, sigmas, station, ages, satellites."""
-
 _BASELINE = (*_SOLUTION, _real("f", 4), *(_real("f", 6),) * 2, _RESERVED, *(_real("f", 4),) * 2, _STATION)
 
 
@@ -423,24 +415,18 @@ BODIES = {
 
 MAX_LOG_BYTES = 1024
 """Bytes of a log. Longer ones (raw observations) are not read here; a broken length must not swallow good logs."""
-
 _MAX_NAME_BYTES = 40
-
 _WEEK_MS = 604_800_000
 
 _LONG_HEADER = Struct("<HBBHHxBHII4x")
 """After sync (AA 44 12) and header length: id, type, port, body length, sequence, time status, week, ms, receiver
 status."""
-
 _LONG_BYTES = 4 + _LONG_HEADER.size
-
 _SHORT_HEADER = Struct("<HHI")
 """After sync (AA 44 13) and body length: id, week, ms."""
-
 _SHORT_BYTES = 4 + _SHORT_HEADER.size
 
 _IDS = {name: ident for ident, name in MESSAGE_IDS.items()}
-
 _PORTS = {"COM1": 32, "COM2": 64, "COM3": 96}
 
 

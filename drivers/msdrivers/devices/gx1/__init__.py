@@ -113,9 +113,7 @@ _SLICES = {
     }
     for command, layout in LAYOUTS.items()
 }
-
 _STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in LAYOUTS.items()}
-
 _UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
 
 
@@ -415,11 +413,8 @@ TESLA = 1e-4
 """A gauss."""
 
 _FULL_SCALE = 32_768_000.0
-
 _ANGLE_SCALE = 2.0 * math.pi / 65536.0
-
 _QUATERNION_SCALE = 1.0 / 8192.0
-
 MIN_WORD, MAX_WORD = -32768, 32767
 
 QUARTER_TURN = 16384

@@ -271,7 +271,6 @@ class Gx1ScriptRunner(ScriptRunner):
 
 
 LISTEN_S = 0.3
-
 FLUSH_TIMEOUT_S = 1.0
 """How long a device may take to end its stream, as DUNE's driver allows."""
 
@@ -502,7 +501,6 @@ class GravityCheck:
 
 
 NEVER = 1 << 62
-
 REPLY_TIMEOUT_NS = 500_000_000
 """Reply timeout."""
 
@@ -549,7 +547,6 @@ class PollSchedule:
 
 
 WINDOW_NS = 5_000_000_000
-
 TOLERANCE = 0.005
 """Largest relative deviation of a tick within a window: 25 ms, a tick or two plus the variation of the delay."""
 
@@ -616,7 +613,6 @@ BIAS_CAPTURE_TIMEOUT_S = 9.0
 """Timeout of the gyro bias capture: shorter than the runner's reopen timeout."""
 
 GRAVITY_POLL_PERIOD_S = 1.0
-
 _GRAVITY_MESSAGES = (CommandByte.EULER_VECTORS, CommandByte.QUATERNION_VECTORS)
 """Messages with specific force, rates and orientation, as `GravityCheck` needs."""
 
