@@ -99,34 +99,25 @@ def _has_station(number: int) -> bool:
 class RtcmStream(FrameScanner[RtcmFrame]):
     """Parses bytes to frames. Never raises; memory is bounded."""
 
-    def __init__(self) -> None:
-        super().__init__((RtcmFormat(),))
+    formats = (RtcmFormat(),)
 
 
 MAX_HEADER: Final = 8192
 MAX_CHUNK: Final = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class NtripRequest:
-    """What is asked of a caster. `host` has no port."""
-
-    host: str
-    mountpoint: str
-    user: str = ""
-    password: str = ""
-
-    def encode(self) -> bytes:
-        lines = [
-            f"GET /{self.mountpoint} HTTP/1.1",
-            f"Host: {self.host}",
-            "Ntrip-Version: Ntrip/2.0",
-            f"User-Agent: NTRIP ModelServer/{__version__}",
-            "Connection: close",
-        ]
-        if self.user:
-            lines.append(f"Authorization: Basic {b64encode(f'{self.user}:{self.password}'.encode()).decode()}")
-        return ("\r\n".join(lines) + "\r\n\r\n").encode("utf-8")
+def encode_request(settings: NtripSettings) -> bytes:
+    """Return the request for a mountpoint."""
+    lines = [
+        f"GET /{settings.mountpoint} HTTP/1.1",
+        f"Host: {split_address(settings.caster)[0]}",
+        "Ntrip-Version: Ntrip/2.0",
+        f"User-Agent: NTRIP ModelServer/{__version__}",
+        "Connection: close",
+    ]
+    if settings.user:
+        lines.append(f"Authorization: Basic {b64encode(f'{settings.user}:{settings.password}'.encode()).decode()}")
+    return ("\r\n".join(lines) + "\r\n\r\n").encode("utf-8")
 
 
 class NtripError(Exception):
@@ -136,21 +127,16 @@ class NtripError(Exception):
 class NtripSession:
     """Bytes of a caster in, frames out. `stream.counts` has the frames by kind and what was rejected."""
 
-    def __init__(self, request: NtripRequest) -> None:
-        self._request = request
+    def __init__(self, mountpoint: str) -> None:
+        self._mountpoint = mountpoint
         self._buffer = b""
-        self._is_answered = self._is_chunked = False
+        self.is_answered = self._is_chunked = False
         self._chunk_left = 0
         self.stream = RtcmStream()
 
-    @property
-    def is_answered(self) -> bool:
-        """Whether the caster has accepted the request."""
-        return self._is_answered
-
     def feed(self, data: bytes) -> list[RtcmFrame]:
         """Return the frames that `data` completes. Raises NtripError."""
-        if not self._is_answered:
+        if not self.is_answered:
             self._buffer += data
             body = self._read_header()
             if body is None:
@@ -167,10 +153,10 @@ class NtripSession:
             return None
         status = line.decode("latin-1")
         if status.startswith("ICY 200"):
-            self._is_answered, self._buffer = True, b""
+            self.is_answered, self._buffer = True, b""
             return rest
         if status.startswith("SOURCETABLE"):
-            raise NtripError(f"the caster has no mountpoint {self._request.mountpoint!r}: check mountpoint")
+            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
         words = status.split(" ", 2)
         if not words[0].startswith("HTTP/") or len(words) < 2:
             raise NtripError(f"the server's answer {status[:60]!r} is not that of an NTRIP caster: check caster")
@@ -184,8 +170,8 @@ class NtripSession:
             return None
         text = header.decode("latin-1").lower()
         if "gnss/sourcetable" in text:
-            raise NtripError(f"the caster has no mountpoint {self._request.mountpoint!r}: check mountpoint")
-        self._is_answered, self._buffer = True, b""
+            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+        self.is_answered, self._buffer = True, b""
         self._is_chunked = "transfer-encoding: chunked" in text
         return body
 
@@ -219,16 +205,13 @@ class NtripSession:
         return content
 
 
-def make_gga(
-    latitude_deg: float, longitude_deg: float, height_msl: float, satellites: int, time_of_day_us: int
-) -> bytes:
-    """Return the sentence by which a network of stations computes corrections for this place."""
-    place = (*nmea.format_angle(latitude_deg, "NS", 2), *nmea.format_angle(longitude_deg, "EW", 3))
-    height = (nmea.format_number(height_msl, 2), "M", "0.0", "M")
-    count = str(max(satellites, 4))
-    return nmea.encode(
-        "GP", "GGA", (nmea.format_time_of_day(time_of_day_us), *place, "1", count, "1.0", *height, "", "")
-    )
+def make_gga(sample: GpsSample, time_of_day_us: int) -> bytes:
+    """Return the sentence by which a network of stations computes corrections for the place of a fix."""
+    height = sample.height_msl if sample.height_msl == sample.height_msl else sample.height_ellipsoidal
+    place = (*nmea.format_angle(sample.latitude_deg, "NS", 2), *nmea.format_angle(sample.longitude_deg, "EW", 3))
+    heights = (nmea.format_number(height if height == height else 0.0, 2), "M", "0.0", "M")
+    quality = ("1", str(max(sample.satellites, 4)), "1.0")
+    return nmea.encode("GP", "GGA", (nmea.format_time_of_day(time_of_day_us), *place, *quality, *heights, "", ""))
 
 
 log = logging.getLogger(__name__)
@@ -323,19 +306,17 @@ class CorrectionsClient:
     def _receive(self) -> None:
         """Receive until the connection ends. Raises OSError, NtripError."""
         settings = self._settings
-        host, port = split_address(settings.caster)
-        request = NtripRequest(host, settings.mountpoint, settings.user, settings.password)
-        session = NtripSession(request)
-        with contextlib.closing(socket.create_connection((host, port), CONNECT_TIMEOUT_S)) as connection:
+        session, address = NtripSession(settings.mountpoint), split_address(settings.caster)
+        with contextlib.closing(socket.create_connection(address, CONNECT_TIMEOUT_S)) as connection:
             self._counts["connects"] += 1
-            connection.sendall(request.encode())
+            connection.sendall(encode_request(settings))
             connection.settimeout(POLL_S)
             last_s, gga_s = self._monotonic(), -1e9
             while not self._is_stopping.is_set():
                 now = self._monotonic()
                 if session.is_answered and settings.gga_period and now - gga_s >= settings.gga_period and self._place:
                     gga_s = now
-                    connection.sendall(_make_position(self._place))
+                    connection.sendall(make_gga(self._place, (time.time_ns() // 1000) % DAY_US))
                 try:
                     data = connection.recv(4096)
                 except TimeoutError:
@@ -365,11 +346,3 @@ class CorrectionsClient:
         if text != self._reported:
             self._reported = text
             log.warning("%s: %s", self._name, text)
-
-
-def _make_position(sample: GpsSample) -> bytes:
-    height = sample.height_msl if sample.height_msl == sample.height_msl else sample.height_ellipsoidal
-    height = height if height == height else 0.0
-    return make_gga(
-        sample.latitude_deg, sample.longitude_deg, height, sample.satellites, (time.time_ns() // 1000) % DAY_US
-    )

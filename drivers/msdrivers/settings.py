@@ -33,12 +33,23 @@ from modelserver.errors import (
     suggest_key,
     suggest_name,
 )
-from msdrivers import registry as lines
 from msdrivers.emulate import InjectedFault
 from msdrivers.endpoint import CanFrame, Endpoint, ModbusUnit
 from msdrivers.links import Link
 from msdrivers.raw_log import BYTES_CODEC, UnitCodec
-from msdrivers.registry import KINDS, DeviceKind, EmulatorInputs, LineSettings, NtripSettings, TcpSettings, get_line_key
+from msdrivers.registry import (
+    KINDS,
+    CanSettings,
+    DeviceKind,
+    EmulatorInputs,
+    LineSettings,
+    ModbusSettings,
+    NtripSettings,
+    SerialSettings,
+    TcpSettings,
+    get_line_key,
+    split_address,
+)
 
 _LIST_ERRORS = ("tuple_type", "list_type")
 _SECTION_ERRORS = ("dataclass_type", "dict_type")
@@ -53,25 +64,6 @@ _EXPECTED = {
     **dict.fromkeys(_LIST_ERRORS, "a list"),
     **dict.fromkeys(_SECTION_ERRORS, "a section"),
 }
-
-
-def describe_error(detail: Any, keys: Sequence[str]) -> tuple[str, str, tuple[str, ...]]:
-    """Describe one of pydantic's errors: message, fix, nearest known names.
-
-    `keys` are those of the section that is expected there.
-    """
-    kind, got = detail["type"], detail.get("input")
-    *path, last = detail["loc"]
-    name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
-    actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
-    if kind in _CHOICE_ERRORS:
-        expected = detail["ctx"]["expected"]
-        near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
-        return f"{name} is {expected}{actual}", f"write {near[0]}" if near else "", near
-    if kind not in _EXPECTED:
-        message = str(detail["msg"])
-        return f"{name}: {message[:1].lower()}{message[1:]}{actual}", "", ()
-    return f"{name} is {_EXPECTED[kind]}{actual}", _suggest_fix(kind, got, keys), ()
 
 
 def _suggest_fix(kind: str, got: Any, keys: Sequence[str]) -> str:
@@ -209,8 +201,19 @@ class SectionReader(SettingsReader):
 
     def explain_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
         """Return suggestion, fix and message for a single wrong value."""
-        message, fix, near = describe_error(detail, list_known_keys(self.schema, tuple(detail["loc"])))
-        return near, fix, message
+        kind, got = detail["type"], detail.get("input")
+        *path, last = detail["loc"]
+        name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
+        actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
+        if kind in _CHOICE_ERRORS:
+            expected = detail["ctx"]["expected"]
+            near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
+            return near, f"write {near[0]}" if near else "", f"{name} is {expected}{actual}"
+        if kind not in _EXPECTED:
+            message = str(detail["msg"])
+            return (), "", f"{name}: {message[:1].lower()}{message[1:]}{actual}"
+        keys = list_known_keys(self.schema, tuple(detail["loc"]))
+        return (), _suggest_fix(kind, got, keys), f"{name} is {_EXPECTED[kind]}{actual}"
 
 
 def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
@@ -271,6 +274,11 @@ class DriverSettings:
     channel: str = ""
     source_map: SourceMap = field(default=SourceMap(), compare=False, repr=False)
     ntrip: NtripSettings | None = None
+
+    def make_warning(self, message: str, fix: str, *path: str, nearest: tuple[str, ...] = ()) -> Problem:
+        """Return a problem of the key at a path of the driver's section."""
+        source = self.source_map.locate("drivers", self.name, *path)
+        return Problem(Severity.WARNING, message, source, fix, nearest)
 
 
 def read_drivers(
@@ -386,27 +394,27 @@ MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
 
 def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
     """Return how the units of a driver's line are recorded."""
-    if isinstance(settings.line, lines.CanSettings):
+    if isinstance(settings.line, CanSettings):
         return CAN_CODEC
-    return MODBUS_CODEC if isinstance(settings.line, lines.ModbusSettings) else BYTES_CODEC
+    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:
     """Return a driver's line, not opened yet."""
     line = settings.line
     # each kind of line needs another library, and some of them are slow to load
-    if isinstance(line, lines.SerialSettings):
+    if isinstance(line, SerialSettings):
         from msdrivers.links.serial_port import SerialLink
 
         return SerialLink(line.port, choose_first_baud(settings))
-    if isinstance(line, lines.CanSettings):
+    if isinstance(line, CanSettings):
         from msdrivers.links.can_bus import CanLink
 
         return CanLink(line.can, line.interface, line.bitrate)
     from msdrivers.links import TcpLink
 
-    link = TcpLink(*lines.split_address(line.address))
-    if isinstance(line, lines.TcpSettings):
+    link = TcpLink(*split_address(line.address))
+    if isinstance(line, TcpSettings):
         return link
     from msdrivers.links.modbus import ModbusLink
 
@@ -416,7 +424,7 @@ def make_link(settings: DriverSettings) -> Link[Any]:
 def choose_first_baud(settings: DriverSettings) -> int:
     """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
     bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
-    given = settings.line.baud if isinstance(settings.line, lines.SerialSettings) else 0
+    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
     return bauds[0] if bauds else given or settings.kind.baud
 
 
@@ -461,18 +469,18 @@ def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
         owned = _exclusive_resource(driver.line)
         owner = driver.name if owned is None else owners.setdefault(owned, driver.name)
         if owner != driver.name:
-            source = driver.source_map.locate("drivers", driver.name, lines.get_line_key(type(driver.line)))
             message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"
-            yield Problem(Severity.WARNING, message, source, "give each a line of its own, or start only one of them")
+            fix = "give each a line of its own, or start only one of them"
+            yield driver.make_warning(message, fix, get_line_key(type(driver.line)))
 
 
-def _exclusive_resource(line: lines.LineSettings) -> Hashable | None:
-    if isinstance(line, lines.CanSettings):
+def _exclusive_resource(line: LineSettings) -> Hashable | None:
+    if isinstance(line, CanSettings):
         return None
-    if isinstance(line, lines.SerialSettings):
+    if isinstance(line, SerialSettings):
         # a port has several names, e.g. below /dev/serial/by-id/
         return os.path.realpath(line.port)
-    return (line.address, line.unit_id) if isinstance(line, lines.ModbusSettings) else line.address
+    return (line.address, line.unit_id) if isinstance(line, ModbusSettings) else line.address
 
 
 def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:
@@ -489,7 +497,7 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
             fix = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
         else:
             fix = f"known: {', '.join(list(frames)[:10])}"
-        yield Problem(Severity.WARNING, what, driver.source_map.locate("drivers", driver.name, "wheels", name), fix)
+        yield driver.make_warning(what, fix, "wheels", name)
 
 
 def find_backward_counters(driver: DriverSettings) -> Iterator[Problem]:
@@ -499,10 +507,8 @@ def find_backward_counters(driver: DriverSettings) -> Iterator[Problem]:
             why = (
                 f"wheel {name} rolls backward as its count rises: meters_per_count is {wheel.count.meters_per_count:g}"
             )
-            source = driver.source_map.locate("drivers", driver.name, "wheels", name)
-            yield Problem(
-                Severity.WARNING, why, source, "right for an encoder that is mounted mirrored, else drop the sign"
-            )
+            fix = "right for an encoder that is mounted mirrored, else drop the sign"
+            yield driver.make_warning(why, fix, "wheels", name)
 
 
 def find_unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Iterator[Problem]:
@@ -516,4 +522,4 @@ def find_unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> 
         what = f"the geometry has no constraint {quote(joint)}: what is measured of this joint moves nothing"
         near = suggest_name(joint, constraints)
         fix = f"write {near[0]}" if near else f"known: {', '.join(list(constraints)[:10]) or 'none'}"
-        yield Problem(Severity.WARNING, what, driver.source_map.locate("drivers", driver.name, *place), fix, near)
+        yield driver.make_warning(what, fix, *place, nearest=near)

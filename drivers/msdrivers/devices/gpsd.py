@@ -106,8 +106,7 @@ class GpsdFormat:
 class GpsdStream(FrameScanner[GpsdReport]):
     """Parses bytes to reports. Never raises; memory is bounded."""
 
-    def __init__(self) -> None:
-        super().__init__((GpsdFormat(),))
+    formats = (GpsdFormat(),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

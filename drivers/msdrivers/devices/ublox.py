@@ -115,8 +115,7 @@ class UbxFormat:
 class UbxStream(FrameScanner[UbxMessage]):
     """Parses bytes to UBX messages. Never raises; memory is bounded."""
 
-    def __init__(self) -> None:
-        super().__init__((UbxFormat(),))
+    formats = (UbxFormat(),)
 
 
 # --- values of messages ---------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from binascii import crc_hqx
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import xor
@@ -149,8 +149,7 @@ class VnTextFormat:
 class VnStream(FrameScanner[VnMessage]):
     """Parses bytes to binary and ASCII messages. Never raises; memory is bounded."""
 
-    def __init__(self) -> None:
-        super().__init__((VnBinaryFormat(), VnTextFormat()))
+    formats = (VnBinaryFormat(), VnTextFormat())
 
 
 def encode_text(text: str) -> bytes:
@@ -159,13 +158,18 @@ def encode_text(text: str) -> bytes:
     return f"${body}*{reduce(xor, body.encode('latin-1'), 0):02X}\r\n".encode("latin-1")
 
 
+def _make_masks(keys: Iterable[tuple[int, int]]) -> tuple[int, list[int]]:
+    """Return the byte of the groups, and the masks of their fields."""
+    masks: dict[int, int] = {}
+    for group, bit in keys:
+        masks[group] = masks.get(group, 0) | 1 << bit
+    return sum(1 << group - 1 for group in masks), [masks[group] for group in sorted(masks)]
+
+
 def encode_binary(fields: Mapping[tuple[int, int], bytes]) -> bytes:
     """Return a binary message of fields' bytes by (group, bit)."""
-    masks: dict[int, int] = {}
-    for group, bit in fields:
-        masks[group] = masks.get(group, 0) | 1 << bit
-    body = bytes((sum(1 << group - 1 for group in masks),))
-    body += b"".join(masks[group].to_bytes(2, "little") for group in sorted(masks))
+    groups, masks = _make_masks(fields)
+    body = bytes((groups,)) + b"".join(mask.to_bytes(2, "little") for mask in masks)
     body += b"".join(fields[key] for key in sorted(fields))
     return bytes((SYNC,)) + body + crc_hqx(body, 0).to_bytes(2, "big")
 
@@ -180,12 +184,9 @@ def make_setup(rate_hz: float, port: int) -> tuple[SetupStep, ...]:
 
     The ASCII output must be off first: together they may exceed the baud rate (error 0C).
     """
-    masks: dict[int, int] = {}
-    for group, bit in WANTED:
-        masks[group] = masks.get(group, 0) | 1 << bit
-    groups = sum(1 << group - 1 for group in masks)
+    groups, masks = _make_masks(WANTED)
     divisor = max(1, round(BASE_RATE_HZ / rate_hz))
-    words = ",".join(f"{masks[group]:04X}" for group in sorted(masks))
+    words = ",".join(f"{mask:04X}" for mask in masks)
     return (
         *(SetupStep(encode_text(f"WRG,06,0,{each}"), f"no text on port {each}", is_optional=True) for each in (1, 2)),
         SetupStep(

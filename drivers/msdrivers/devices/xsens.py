@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -37,17 +37,11 @@ MAX_DATA: Final = 2048
 class MessageId(IntEnum):
     """Identifiers of messages; the acknowledgement of one is the next number."""
 
-    REQUEST_DEVICE_ID = 0x00
     GO_TO_MEASUREMENT = 0x10
     GO_TO_MEASUREMENT_ACK = 0x11
-    REQUEST_PRODUCT = 0x1C
-    PRODUCT = 0x1D
     GO_TO_CONFIG = 0x30
     GO_TO_CONFIG_ACK = 0x31
     MT_DATA_2 = 0x36
-    WAKE_UP = 0x3E
-    WAKE_UP_ACK = 0x3F
-    RESET = 0x40
     ERROR = 0x42
     SET_OUTPUT = 0xC0
     SET_OUTPUT_ACK = 0xC1
@@ -66,9 +60,7 @@ class ItemId(IntEnum):
     STATUS_WORD = 0xE020
 
 
-FRAME_MASK: Final = 0x000C
 FRAME_ENU, FRAME_NED = 0x0, 0x4
-FORMAT_MASK: Final = 0x0003
 
 TICK: Final = 1e-4
 """Seconds of SampleTimeFine."""
@@ -126,8 +118,7 @@ class XbusFormat:
 class XbusStream(FrameScanner[XbusMessage]):
     """Parses bytes to Xbus messages. Never raises; memory is bounded."""
 
-    def __init__(self) -> None:
-        super().__init__((XbusFormat(),))
+    formats = (XbusFormat(),)
 
 
 def encode(identifier: int, data: bytes = b"") -> bytes:
@@ -173,25 +164,15 @@ class MtData:
         return bool((self.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
 
 
-def _read_float(data: bytes) -> float:
-    return float(struct.unpack(">f", data)[0])
-
-
-def _read_fixed_12_20(data: bytes) -> float:
-    return int.from_bytes(data, "big", signed=True) / (1 << 20)
-
-
-def _read_fixed_16_32(data: bytes) -> float:
-    # the fraction first, then the whole part
-    return int.from_bytes(data[4:], "big", signed=True) + int.from_bytes(data[:4], "big") / (1 << 32)
-
-
-def _read_double(data: bytes) -> float:
-    return float(struct.unpack(">d", data)[0])
-
-
 _SIZES: Final = (4, 4, 6, 8)
-_READERS: Final = (_read_float, _read_fixed_12_20, _read_fixed_16_32, _read_double)
+_READERS: Final[tuple[Callable[[bytes], float], ...]] = (
+    lambda data: float(struct.unpack(">f", data)[0]),
+    lambda data: int.from_bytes(data, "big", signed=True) / (1 << 20),
+    # the fraction first, then the whole part
+    lambda data: int.from_bytes(data[4:], "big", signed=True) + int.from_bytes(data[:4], "big") / (1 << 32),
+    lambda data: float(struct.unpack(">d", data)[0]),
+)
+"""By number format: float32, fixed point 12.20, fixed point 16.32, float64."""
 
 
 def encode_items(items: Iterable[tuple[int, bytes]]) -> bytes:

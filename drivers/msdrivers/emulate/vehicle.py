@@ -95,7 +95,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
             self._set_raw(wheel.count, count - (1 << wheel.count.length) if signed else count)
         if wheel.speed is not None and mapped.speed is not None and math.isfinite(sample.speed):
             speed = sample.speed / mapped.speed.scale
-            self._set_physical(wheel.speed, abs(speed) if mapped.speed.is_magnitude else speed)
+            self._set_raw(wheel.speed, wheel.speed.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
         if wheel.direction is not None and mapped.direction is not None:
             numbers = {
                 Direction.STOPPED: mapped.direction.stopped,
@@ -106,13 +106,10 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
             unknown = next((each for each in range(1 << wheel.direction.length) if each not in known), 0)
             self._set_raw(wheel.direction, numbers.get(sample.direction, unknown))
         if wheel.steering is not None and mapped.steering is not None and math.isfinite(sample.steering):
-            self._set_physical(wheel.steering, (sample.steering - mapped.steering.offset) / mapped.steering.scale)
+            self._set_raw(wheel.steering, wheel.steering.to_bits(mapped.steering.from_si(sample.steering)))
 
     def _set_raw(self, signal: BoundSignal, raw: float) -> None:
         self._raw[signal.message][signal.name] = raw
-
-    def _set_physical(self, signal: BoundSignal, value: float) -> None:
-        self._raw[signal.message][signal.name] = signal.to_bits(value)
 
 
 MAX_REJECTED_COUNT = 255
@@ -261,7 +258,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
             message = raw.setdefault(signal.message, dict.fromkeys(self._database.bind_signals(signal.message), 0))
             if name in values:
                 mapped = getattr(status.map, name)
-                message[signal.name] = signal.to_bits((values[name] - mapped.offset) / mapped.scale)
+                message[signal.name] = signal.to_bits(mapped.from_si(values[name]))
             elif name == "mode":
                 message[signal.name] = status.map.modes.get(self.mode.name.lower(), 0)
             else:

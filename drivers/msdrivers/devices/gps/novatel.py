@@ -253,10 +253,6 @@ class CommandResponse:
     start: int
     error: str = ""
 
-    @property
-    def is_ok(self) -> bool:
-        return not self.error
-
 
 @dataclass(frozen=True, slots=True)
 class Prompt:

@@ -295,77 +295,6 @@ class UnusableDeviceError(Exception):
     """The device answers, but its data cannot be used."""
 
 
-@dataclass(slots=True)
-class LineState:
-    """Baud rates to try, in this order, and what the device streamed when it was found.
-
-    found_stream: None until known, 0 for none. is_known: a device has answered at the first baud rate.
-    """
-
-    bauds: list[int]
-    """Empty for a line that has none."""
-    found_stream: int | None = None
-    is_known: bool = False
-
-    @property
-    def at_baud_text(self) -> str:
-        """Text for the present baud rate; empty without one."""
-        return f" at {self.bauds[0]} baud" if self.bauds else ""
-
-    def make_restore_request(self) -> bytes:
-        """Return the request that leaves the continuous mode as it was found."""
-        return gx1.make_stream(self.found_stream) if self.found_stream else gx1.STOP
-
-
-def find_device(link: Gx1Receiver, found: LineState) -> ScriptPart[str]:
-    """Find the device: stop what it streams at one baud rate after the other. Return its serial number and firmware.
-
-    Returns once one answers. The line is taken to be open at the first of the baud rates.
-    """
-    while True:
-        received: list[str] = []
-        for number in range(max(1, len(found.bauds))):
-            if number:
-                found.bauds.append(found.bauds.pop(0))
-                yield Reopen(f"no 3DM-GX1 at {found.bauds[-1]} baud, received {received[-1]}", found.bauds[0])
-            # a known device returns at its rate: try others only after several attempts
-            for attempt in range(KNOWN_ATTEMPTS if found.is_known else 1):
-                link.reset()
-                try:
-                    yield from _stop_stream(
-                        link, found, KNOWN_FLUSH_TIMEOUT_S if found.is_known and not attempt else FLUSH_TIMEOUT_S
-                    )
-                    device = yield from _read_identity()
-                except NoReplyError:
-                    continue
-                found.is_known = True
-                return device
-            found.is_known = False
-            received.append(link.describe_input())
-        yield EndpointStatus(EndpointPhase.SILENT, _explain_no_device(found.bauds, received))
-        yield PauseStep(RETRY_DELAY_S)
-        if len(found.bauds) > 1:
-            found.bauds.append(found.bauds.pop(0))
-            yield Reopen("no 3DM-GX1 found, trying again", found.bauds[0])
-
-
-def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPart[None]:
-    """Record what the device streams (two replies of one kind) and stop it, within `flush` seconds."""
-    listened = yield CollectStep(LISTEN_S, frozenset(gx1.MEASUREMENTS))
-    kinds = [packet.command for packet in listened]
-    if found.found_stream is None:
-        found.found_stream = next((kind for kind in kinds if kinds.count(kind) > 1), None)
-    if link.bytes_received:
-        # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
-        yield Send(gx1.STOP)
-        yield PauseStep(flush)
-    yield CommandStep(gx1.STOP, value=0)
-    if found.found_stream is None:
-        found.found_stream = 0
-    # what was listened to may have been noise that looked like replies
-    link.ticks.reset()
-
-
 def _read_identity() -> ScriptPart[str]:
     serial = yield CommandStep(gx1.make_poll(gx1.CommandByte.SERIAL))
     firmware = yield CommandStep(gx1.make_poll(gx1.CommandByte.FIRMWARE))
@@ -630,7 +559,12 @@ class Gx1Driver:
         """Seconds of a tick; 0 before that is known."""
         self._link = Gx1Receiver()
         self._script = Gx1ScriptRunner(self._link.parser)
-        self._line_state = LineState(list(settings.bauds))
+        self._bauds = list(settings.bauds)
+        """Those to try, in this order; empty for a line that has none."""
+        self._is_known = False
+        """A device has answered at the first baud rate."""
+        self._found_stream: int | None = None
+        """What the device streamed when it was found: None until known, 0 for nothing."""
         self._gains = Gains(1, 1, 1)
         self._device = "3DM-GX1"
         self._bias_pending = settings.capture_bias_at_start
@@ -683,7 +617,7 @@ class Gx1Driver:
         """Restore the continuous mode as it was found."""
         self._script.stop()
         self._link.reset()
-        return [] if self._line_state.found_stream is None else [Send(self._line_state.make_restore_request())]
+        return [] if self._found_stream is None else [Send(gx1.make_stream(self._found_stream))]
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -693,8 +627,8 @@ class Gx1Driver:
     def _run_setup(self) -> Script:
         while True:
             try:
-                self._device = yield from find_device(self._link, self._line_state)
-                yield report(f"{self._device} answers{self._line_state.at_baud_text}")
+                self._device = yield from self._find_device()
+                yield report(f"{self._device} answers" + (f" at {self._bauds[0]} baud" if self._bauds else ""))
                 self._gains = yield from read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
@@ -708,6 +642,53 @@ class Gx1Driver:
             text = f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
             yield EndpointStatus(EndpointPhase.SILENT, text)
             yield PauseStep(RETRY_DELAY_S)
+
+    def _find_device(self) -> ScriptPart[str]:
+        """Return serial number and firmware of the device: stop what it streams at one baud rate after the other.
+
+        The line is taken to be open at the first of the baud rates.
+        """
+        while True:
+            bauds, received = self._bauds, list[str]()
+            for number in range(max(1, len(bauds))):
+                if number:
+                    bauds.append(bauds.pop(0))
+                    yield Reopen(f"no 3DM-GX1 at {bauds[-1]} baud, received {received[-1]}", bauds[0])
+                # a known device returns at its rate: try others only after several attempts
+                for attempt in range(KNOWN_ATTEMPTS if self._is_known else 1):
+                    self._link.reset()
+                    try:
+                        yield from self._stop_stream(
+                            KNOWN_FLUSH_TIMEOUT_S if self._is_known and not attempt else FLUSH_TIMEOUT_S
+                        )
+                        device = yield from _read_identity()
+                    except NoReplyError:
+                        continue
+                    self._is_known = True
+                    return device
+                self._is_known = False
+                received.append(self._link.describe_input())
+            yield EndpointStatus(EndpointPhase.SILENT, _explain_no_device(bauds, received))
+            yield PauseStep(RETRY_DELAY_S)
+            if len(bauds) > 1:
+                bauds.append(bauds.pop(0))
+                yield Reopen("no 3DM-GX1 found, trying again", bauds[0])
+
+    def _stop_stream(self, flush: float) -> ScriptPart[None]:
+        """Record what the device streams (two replies of one kind) and stop it, within `flush` seconds."""
+        listened = yield CollectStep(LISTEN_S, frozenset(gx1.MEASUREMENTS))
+        kinds = [packet.command for packet in listened]
+        if self._found_stream is None:
+            self._found_stream = next((kind for kind in kinds if kinds.count(kind) > 1), None)
+        if self._link.bytes_received:
+            # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
+            yield Send(gx1.STOP)
+            yield PauseStep(flush)
+        yield CommandStep(gx1.STOP, value=0)
+        if self._found_stream is None:
+            self._found_stream = 0
+        # what was listened to may have been noise that looked like replies
+        self._link.ticks.reset()
 
     def _read_timer(self) -> ScriptPart[None]:
         if self.settings.tick is None:
@@ -796,8 +777,7 @@ class Gx1Driver:
         self._seq += 1
         self._celsius = NAN
         # without the device's time the way over the line is part of the delay
-        bauds = self._line_state.bauds
-        line = LENGTHS[command] * 10.0 / bauds[0] if bauds and not device_utime else 0.0
+        line = LENGTHS[command] * 10.0 / self._bauds[0] if self._bauds and not device_utime else 0.0
         return [*outputs, MeasuredSample(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
 
     def _on_gravity_known(self) -> list[Output[bytes]]:
