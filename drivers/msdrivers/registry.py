@@ -272,19 +272,14 @@ def _load(module: str, prefix: str, has_dbc: bool = False) -> Callable[[], Devic
 
 
 def _emulate(
-    module: str, make: Callable[[Any, EmulatorInputs], Endpoint[Any]], has_own_faults: bool = False
+    module: str, make: Callable[[Any, EmulatorInputs], Endpoint[Any]]
 ) -> Callable[[EmulatorInputs], Endpoint[Any]]:
-    """Return a function that imports a module below `msdrivers.emulate` and makes the emulator of a kind.
-
-    has_own_faults: the emulator applies the faults itself.
-    """
+    """Return a function that imports a module below `msdrivers.emulate` and makes the emulator of a kind."""
 
     def make_emulator(inputs: EmulatorInputs) -> Endpoint[Any]:
         emulators = import_module(f"msdrivers.emulate.{module}")
         # one series for the device before and after a restart
         inputs = inputs._replace(samples=iter(inputs.samples))
-        if has_own_faults:
-            return make(emulators, inputs)
         return FaultInjector(lambda: make(emulators, inputs), inputs.faults)
 
     return make_emulator
@@ -356,15 +351,9 @@ _KINDS = (
         ImuSample,
         _BYTE_LINES,
         _load("gx1.driver", "Gx1"),
-        _emulate(
-            "imu",
-            lambda emulators, inputs: emulators.Gx1Emulator(
-                inputs.samples, unit=emulators.Gx1Unit(faults=inputs.faults)
-            ),
-            True,
-        ),
+        _emulate("imu", lambda emulators, inputs: emulators.Gx1Emulator(inputs.samples)),
         38400,
-        faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
+        faults={**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"},
         has_z_down=True,
     ),
     DeviceKind(
@@ -420,9 +409,8 @@ _KINDS = (
         _emulate(
             "vehicle",
             lambda emulators, inputs: emulators.WheelsEmulator(
-                inputs.settings.wheels, _load_dbc(inputs.settings, inputs.folder), inputs.samples, inputs.faults
+                inputs.settings.wheels, _load_dbc(inputs.settings, inputs.folder), inputs.samples
             ),
-            True,
         ),
         faults=_CAN_FAULTS,
     ),
@@ -439,9 +427,7 @@ _KINDS = (
                 inputs.settings.status,
                 inputs.settings.command,
                 samples=inputs.samples,
-                faults=inputs.faults,
             ),
-            True,
         ),
         command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
@@ -464,8 +450,7 @@ _KINDS = (
         _load("axis", "Axis"),
         _emulate(
             "vehicle",
-            lambda emulators, inputs: emulators.AxisEmulator(inputs.settings.registers, faults=inputs.faults),
-            True,
+            lambda emulators, inputs: emulators.AxisEmulator(inputs.settings.registers),
         ),
         follows_samples=False,
         faults={

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
@@ -71,96 +71,52 @@ def parse_fault(text: str, known: Mapping[str, str] = FAULT_AMOUNTS) -> Injected
     return fault
 
 
-class FaultQueue(Generic[U]):
-    """The faults of one device in the order of their times, monotonic nanoseconds; applies those of the line.
+@runtime_checkable
+class HasOwnFaults(Protocol):
+    """An emulator that applies some faults itself."""
 
-    drop: `amount` units are lost. corrupt: `amount` units are damaged by `corrupt`. `silencing` kinds, e.g. stall:
-    nothing passes for `amount` seconds. The others are the device's to apply.
-    """
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        """Apply a fault, if it is one of the device's own; return whether it is."""
 
-    def __init__(
-        self,
-        faults: Iterable[InjectedFault],
-        corrupt: Callable[[U], U],
-        silencing: Sequence[str] = ("stall", "restart", "bus_off"),
-    ):
-        self.counts: Counter[str] = Counter()
-        """Units that were silenced, dropped and corrupted."""
-        self.silent_until_ns = 0
-        self._faults = deque(sorted(faults, key=lambda fault: fault.at))
-        self._corrupt, self._silencing = corrupt, silencing
-        self._started_ns: int | None = None
-        self._pending: Counter[str] = Counter()
-
-    def start(self, at_ns: int) -> None:
-        """Set the reference time of the faults at the first call."""
-        self._started_ns = at_ns if self._started_ns is None else self._started_ns
-
-    def get_deadline(self) -> int | None:
-        """Return when the next fault is due; None if there is none, or before the start."""
-        if self._started_ns is None or not self._faults:
-            return None
-        return self._started_ns + round(self._faults[0].at * 1e9)
-
-    def pop_due(self, at_ns: int) -> Iterator[tuple[InjectedFault, int]]:
-        """Yield the faults that are due and their times."""
-        while (due := self.get_deadline()) is not None and due <= at_ns:
-            fault = self._faults.popleft()
-            if fault.kind in self._silencing:
-                self.silent_until_ns = max(self.silent_until_ns, due + round(fault.amount * 1e9))
-            self._pending[fault.kind] += round(fault.amount)
-            yield fault, due
-
-    def is_silent(self, at_ns: int) -> bool:
-        """Return whether the line is silent in both directions."""
-        return at_ns < self.silent_until_ns
-
-    def filter_units(self, units: Iterable[U], at_ns: int) -> list[Send[U]]:
-        """Return the units that pass, some of them damaged."""
-        sent = []
-        for unit in units:
-            if self.is_silent(at_ns):
-                self.counts["fault.silenced"] += 1
-            elif self._pending["drop"] > 0:
-                self._pending["drop"] -= 1
-                self.counts["fault.dropped"] += 1
-            elif self._pending["corrupt"] > 0:
-                self._pending["corrupt"] -= 1
-                self.counts["fault.corrupted"] += 1
-                sent.append(Send(self._corrupt(unit)))
-            else:
-                sent.append(Send(unit))
-        return sent
+    def corrupt(self, unit: Any) -> Any:
+        """Return a damaged unit, as the line would."""
 
 
 class FaultInjector(Generic[U]):
-    """An `Endpoint` that wraps another and drops, corrupts or delays its output, restarts it, or shifts its clock.
+    """An `Endpoint` that wraps another and applies faults in the order of their times.
 
-    `make` returns the device as after power-on.
+    drop: `amount` units are lost. corrupt: `amount` units are damaged. stall, restart, bus_off: nothing passes for
+    `amount` seconds, then a restarted device is replaced by a new one; after bus_off the interface reports it. jump:
+    the device's clock is shifted. What a device applies itself (`HasOwnFaults`) is left to it. `make` returns the
+    device as after power-on.
     """
 
-    def __init__(self, make: Callable[[], Endpoint[U]], faults: Sequence[InjectedFault]):
+    def __init__(self, make: Callable[[], Endpoint[U]], faults: Iterable[InjectedFault]):
         self._make = make
         self._inner = make()
-        self._faults = FaultQueue[U](faults, corrupt_unit)
+        self._faults = deque(sorted(faults, key=lambda fault: fault.at))
+        self._started_ns: int | None = None
+        self._silent_until_ns = 0
+        self._pending: Counter[str] = Counter()
         self._is_restarting = False
         self._clock_jump_ns = 0
+        self._counts: Counter[str] = Counter()
 
     def on_open(self, now: HostTime) -> Sequence[Output[U]]:
-        self._faults.start(now.monotonic_ns)
+        self._started_ns = now.monotonic_ns if self._started_ns is None else self._started_ns
         return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
 
     def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
         """Pass on a received unit unless the device is silent."""
         struck = self._apply_due_faults(now)
-        if self._faults.is_silent(now.monotonic_ns):
+        if now.monotonic_ns < self._silent_until_ns:
             return struck
         return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
         """Apply due faults; fire the device's timer."""
         outputs = self._apply_due_faults(now)
-        if self._is_restarting and not self._faults.is_silent(now.monotonic_ns):
+        if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
             self._is_restarting = False
             self._inner = self._make()
             outputs += self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
@@ -173,7 +129,7 @@ class FaultInjector(Generic[U]):
         """Return when the device, or a fault, is due."""
         inner = self._inner.get_deadline()
         device = None if inner is None else inner - self._clock_jump_ns
-        dues = (self._faults.silent_until_ns if self._is_restarting else device, self._faults.get_deadline())
+        dues = (self._silent_until_ns if self._is_restarting else device, self._get_fault_ns())
         return min((due for due in dues if due is not None), default=None)
 
     def on_close(self, now: HostTime) -> Sequence[Output[U]]:
@@ -181,27 +137,52 @@ class FaultInjector(Generic[U]):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """The device's counters, and the units that faults took or damaged."""
-        return {**self._inner.counts, **self._faults.counts}
+        """The device's counters, and the units that were silenced, dropped and corrupted."""
+        return {**self._inner.counts, **self._counts}
 
     def _to_device_time(self, now: HostTime) -> HostTime:
         return HostTime(now.monotonic_ns + self._clock_jump_ns, now.utime + self._clock_jump_ns // 1000)
 
+    def _get_fault_ns(self) -> int | None:
+        if self._started_ns is None or not self._faults:
+            return None
+        return self._started_ns + round(self._faults[0].at * 1e9)
+
     def _apply_due_faults(self, now: HostTime) -> list[Output[U]]:
         outputs: list[Output[U]] = []
-        for fault, _ in self._faults.pop_due(now.monotonic_ns):
+        while (due := self._get_fault_ns()) is not None and due <= now.monotonic_ns:
+            fault = self._faults.popleft()
+            outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
+            if fault.kind == "bus_off":
+                outputs.append(cast(Send[U], Send(make_bus_off_frame())))
+            if fault.kind in ("stall", "restart", "bus_off"):
+                self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
+            self._pending[fault.kind] += round(fault.amount)
+            if isinstance(self._inner, HasOwnFaults) and self._inner.apply_fault(fault, now):
+                continue
             self._is_restarting = self._is_restarting or fault.kind == "restart"
             if fault.kind == "jump":
                 self._clock_jump_ns += round(fault.amount * 1e9)
-            outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
         return outputs
 
     def _filter_outputs(self, outputs: Sequence[Output[U]], now: HostTime) -> list[Output[U]]:
+        """Return what passes, some units damaged."""
         passed: list[Output[U]] = []
         for output in outputs:
-            passed += (
-                self._faults.filter_units((output.unit,), now.monotonic_ns) if isinstance(output, Send) else [output]
-            )
+            if not isinstance(output, Send):
+                passed.append(output)
+            elif now.monotonic_ns < self._silent_until_ns:
+                self._counts["fault.silenced"] += 1
+            elif self._pending["drop"] > 0:
+                self._pending["drop"] -= 1
+                self._counts["fault.dropped"] += 1
+            elif self._pending["corrupt"] > 0:
+                self._pending["corrupt"] -= 1
+                self._counts["fault.corrupted"] += 1
+                damage = self._inner.corrupt if isinstance(self._inner, HasOwnFaults) else corrupt_unit
+                passed.append(Send(damage(output.unit)))
+            else:
+                passed.append(output)
         return passed
 
 
@@ -218,26 +199,22 @@ def corrupt_unit(unit: Any) -> Any:
 
 
 class CanEmulator(ABC, Generic[S]):
-    """Base of an emulator on a CAN bus that sends samples at their stamps, with faults.
+    """Base of an emulator on a CAN bus that sends samples at their stamps.
 
     If the first stamp is in the past when the line is first opened, all are shifted equally. A corrupt frame lacks its
-    last byte. After bus_off the interface reports it, and no frame passes for `amount` seconds.
+    last byte.
     """
 
-    def __init__(self, text: str, samples: Iterable[S], faults: Iterable[InjectedFault]):
+    def __init__(self, text: str, samples: Iterable[S]):
         """`text` is the status when the line is opened."""
         self._text = text
         self._samples: Iterator[S] = iter(samples)
         self._next: S | None = next(self._samples, None)
-        self._faults = FaultQueue[CanFrame](
-            faults, lambda frame: CanFrame(frame.arbitration_id, frame.data[:-1], frame.is_extended)
-        )
         self._started: tuple[int, int] | None = None
         self.counts: Counter[str] = Counter()
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start at the first opening; later the device has continued."""
-        self._faults.start(now.monotonic_ns)
         if self._started is None:
             first = now.utime if self._next is None else self._next.header.utime
             self._started = (now.monotonic_ns, min(now.utime, first))
@@ -247,26 +224,23 @@ class CanEmulator(ABC, Generic[S]):
         return []
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Apply the faults and send the frames that are due."""
+        """Send the frames that are due."""
         outputs: list[Output[CanFrame]] = []
         while (due := self.get_deadline()) is not None and due <= now.monotonic_ns:
-            for fault, _ in self._faults.pop_due(due):
-                if fault.kind == "bus_off":
-                    outputs.append(Send(make_bus_off_frame()))
-                self._on_fault(fault)
             sample = None
             if self._get_sample_ns() == due:
                 sample, self._next = self._next, next(self._samples, None)
-            outputs += self._faults.filter_units(self._make_frames(sample, due), due)
+            outputs += [Send(each) for each in self._make_frames(sample, due)]
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when the next sample or fault is due, monotonic nanoseconds."""
-        deadlines = (self._get_sample_ns(), self._faults.get_deadline())
-        return min((each for each in deadlines if each is not None), default=None)
+        return self._get_sample_ns()
 
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
         return []
+
+    def corrupt(self, unit: CanFrame) -> CanFrame:
+        return replace(unit, data=unit.data[:-1])
 
     def _get_sample_ns(self) -> int | None:
         if self._next is None or self._started is None:
@@ -274,8 +248,8 @@ class CanEmulator(ABC, Generic[S]):
         return self._started[0] + (self._next.header.utime - self._started[1]) * 1000
 
     @abstractmethod
-    def _on_fault(self, fault: InjectedFault) -> None:
-        """Apply a fault that is the device's own."""
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        """Apply a fault, if it is one of the device's own; return whether it is."""
 
     @abstractmethod
     def _make_frames(self, sample: S | None, at_ns: int) -> Iterable[CanFrame]:

@@ -24,7 +24,7 @@ from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gain
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vectornav import FIELD_BYTES, VnStream, VnText
 from msdrivers.devices.xsens import ItemId, MessageId, XbusMessage, XbusStream
-from msdrivers.emulate import FaultQueue, InjectedFault, SampleEmulator
+from msdrivers.emulate import InjectedFault, SampleEmulator, corrupt_unit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 
 
@@ -315,11 +315,9 @@ class Gx1Unit:
     """One device. SI units.
 
     cycle_ticks: ticks from one streamed reply to the next. tick_offset: its ticks when it starts. drift: how much
-    faster its clock runs than the host's, as a fraction. delay: from a measurement until it is sent. boot_time: how
-    long it is silent after a restart. gyro_bias: bias of its gyros. force_sign: 1 if it reports
-    specific force, -1 for its opposite. celsius: its temperature. streamed_at_start: the command that it streams when
-    the line is opened, 0 for none. faults: `drop` or `corrupt` the next `amount` replies, `stall` for `amount`
-    seconds, `restart`, `jump` by `amount` ticks.
+    faster its clock runs than the host's, as a fraction. delay: from a measurement until it is sent. gyro_bias: bias of
+    its gyros. force_sign: 1 if it reports specific force, -1 for its opposite. celsius: its temperature.
+    streamed_at_start: the command that it streams when the line is opened, 0 for none. Its time jumps by ticks.
     """
 
     serial: int = 1234
@@ -328,13 +326,11 @@ class Gx1Unit:
     tick_offset: int = 0
     drift: float = 0.0
     delay: float = 0.003
-    boot_time: float = 1.0
     bias_capture: float = 3.0
     gyro_bias: Vector3 = (0.0, 0.0, 0.0)
     force_sign: int = 1
     celsius: float = 23.0
     streamed_at_start: int = 0
-    faults: tuple[InjectedFault, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -446,9 +442,6 @@ class Gx1Emulator:
         self._samples = SampleInterpolator(samples)
         self._requests = RequestParser()
         self._outbox: deque[tuple[int, bytes]] = deque()
-        self._faults = FaultQueue[bytes](
-            self.unit.faults, lambda raw: raw[:-3] + bytes((raw[-3] ^ 0x10,)) + raw[-2:], silencing=("stall",)
-        )
         self._opened_ns: int | None = None
         self._clock = UnitClock.make(self.eeprom, self.unit, 0, 0)
         self._tick = 0
@@ -462,14 +455,13 @@ class Gx1Emulator:
         """Switch on at the first time; later the device has run on."""
         if self._opened_ns is None:
             self._opened_ns = now.monotonic_ns
-            self._faults.start(now.monotonic_ns)
             self._switch_on(now.monotonic_ns, self.unit.tick_offset)
         phase = EndpointPhase.STREAMING if self.streamed else EndpointPhase.WAITING
         return [EndpointStatus(phase, f"3DM-GX1 {self.unit.serial} emulated")]
 
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
         outputs = self.on_timer(now)
-        if now.monotonic_ns < max(self._clock.started_ns, self._faults.silent_until_ns):
+        if now.monotonic_ns < self._clock.started_ns:
             return outputs
         for request in self._requests.feed(unit):
             self.counts[f"request.{CommandByte(request.command).name.lower()}"] += 1
@@ -480,8 +472,6 @@ class Gx1Emulator:
         if self._opened_ns is None:
             return []
         self._utime_offset_us = now.utime - now.monotonic_ns // 1000
-        for fault, _ in self._faults.pop_due(now.monotonic_ns):
-            self.apply_fault(fault, now)
         self._run_cycles(now.monotonic_ns)
         return self._pop_sent(now.monotonic_ns)
 
@@ -490,21 +480,22 @@ class Gx1Emulator:
             return None
         instants = [self._clock.instant_of(self._tick)]
         if self._outbox:
-            instants.append(max(self._outbox[0][0], self._faults.silent_until_ns))
-        if (fault_ns := self._faults.get_deadline()) is not None:
-            instants.append(fault_ns)
+            instants.append(self._outbox[0][0])
         return min(instants)
 
     def on_close(self, now: HostTime) -> list[Output[bytes]]:
         return []
 
-    def apply_fault(self, fault: InjectedFault, now: HostTime) -> None:
-        """Apply a fault that is the device's own."""
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "jump":
             self._clock = replace(self._clock, offset=self._clock.offset + round(fault.amount))
         elif fault.kind == "restart":
-            self._switch_on(now.monotonic_ns + round(self.unit.boot_time * 1e9), 0)
+            self._switch_on(now.monotonic_ns + round(fault.amount * 1e9), 0)
             self.streamed, self._bias = 0, (0.0, 0.0, 0.0)
+        return fault.kind in ("jump", "restart")
+
+    def corrupt(self, unit: bytes) -> bytes:
+        return bytes(corrupt_unit(unit))
 
     def _switch_on(self, at_ns: int, ticks: int) -> None:
         self._clock = UnitClock.make(self.eeprom, self.unit, at_ns, ticks)
@@ -589,14 +580,10 @@ class Gx1Emulator:
         send_ns = at_ns + round(self.unit.delay * 1e9)
         if self._outbox:
             send_ns = max(send_ns, self._outbox[-1][0])
-        for sent in self._faults.filter_units((Gx1Packet(command, words, ticks).to_bytes(),), at_ns):
-            self._outbox.append((send_ns, sent.unit))
+        self._outbox.append((send_ns, Gx1Packet(command, words, ticks).to_bytes()))
 
     def _pop_sent(self, now_ns: int) -> list[Output[bytes]]:
         outputs: list[Output[bytes]] = []
-        if self._faults.is_silent(now_ns):
-            # replies during a stall are lost
-            self._outbox.clear()
         while self._outbox and self._outbox[0][0] <= now_ns:
             self.counts["sent"] += 1
             outputs.append(Send(self._outbox.popleft()[1]))

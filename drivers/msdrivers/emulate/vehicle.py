@@ -19,7 +19,7 @@ from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
-from msdrivers.emulate import CanEmulator, FaultQueue, InjectedFault
+from msdrivers.emulate import CanEmulator, InjectedFault
 from msdrivers.endpoint import (
     MAX_READ,
     MAX_WRITE,
@@ -49,11 +49,10 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         wheels: Mapping[str, WheelMap],
         database: CanDatabase,
         samples: Iterable[WheelsSample],
-        faults: Iterable[InjectedFault] = (),
         first_count: int = 0,
     ):
         """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
-        super().__init__(f"{len(wheels)} wheels emulated", samples, faults)
+        super().__init__(f"{len(wheels)} wheels emulated", samples)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
@@ -64,12 +63,13 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         self._counted = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
         self._rolled = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
 
-    def _on_fault(self, fault: InjectedFault) -> None:
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         for name in self._offset:
             if fault.kind == "jump":
                 self._offset[name] += round(fault.amount)
             elif fault.kind == "restart":
                 self._offset[name] = -self._counted[name]
+        return fault.kind in ("jump", "restart")
 
     def _make_frames(self, sample: WheelsSample | None, at_ns: int) -> list[CanFrame]:
         if sample is None:
@@ -144,10 +144,9 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         command: CommandMap | None = None,
         unit: VehicleUnit | None = None,
         samples: Iterable[VehicleStatusSample] = (),
-        faults: Iterable[InjectedFault] = (),
     ):
         """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
-        super().__init__("vehicle controller emulated", samples, faults)
+        super().__init__("vehicle controller emulated", samples)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
         """Driving mode; set it to press the emergency stop."""
@@ -175,7 +174,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         outputs = self.on_timer(now)
         command = self._command
         is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
-        if command is None or not is_command or self._faults.is_silent(now.monotonic_ns):
+        if command is None or not is_command:
             return outputs
         try:
             self._on_command(command, self._database.decode(unit), now.monotonic_ns)
@@ -190,9 +189,11 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         other = super().get_deadline()
         return self._status_ns if other is None else min(self._status_ns, other)
 
-    def _on_fault(self, fault: InjectedFault) -> None:
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "restart":
             self.rejected, self._commanded_ns, self._alive = 0, None, None
+        # it has no counters that could jump
+        return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
         self._advance(at_ns)
@@ -293,17 +294,13 @@ class AxisUnit:
 class AxisEmulator:
     """An `Endpoint` of `ModbusUnit` that answers requests.
 
-    Faults: drop: `amount` requests are not answered. corrupt: `amount` replies lack a register. stall: no answer for
-    `amount` seconds. restart: the same, and the axis restarts with its first limits and rate. jump: its angle jumps by
-    `amount` degrees. exception: the next request gets exception code `amount`.
+    Faults of its own: a corrupt reply lacks a register. restart: it restarts with its first limits and rate. jump: its
+    angle jumps by `amount` degrees. exception: the next request gets exception code `amount`.
     """
 
-    def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None, faults: Iterable[InjectedFault] = ()):
+    def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
         self.unit = unit or AxisUnit()
         self._registers = registers
-        self._faults = FaultQueue[ModbusUnit](
-            faults, lambda unit: replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
-        )
         self._started_ns: int | None = None
         self._exceptions: deque[int] = deque()
         self.counts: Counter[str] = Counter()
@@ -313,19 +310,16 @@ class AxisEmulator:
         """Power on at the first opening; later the axis has continued."""
         if self._started_ns is None:
             self._started_ns = self._updated_ns = now.monotonic_ns
-            self._faults.start(now.monotonic_ns)
         return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        for fault, due in self._faults.pop_due(now.monotonic_ns):
-            self._apply_fault(fault, due)
-        if self._faults.is_silent(now.monotonic_ns) or not isinstance(unit, ReadRegisters | WriteRegisters):
+        if not isinstance(unit, ReadRegisters | WriteRegisters):
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
         reply = self._make_exception(unit, code) if code else self._answer(unit)
         self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
-        return [*self._faults.filter_units((reply,), now.monotonic_ns)]
+        return [Send(reply)]
 
     def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         return []
@@ -345,14 +339,18 @@ class AxisEmulator:
         self._direction, self._measured_rate = 1.0, 0.0
         self._updated_ns, self._number = at_ns, 0
 
-    def _apply_fault(self, fault: InjectedFault, at_ns: int) -> None:
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "exception":
             self._exceptions.append(round(fault.amount))
         elif fault.kind == "jump":
-            self._advance(at_ns)
+            self._advance(now.monotonic_ns)
             self.degrees += fault.amount
         elif fault.kind == "restart":
-            self._switch_on(self._faults.silent_until_ns)
+            self._switch_on(now.monotonic_ns + round(fault.amount * 1e9))
+        return fault.kind in ("exception", "jump", "restart")
+
+    def corrupt(self, unit: ModbusUnit) -> ModbusUnit:
+        return replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
 
     def _advance(self, at_ns: int) -> None:
         """Turn on to an instant, and measure at the last instant of its own before."""

@@ -13,7 +13,7 @@ from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis
 
 from modelserver.messages import DriverHealth, DriverPhase, JointsSample
 from msdrivers.devices.axis import AxisDriver, AxisRegisters, AxisSettings, NodSettings, RegisterMap
-from msdrivers.emulate import InjectedFault
+from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import AxisEmulator, AxisUnit
 from msdrivers.endpoint import (
     EndpointPhase,
@@ -41,8 +41,8 @@ def connect(
 ) -> tuple[Wire[ModbusUnit], AxisDriver, AxisEmulator]:
     settings = settings or axis_settings()
     driver = AxisDriver(settings)
-    emulator = AxisEmulator(settings.registers, unit, faults)
-    return Wire(driver, emulator, flight_s=flight_s), driver, emulator
+    emulator = AxisEmulator(settings.registers, unit)
+    return Wire(driver, FaultInjector(lambda: emulator, faults), flight_s=flight_s), driver, emulator
 
 
 def joints(wire: Wire[ModbusUnit], begin: float = 0.0) -> list[JointsSample]:

@@ -23,7 +23,7 @@ from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.can import SignalMap
 from msdrivers.devices.vehicle import CommandLimits, StatusMap, VehicleDriver, VehicleSettings
-from msdrivers.emulate import InjectedFault
+from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Send
 
@@ -34,8 +34,8 @@ def connect(
     *faults: InjectedFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
 ) -> tuple[Wire[CanFrame], VehicleDriver, VehicleEmulator]:
     driver = VehicleDriver(settings or vehicle_settings(), DATABASE)
-    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit, faults=faults)
-    return Wire(driver, emulator), driver, emulator
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit)
+    return Wire(driver, FaultInjector(lambda: emulator, faults)), driver, emulator
 
 
 def make_command(

@@ -31,7 +31,7 @@ from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
 from msdrivers.devices.can import SignalMap, parse_dbc
 from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, WheelsDriver, WheelsSettings
-from msdrivers.emulate import InjectedFault
+from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import WheelsEmulator
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
 
@@ -48,8 +48,8 @@ def connect(
 ) -> Wire[CanFrame]:
     database = raptor_dbc()
     settings = settings or wheels_settings()
-    emulator = WheelsEmulator(settings.wheels, database, rolling_samples(seconds, speed, hz, BOTH), faults, first_count)
-    return Wire(WheelsDriver(settings, database), emulator)
+    emulator = WheelsEmulator(settings.wheels, database, rolling_samples(seconds, speed, hz, BOTH), first_count)
+    return Wire(WheelsDriver(settings, database), FaultInjector(lambda: emulator, faults))
 
 
 def oscillate(t: float) -> float:
@@ -443,7 +443,7 @@ def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_o
     )
     truths = [sample for sample in run.events(40.0) if isinstance(sample, WheelsSample)]
     wire = Wire(
-        WheelsDriver(settings, raptor_dbc()), WheelsEmulator(settings.wheels, raptor_dbc(), truths, (), 65_000)
+        WheelsDriver(settings, raptor_dbc()), WheelsEmulator(settings.wheels, raptor_dbc(), truths, 65_000)
     ).run(40.5)
     samples = wheels_of(wire)
     assert len(samples) == len(truths)
