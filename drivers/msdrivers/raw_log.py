@@ -20,16 +20,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TextIO, TypeVar
+from typing import Generic, NamedTuple, Protocol, TextIO
 
 from modelserver.errors import RecordingError
 from modelserver.files.regular import NotRegularFileError, open_regular
-from msdrivers.endpoint import HostTime
+from msdrivers.endpoint import HostTime, U
 from msdrivers.links import EndOfRecordingError, Link, LinkWrapper
 
 log = logging.getLogger(__name__)
 
-U = TypeVar("U")
 
 MAGIC = "# modelserver raw 1 "
 

@@ -13,15 +13,16 @@ Signed commands (`DriveVerifier`) are verified before they reach the endpoint: a
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic
 
-from modelserver.errors import WireError
+from modelserver.errors import WireError, quote
 from modelserver.messages import NAN, DriverHealth, DriverPhase, Envelope, Sample, VehicleCommand
 from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.codec import decode, encode
@@ -36,8 +37,9 @@ from msdrivers.endpoint import (
     Output,
     Reopen,
     Send,
+    U,
 )
-from msdrivers.links import EndOfRecordingError, GuardedLink, Link, LinkError
+from msdrivers.links import EndOfRecordingError, Link, LinkError
 from msdrivers.raw_log import TimeSource
 from msdrivers.registry import CHANNELS
 
@@ -238,8 +240,6 @@ class ReconnectBackoff:
         return f"; opened and closed {self._failures} times in {seconds:.0f} s: does another program use it?"
 
 
-U = TypeVar("U")
-
 MAX_COUNTERS = 200
 """Largest number of the endpoint's counters in a health report; the runner's own come on top."""
 
@@ -302,7 +302,7 @@ class Runner(Generic[U]):
         """Errors and dropped commands, by kind."""
         self.reconnects = 0
         self._endpoint, self._settings, self._time_source = endpoint, settings, time_source
-        self._link = GuardedLink(link, self._count_error)
+        self._link = link
         self._publish, self._publish_health = publish, publish_health
         self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
         max_silence = endpoint.max_silence if isinstance(endpoint, HasMaxSilence) else 0.0
@@ -382,7 +382,8 @@ class Runner(Generic[U]):
             self._time_source.sleep(min(wait, self._settings.poll_timeout))
             return
         try:
-            self._link.open(self._baud)
+            with self._guard_link("open"):
+                self._link.open(self._baud)
         except LinkError as error:
             self._on_link_error(error)
             return
@@ -423,14 +424,16 @@ class Runner(Generic[U]):
         self._reporter.set_stable(False)
 
     def _close_line(self) -> None:
-        self._link.close()
+        with contextlib.suppress(LinkError), self._guard_link("close"):
+            self._link.close()
         self._is_open = self._reporter.is_silent = False
 
     def _transfer(self) -> None:
         due = self._endpoint.get_deadline()
         now = self._time_source.now()
         next_ns = min(self._reporter.next_report_ns, due) if due is not None else self._reporter.next_report_ns
-        units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.poll_timeout))
+        with self._guard_link("poll"):
+            units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.poll_timeout))
         now = self._time_source.now()
         if units:
             self._received_ns, self._reporter.is_silent = now.monotonic_ns, False
@@ -451,6 +454,19 @@ class Runner(Generic[U]):
             self._count_error(what)
             return ()
 
+    @contextlib.contextmanager
+    def _guard_link(self, what: str) -> Iterator[None]:
+        """Turn any other exception of the link into a LinkError; it is counted and logged."""
+        try:
+            yield
+        except LinkError:
+            raise
+        except Exception as error:
+            self._count_error(f"link.{what}")
+            why = f"{type(error).__name__}: {quote(str(error), 100)}"
+            fix = "an error of the line's own, with its place in the log"
+            raise LinkError(self._link.description, why, fix) from error
+
     def _count_error(self, what: str) -> None:
         self.counts[f"errors.{what}"] += 1
         count = self.counts[f"errors.{what}"]
@@ -461,7 +477,8 @@ class Runner(Generic[U]):
     def _execute(self, outputs: Sequence[Output[U]]) -> None:
         for output in outputs:
             if isinstance(output, Send):
-                self._link.send(output.unit)
+                with self._guard_link("send"):
+                    self._link.send(output.unit)
             elif isinstance(output, MeasuredSample):
                 self._publish_sample(output)
             elif isinstance(output, EndpointStatus):

@@ -22,10 +22,9 @@ from msdrivers.endpoint import (
     Output,
     Registers,
     Send,
+    U,
     make_bus_off_frame,
 )
-
-U = TypeVar("U")
 
 S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample)
 
@@ -265,6 +264,7 @@ class SampleEmulator(ABC, Generic[S]):
     def __init__(self, samples: Iterable[S], latency: float = 0.0) -> None:
         self._samples: Iterator[S] = iter(samples)
         self._next: S | None = next(self._samples, None)
+        self._first_utime = 0 if self._next is None else self._next.header.utime
         self._latency_us = round(latency * 1e6)
         self._now: HostTime | None = None
         self.counts: Counter[str] = Counter()

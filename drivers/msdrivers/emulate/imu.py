@@ -39,7 +39,6 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
         """`baud` is that of its line, by which it rejects too much output."""
         super().__init__(samples)
         self._baud = baud
-        self._first_utime: int | None = None
         self._stream = VnStream()
         self._text_hz = {1: 40, 2: 0}
         self._keys: tuple[tuple[int, int], ...] = ()
@@ -103,7 +102,6 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
 
     def _encode(self, sample: ImuSample) -> bytes:
         utime = sample.header.utime
-        self._first_utime = utime if self._first_utime is None else self._first_utime
         rate_hz = vn.BASE_RATE_HZ / self._divisor if self._divisor else self._text_hz[1]
         if not rate_hz or (self._sent_us is not None and utime - self._sent_us < 1e6 / rate_hz - 500):
             return b""
@@ -166,7 +164,6 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         self._outputs = {int(ItemId.PACKET_COUNTER): xsens.AS_SENT, int(ItemId.QUATERNION): 100}
         self._is_measuring = True
         self._counter = 0
-        self._first_utime: int | None = None
         self._sent: dict[int, int] = {}
 
     def _answer(self, unit: bytes) -> list[bytes]:
@@ -204,7 +201,6 @@ class XsensEmulator(SampleEmulator[ImuSample]):
 
     def _encode(self, sample: ImuSample) -> bytes:
         utime = sample.header.utime
-        self._first_utime = utime if self._first_utime is None else self._first_utime
         if not self._is_measuring:
             return b""
         due = [
@@ -265,16 +261,13 @@ class TextImuEmulator(SampleEmulator[ImuSample]):
     def __init__(self, samples: Iterable[ImuSample], settings: TextSettings) -> None:
         super().__init__(samples)
         self._settings = settings
-        self._first_utime: int | None = None
 
     def _encode(self, sample: ImuSample) -> bytes:
         self.counts["lines"] += 1
-        self._first_utime = sample.header.utime if self._first_utime is None else self._first_utime
         values = {name: self._get_value(sample, name) for name in self._settings.mapped}
         return encode_line(self._settings, values)
 
     def _get_value(self, sample: ImuSample, name: str) -> float:
-        assert self._first_utime is not None
         if name == "time":
             return 1.0 + (sample.header.utime - self._first_utime) * 1e-6
         if name == "temperature":

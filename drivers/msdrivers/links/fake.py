@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Generic, TypeVar
+from typing import Generic
 
-from msdrivers.endpoint import HostTime
+from msdrivers.endpoint import HostTime, U
 from msdrivers.links import LinkError
-
-U = TypeVar("U")
 
 
 class FakeTimeSource:
