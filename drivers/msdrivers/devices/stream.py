@@ -414,6 +414,7 @@ EXAMINED_BYTES: Final = 4096
 """First bytes of a line by which another device is recognized."""
 
 SECOND_NS: Final = 1_000_000_000
+NEVER_NS: Final = 1 << 62
 WARNING_INTERVAL_NS: Final = 60 * SECOND_NS
 """Rate limit of the warning that no device was found."""
 
@@ -421,31 +422,40 @@ _MAX_ARRIVALS: Final = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StreamSettings:
-    """Settings that these devices have in common. Raises ValueError with the key for an invalid value."""
+class ByteSettings:
+    """Settings that all these devices have. Raises ValueError with the key for an invalid value."""
 
     source: str = field(kw_only=False)
     silence: float = 0.5
     """Timeout for samples, seconds, after which the setup is repeated."""
-    answer_timeout: float = 0.5
-    """Timeout for an answer, seconds."""
-    attempts: int = 3
-    """How often an unanswered message is sent."""
     delay: float = 0.0
     """From the measurement to the instant that the device states, seconds."""
     delay_sigma: float = 0.0
     """Standard deviation of `delay`, seconds."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, silence=(0.05, 3600.0), answer_timeout=(0.05, 60.0), attempts=(1, 100))
-        check_ranges(self, delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
-        if any(baud <= 0 for baud in self.bauds):
-            raise ValueError(f"bauds are above 0, got {self.bauds}")
+        check_ranges(self, silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
 
     @property
     def bauds(self) -> tuple[int, ...]:
         """Baud rates to try; the line is opened at the first. Empty: the line has none."""
         return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamSettings(ByteSettings):
+    """Settings of a device that is configured."""
+
+    answer_timeout: float = 0.5
+    """Timeout for an answer, seconds."""
+    attempts: int = 3
+    """How often an unanswered message is sent."""
+
+    def __post_init__(self) -> None:
+        ByteSettings.__post_init__(self)
+        check_ranges(self, answer_timeout=(0.05, 60.0), attempts=(1, 100))
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds are above 0, got {self.bauds}")
 
 
 class StreamDriver(ABC, Generic[M]):
@@ -458,7 +468,7 @@ class StreamDriver(ABC, Generic[M]):
     awaited: str
     """What it streams, e.g. "NAV-PVT"."""
 
-    def __init__(self, settings: StreamSettings, stream: FrameScanner[M]) -> None:
+    def __init__(self, settings: ByteSettings, stream: FrameScanner[M]) -> None:
         self._settings, self._stream = settings, stream
         self.max_silence = settings.silence
         self._phase, self._reported = EndpointPhase.WAITING, ""
@@ -477,9 +487,9 @@ class StreamDriver(ABC, Generic[M]):
 
     # --- what a device defines ---
 
-    @abstractmethod
     def _make_identification(self) -> bytes:
-        """Return the request for the device's identity."""
+        """Return the request for the device's identity; nothing for one that is only read."""
+        return b""
 
     @abstractmethod
     def _on_message(self, message: M, now: HostTime) -> list[Output[bytes]]:
@@ -512,7 +522,7 @@ class StreamDriver(ABC, Generic[M]):
     @property
     def counts(self) -> Mapping[str, int]:
         """Messages by kind, `rejected.<reason>`, `skipped` bytes, `samples`, and the device's own."""
-        return {**self._stream.counts, **self._counts}
+        return Counter({**self._stream.counts, **self._counts})
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Discard incomplete data and ask the device who it is."""
@@ -637,6 +647,7 @@ class StreamDriver(ABC, Generic[M]):
         self._restart_silence_timer()
 
     def _make_request(self, frame: bytes) -> RequestStep:
+        assert isinstance(self._settings, StreamSettings)
         return RequestStep(frame, self._settings.answer_timeout, self._settings.attempts)
 
     def _restart_silence_timer(self) -> None:

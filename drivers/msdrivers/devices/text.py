@@ -16,20 +16,27 @@ line after the port was opened is not used: it may be the end of one.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import ClassVar, Final
+from typing import Final, NamedTuple
 
 from modelserver.errors import quote, suggest_name
 from modelserver.messages import NAN, ImuSample, JointSample, JointsSample, Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
 from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.devices.stream import recognize_line
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output
+from msdrivers.devices.stream import (
+    NEVER_NS,
+    ByteSettings,
+    FrameScanner,
+    ParsedFrame,
+    Script,
+    StreamDriver,
+    recognize_line,
+)
+from msdrivers.endpoint import EndpointPhase, HostTime, Output
 
 MAX_LINE: Final = 1024
 """Longer lines are cut."""
@@ -53,10 +60,9 @@ class ColumnMap(Strict):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TextSettings(Strict):
+class TextSettings(Strict, ByteSettings):
     """Settings that these devices have in common. Raises ValueError with the key for an invalid value."""
 
-    source: str
     columns: int
     """Number of columns of a line; others are rejected."""
     separator: str = ","
@@ -73,7 +79,8 @@ class TextSettings(Strict):
     """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, columns=(1, 256), silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
+        ByteSettings.__post_init__(self)
+        check_ranges(self, columns=(1, 256))
         if self.checksum not in ("none", "xor"):
             raise ValueError(f"checksum is none or xor, got {quote(self.checksum)}")
         for name, column in self.mapped.items():
@@ -86,31 +93,25 @@ class TextSettings(Strict):
         raise NotImplementedError
 
 
-class LineReader:
-    """Collects lines of bounded length, with the offset of their first byte's arrival."""
+class TextLine(NamedTuple):
+    """A line without its end, and the offset of its first byte in the stream. is_cut: only a part of it."""
 
-    def __init__(self) -> None:
-        self._buffer = b""
-        self._first_utime = 0
-        self._is_first = True
+    data: bytes
+    start: int
+    is_cut: bool = False
 
-    def clear(self) -> None:
-        """Discard what is incomplete; the next line is not used."""
-        self._buffer, self._is_first = b"", True
 
-    def feed(self, data: bytes, utime: int) -> list[tuple[bytes, int]]:
-        """Return the lines that `data`, received at `utime`, completes, each with when its first byte was received."""
-        lines = []
-        while data:
-            if not self._buffer:
-                self._first_utime = utime
-            part, newline, data = data.partition(b"\n")
-            self._buffer = (self._buffer + part)[: MAX_LINE + 1]
-            if newline:
-                if not self._is_first:
-                    lines.append((self._buffer.rstrip(b"\r"), self._first_utime))
-                self._buffer, self._is_first = b"", False
-        return lines
+class LineFormat:
+    """A `FrameFormat` of lines of text; any byte may begin one."""
+
+    start_bytes = bytes(range(256))
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[TextLine] | None:
+        end = buffer.find(b"\n", at)
+        if end >= 0:
+            return ParsedFrame(end + 1, "lines", TextLine(bytes(buffer[at:end]).rstrip(b"\r"), start))
+        is_short = len(buffer) - at <= MAX_LINE
+        return None if is_short else ParsedFrame(len(buffer), "lines", TextLine(bytes(buffer[at:]), start, True))
 
 
 def encode_line(description: TextSettings, values: Mapping[str, float]) -> bytes:
@@ -126,26 +127,21 @@ def encode_line(description: TextSettings, values: Mapping[str, float]) -> bytes
     return f"{text}\r\n".encode()
 
 
-EXAMINED_BYTES: Final = 4096
-_SECOND_NS: Final = 1_000_000_000
+class TextDriver(StreamDriver[TextLine]):
+    """An `Endpoint` of bytes at the host's end of the device's line.
 
+    Counts: lines, samples, `other_lines`, and `rejected.<reason>`: columns, number, checksum, range, length.
+    """
 
-class TextDriver(ABC):
-    """An `Endpoint` of bytes at the host's end of the device's line."""
-
-    device: ClassVar[str]
-    """Name in the vehicle file."""
+    description = "device that sends lines of text"
+    _settings: TextSettings
 
     def __init__(self, settings: TextSettings) -> None:
-        self._settings = settings
-        self.max_silence = settings.silence
-        self._reader = LineReader()
-        self._phase, self._reported = EndpointPhase.WAITING, ""
-        self._silence_deadline_ns: int | None = None
-        self._first_bytes, self._last_line = b"", b""
-        self._seq = 0
-        self.counts: Counter[str] = Counter()
-        """Lines, samples, `other_lines`, and `rejected.<reason>`: columns, number, checksum, range, length."""
+        super().__init__(settings, FrameScanner((LineFormat(),)))
+        self.awaited = f"lines of {settings.columns} columns"
+        self._is_partial = True
+        """What comes next may be the end of a line."""
+        self._last_line = b""
 
     @abstractmethod
     def _make_sample(self, values: Mapping[str, float], header: SensorHeader) -> Sample:
@@ -155,37 +151,20 @@ class TextDriver(ABC):
     def _get_limit(self, name: str) -> float:
         """Return the largest magnitude of a field."""
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        self._reader.clear()
-        self._first_bytes = self._last_line = b""
-        self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * _SECOND_NS)
-        return self._set_status(EndpointPhase.WAITING, "waiting for lines of text")
+    def _on_start(self) -> None:
+        self._is_partial, self._last_line, self._first_bytes = True, b"", b""
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        if len(self._first_bytes) < EXAMINED_BYTES:
-            self._first_bytes += unit[: EXAMINED_BYTES - len(self._first_bytes)]
-        out: list[Output[bytes]] = []
-        for line, utime in self._reader.feed(unit, now.utime):
-            out += self._on_line(line, utime, now)
-        return out
+    def _describe_wait(self) -> str:
+        return "waiting for lines of text"
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        if self._silence_deadline_ns is None or now.monotonic_ns < self._silence_deadline_ns:
-            return []
-        self._silence_deadline_ns = None
+    def _run_setup(self) -> Script:
+        """Only read."""
+        self._restart_silence_timer()
+        yield from ()
+
+    def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
+        self._silence_deadline_ns = NEVER_NS
         return self._set_status(EndpointPhase.SILENT, self._explain_silence())
-
-    def get_deadline(self) -> int | None:
-        return self._silence_deadline_ns
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        return []
-
-    def _set_status(self, phase: EndpointPhase, text: str) -> list[Output[bytes]]:
-        if (phase, text) == (self._phase, self._reported):
-            return []
-        self._phase, self._reported = phase, text
-        return [EndpointStatus(phase, text)]
 
     def _explain_silence(self) -> str:
         head = f"no usable line for {self._settings.silence:g} s"
@@ -197,50 +176,46 @@ class TextDriver(ABC):
             return f"{head}; the last one was {shown}, expected are {wanted}: check columns, separator and starts_with"
         return f"{head}; {recognize_line(self._first_bytes, self.device)}"
 
-    def _on_line(self, line: bytes, utime: int, now: HostTime) -> list[Output[bytes]]:
-        values = self._read(line)
+    def _on_message(self, message: TextLine, now: HostTime) -> list[Output[bytes]]:
+        is_partial, self._is_partial = self._is_partial, message.is_cut
+        values = None if is_partial else self._read(message.data)
         if values is None:
             return []
         device_utime = max(1, round(1e6 * values["time"])) if "time" in values else 0
-        sample = self._make_sample(values, SensorHeader(0, self._settings.source, self._seq, utime, device_utime))
-        self._seq += 1
-        self.counts["samples"] += 1
-        self._silence_deadline_ns = now.monotonic_ns + round(self._settings.silence * _SECOND_NS)
-        status = self._set_status(EndpointPhase.STREAMING, f"receiving lines of {self._settings.columns} columns")
-        return [MeasuredSample(sample, self._settings.delay, self._settings.delay_sigma, 1e-3), *status]
+        header = self._make_header(self._find_arrival(message.start, now), device_utime)
+        return self._publish(self._make_sample(values, header), now, 1e-3)
 
     def _read(self, line: bytes) -> dict[str, float] | None:
         """Return the numbers of a line in SI units; None, counted by reason, for one that is not used."""
         settings = self._settings
-        self.counts["lines"] += 1
         self._last_line = line[:200]
         if len(line) > MAX_LINE:
-            self.counts["rejected.length"] += 1
+            self._stream.reject("length")
             return None
         text = line.decode("latin-1").strip()
         if settings.checksum == "xor":
             text, star, checksum = text.rpartition("*")
             body = text.removeprefix("$").encode("latin-1")
             if not star or checksum.upper() != f"{reduce(xor, body, 0):02X}":
-                self.counts["rejected.checksum"] += 1
+                self._stream.reject("checksum")
                 return None
         if not text.startswith(settings.starts_with):
-            self.counts["other_lines"] += 1
+            self._counts["other_lines"] += 1
             return None
         columns = text.split(settings.separator) if settings.separator else text.split()
         if len(columns) != settings.columns:
-            self.counts["rejected.columns"] += 1
+            self._stream.reject("columns")
             return None
         try:
             values = {
                 name: float(columns[each.column]) * each.scale + each.offset for name, each in settings.mapped.items()
             }
         except ValueError:
-            self.counts["rejected.number"] += 1
+            self._stream.reject("number")
             return None
         for name, value in values.items():
             if not abs(value) <= self._get_limit(name):
-                self.counts["rejected.range"] += 1
+                self._stream.reject("range")
                 return None
         return values
 
@@ -284,9 +259,6 @@ class TextImuDriver(TextDriver):
     """An `Endpoint` of bytes at the host's end of the unit's line; see `TextImuSettings`."""
 
     device = "text_imu"
-
-    def __init__(self, settings: TextImuSettings) -> None:
-        super().__init__(settings)
 
     def _get_limit(self, name: str) -> float:
         return VECTORS.get(name[:-2], 1e12)

@@ -15,7 +15,6 @@ from modelserver.errors import ConfigError
 from msdrivers.devices.text import (
     MAX_LINE,
     ColumnMap,
-    LineReader,
     TextImuDriver,
     TextImuSettings,
     TextJointsDriver,
@@ -203,8 +202,12 @@ def test_given_wrong_joints_then_the_error_names_them() -> None:
         read_driver("head", {key: value for key, value in section.items() if key != "joints"})
 
 
-def test_given_a_reader_that_is_cleared_then_the_rest_of_a_line_is_not_used() -> None:
-    reader = LineReader()
-    assert reader.feed(b"3,4\n5,6\n7,", 1) == [(b"5,6", 1)]
-    reader.clear()
-    assert reader.feed(b"8\n9,10\n", 2) == [(b"9,10", 2)]
+def test_given_a_line_that_is_opened_again_then_the_rest_of_a_line_is_not_used() -> None:
+    settings = make_settings(fields={"angular_velocity_z": ColumnMap(0)}, columns=2)
+    line = Line(TextImuDriver(settings), TextImuEmulator((), settings)).open()
+    line.deliver(b"3,4\n5,6\n7,")
+    line.open()
+    line.run(0.5)
+    line.deliver(b"8\n9,10\n")
+    found = [(each.angular_velocity[2], each.header.host_utime - START) for each in line.samples]
+    assert found == [(5.0, 0), (9.0, 500_000)]
