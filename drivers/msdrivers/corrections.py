@@ -27,7 +27,7 @@ from typing import Final
 
 from modelserver.messages import FixType, GpsSample, Sample
 from modelserver.version import __version__
-from msdrivers.devices.gps import nmea
+from msdrivers.devices.gps import DAY, nmea
 from msdrivers.devices.stream import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
 from msdrivers.registry import NtripSettings, split_address
 from msdrivers.runner import Runner
@@ -225,7 +225,6 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 """Delays before another attempt, doubled each time."""
 MAX_WAITING: Final = 256
 """Frames that wait for the driver; of more the oldest are lost: old corrections are of no use."""
-DAY_US: Final = 86_400_000_000
 
 
 class CorrectionsClient:
@@ -316,7 +315,7 @@ class CorrectionsClient:
                 now = self._monotonic()
                 if session.is_answered and settings.gga_period and now - gga_s >= settings.gga_period and self._place:
                     gga_s = now
-                    connection.sendall(make_gga(self._place, (time.time_ns() // 1000) % DAY_US))
+                    connection.sendall(make_gga(self._place, (time.time_ns() // 1000) % DAY))
                 try:
                     data = connection.recv(4096)
                 except TimeoutError:

@@ -29,7 +29,6 @@ from msdrivers.links import EndOfRecordingError, Link, LinkWrapper
 
 log = logging.getLogger(__name__)
 
-
 MAGIC = "# modelserver raw 1 "
 
 MAX_LINE = 1 << 20

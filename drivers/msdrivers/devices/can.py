@@ -507,7 +507,6 @@ def _describe(error: _RejectedError, statement: _Statement, name: str) -> Proble
 MAX_SEEN = 8
 """Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
 
-
 MAX_FLAWS = 3
 """Warnings about the DBC file at a start: `modelserver check` has all."""
 

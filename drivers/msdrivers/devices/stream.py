@@ -35,7 +35,6 @@ M = TypeVar("M")
 
 M_co = TypeVar("M_co", covariant=True)
 
-
 MAX_NAMES: Final = 64
 """Largest number of names; further ones are counted as `other`."""
 

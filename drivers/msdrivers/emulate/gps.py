@@ -21,7 +21,7 @@ from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseEr
 
 from modelserver.messages import FixType, GpsSample
 from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea
-from msdrivers.devices.gps.driver import GpsSettings
+from msdrivers.devices.gps.driver import WGS84_DATUM, GpsSettings
 from msdrivers.devices.gps.novatel import (
     Body,
     HeadingLog,
@@ -50,7 +50,6 @@ _FIXES = {
     FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
 """Position type, quality in GGA, mode in RMC and VTG."""
-_WGS84 = 61
 
 
 def is_known(name: str) -> bool:
@@ -103,11 +102,13 @@ def _get_motion(sample: GpsSample) -> tuple[float, float, float]:
 def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
-        return Position(status, PositionType.NONE, *zeros, _WGS84, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
+        return Position(status, PositionType.NONE, *zeros, WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
     used, kind = max(0, sample.satellites), _FIXES[sample.fix_type][0]
     heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
     place = (sample.latitude_deg, sample.longitude_deg, *heights)
-    return Position(SolutionStatus.SOL_COMPUTED, kind, *place, _WGS84, *_get_sigmas(sample), "", 0.0, 0.0, used, used)
+    return Position(
+        SolutionStatus.SOL_COMPUTED, kind, *place, WGS84_DATUM, *_get_sigmas(sample), "", 0.0, 0.0, used, used
+    )
 
 
 def _make_velocity(sample: GpsSample) -> Velocity:
@@ -200,7 +201,6 @@ NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
     "gpzda": _format_zda,
 }
 """Sentence -> its bytes."""
-
 
 _PORT = "COM1"
 _PROMPT = f"[{_PORT}]".encode()

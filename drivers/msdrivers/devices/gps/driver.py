@@ -422,7 +422,6 @@ def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
 QUOTED_BYTES = 24
 """Quoted bytes of the beginning."""
 
-
 MAX_NAMES = 6
 MIN_FLAWED_SENTENCES = 2
 """Fewer flawed sentences may be chance."""

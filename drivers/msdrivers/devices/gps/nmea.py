@@ -37,7 +37,6 @@ KNOT = 1852.0 / 3600.0
 """Meters per second."""
 KMH = 1.0 / 3.6
 
-
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _CLOCK = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
 _ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
@@ -269,7 +268,6 @@ KINDS = frozenset({"GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "HDT", "ZDA"
 
 MODES = frozenset("APDRFE")
 """Letters of the mode indicator, which NMEA 2.3 added, for measured data. M is manual input, S simulated, N invalid."""
-
 
 _parse_nonnegative = partial(parse_number, least=0.0)
 
