@@ -252,13 +252,8 @@ class AxisSettings:
         return ""
 
 
-class _Step(NamedTuple):
-    """Write `degrees` to a commanded register; None: read it."""
-
-    name: str
-    degrees: float | None = None
-
-
+_Step: TypeAlias = tuple[str, ReadRegisters | WriteRegisters]
+"""What is done, and its request."""
 _Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
 
 
@@ -284,20 +279,11 @@ class NodSetup:
     @property
     def step_text(self) -> str:
         """Description of the next step; empty when done."""
-        if self._step is None:
-            return ""
-        name, degrees = self._step
-        verb = "reading" if degrees is None else f"writing {degrees:g} to"
-        return f"{verb} {name} (register {self._registers[name].address})"
+        return "" if self._step is None else self._step[0]
 
     def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
         """Make the request of the next step; None when done."""
-        if self._step is None:
-            return None
-        mapped, degrees = self._registers[self._step.name], self._step.degrees
-        if degrees is None:
-            return ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
-        return WriteRegisters(mapped.address, mapped.from_degrees(degrees), transaction)
+        return None if self._step is None else replace(self._step[1], transaction=transaction)
 
     def on_reply(self, reply: Registers | RegistersWritten) -> str:
         """Complete a step; return a warning if the axis holds another value than was written, else empty."""
@@ -317,21 +303,27 @@ class NodSetup:
 
     def _run(self, nod: NodSettings) -> _Steps:
         for name, mapped in self._registers.items():
-            reply = yield _Step(name)
+            reply = yield self._read(name)
             if isinstance(reply, Registers):
                 self._current[name] = mapped.to_degrees(reply.values)
                 self.found.setdefault(name, reply.values)
         wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
         order = _order_writes(nod.lower_deg, self._current["upper_limit"])
         for name in order:
-            yield _Step(name, wanted[name])
+            mapped = self._registers[name]
+            text = f"writing {wanted[name]:g} to {name} (register {mapped.address})"
+            yield text, WriteRegisters(mapped.address, mapped.from_degrees(wanted[name]))
             self._current[name] = wanted[name]
         for name in order:
-            mapped, reply = self._registers[name], (yield _Step(name))
+            mapped, reply = self._registers[name], (yield self._read(name))
             if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
                 self._current[name] = mapped.to_degrees(reply.values)
                 actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
                 self._warning = f"{actual}: the axis's own limit"
+
+    def _read(self, name: str) -> _Step:
+        mapped = self._registers[name]
+        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.registers)
 
 
 def _order_writes(lower: float, present_upper: float) -> tuple[str, ...]:
