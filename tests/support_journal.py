@@ -11,12 +11,11 @@ from support_signing import ALLOWED, KEY, envelope, write_test_key
 
 from modelserver.config.vehicle_file import LimitsConfig, load_config
 from modelserver.messages import CHANNEL_OF
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.journal import environment
-from modelserver.server.journal.queue import JournalQueue
-from modelserver.server.journal.segments import Ring, list_segments
-from modelserver.server.journal.writer import JournalContext, JournalWriter
+from modelserver.server.journal import JournalQueue
+from modelserver.server.journal import writer as environment
+from modelserver.server.journal.writer import JournalContext, JournalWriter, Ring, list_segments
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, read_geometry
 from modelserver.server.vehicle import load_vehicle

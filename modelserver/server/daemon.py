@@ -18,15 +18,14 @@ from modelserver.errors import quote
 from modelserver.messages import Mode, SwitchMode
 from modelserver.server.bus import LcmBus
 from modelserver.server.clock import Clock
-from modelserver.server.diagnostics.bus_probe import DuplicateServerMonitor, probe_bus, report_findings
-from modelserver.server.diagnostics.machine import read_gauges, read_run_delay
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.diagnostics import DuplicateServerMonitor, probe_bus, read_gauges, report_findings
+from modelserver.server.journal import JournalQueue
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.persistence.stores import SUBJECT as RESTART
-from modelserver.server.persistence.stores import PersistentStores, open_stores
+from modelserver.server.persistence import SUBJECT as RESTART
+from modelserver.server.persistence import PersistentStores, open_stores
 from modelserver.server.reloading import GeometryReader
-from modelserver.server.supervision.systemd import Notifier, ServiceSupervisor
+from modelserver.server.supervision import Notifier, ServiceSupervisor
 from modelserver.server.vehicle import Vehicle
 from modelserver.version import __version__
 from modelserver.wire.provider import resolve_url
@@ -123,7 +122,6 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
             channels=lambda state: vehicle.sensor_channels(state.model),
             on_persist=states.save if states is not None else lambda state: "",
             gauges=read_gauges,
-            run_delay=read_run_delay,
             on_tick=supervisor.on_tick,
             verifier=verifier,
             journal=JournalQueue() if journal is None else journal[0],

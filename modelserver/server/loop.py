@@ -33,18 +33,18 @@ from modelserver.query.answers import DeferredAnswer
 from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock, TickTimer
 from modelserver.server.ingress import (
+    MODE_TYPE,
     PUBLISHER_CONFLICT,
+    CommandVerifier,
     PublisherConflictMonitor,
     RejectionCounter,
     SensorChannel,
     peek_sample_id,
 )
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.reloading import PollReload
-from modelserver.server.requests.handler import RequestHandler
-from modelserver.server.requests.scheduler import RunDelay
-from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
+from modelserver.server.requests import LATE_TICK_NS, RequestHandler
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
@@ -90,7 +90,6 @@ class Hooks:
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
     gauges: reads resources of the process for the health report, given the number of waiting requests.
-    run_delay: reads the run-queue delay of the loop's thread; None if unknown.
     on_tick: called after each tick without error.
     verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
     journal: records everything that is handled and published; one that nothing begins records nothing.
@@ -103,7 +102,6 @@ class Hooks:
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
     gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
-    run_delay: Callable[[], RunDelay | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
     journal: JournalQueue = field(default_factory=JournalQueue)
@@ -182,7 +180,7 @@ class Loop:
         self._sensor_channels: set[str] = set()
         self._subscribe(settings.sensors)
         self._requests = RequestHandler(
-            self, bus, clock, self._log, self._journal, prefix, settings.limits, hooks.verifier, hooks.run_delay
+            self, bus, clock, self._log, self._journal, prefix, settings.limits, hooks.verifier
         )
 
     def run(self) -> None:
@@ -232,8 +230,6 @@ class Loop:
         elif not requests.is_ready:
             if requests.waiting:
                 seconds = min(seconds, FLOOD_PAUSE_S)
-            elif requests.prepare(begin_ns):
-                seconds = 0.0
             self._bus.wait(seconds)
 
     def _drain_sensors(self, begin_ns: int) -> int:
@@ -246,7 +242,7 @@ class Loop:
         now_ns = self._clock.monotonic_ns()
         has_backlog = count == SAMPLES_PER_PASS or now_ns - begin_ns >= limit_ns
         if has_backlog and self._has_backlog:
-            self._requests.contention.add_sensor_backlog(now_ns)
+            self._requests.report_backlog(now_ns)
         self._has_backlog = has_backlog
         return now_ns
 
@@ -255,9 +251,8 @@ class Loop:
         if tick is None:
             return
         now, missed, latency_ns = tick
-        self._requests.contention.add_tick(
-            missed * self._settings.period_ns if missed else latency_ns, now.monotonic_ns
-        )
+        if max(missed * self._settings.period_ns, latency_ns) > LATE_TICK_NS:
+            self._requests.report_late_tick(now.monotonic_ns)
         self._conflicts.clear_expired(now)
         is_report_due = now.monotonic_ns >= self.state.health_due_ns
         for inbox in (self._bus.sensors, self._bus.requests):

@@ -14,12 +14,11 @@ from support_journal import SMALL, JournalRig
 from modelserver.config.vehicle_file import JournalConfig, VehicleConfig
 from modelserver.core import Instant
 from modelserver.messages import GetBodyList, HealthWarning, Rejected, RequestHeader, Tick
-from modelserver.server.journal import queue as journal
+from modelserver.server import journal
+from modelserver.server.journal import JournalQueue
 from modelserver.server.journal import writer as journal_writer
-from modelserver.server.journal.queue import JournalQueue
-from modelserver.server.journal.segments import Ring, Segment
 from modelserver.server.journal.verify import verify
-from modelserver.server.journal.writer import RETRY_S, get_journal_directory, make_writer
+from modelserver.server.journal.writer import RETRY_S, Ring, Segment, get_journal_directory, make_writer
 from modelserver.server.loop import Loop
 from modelserver.wire.journal import JournalRecord, RecordKind, SegmentHead, read_segment
 

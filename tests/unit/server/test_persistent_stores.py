@@ -24,10 +24,8 @@ from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
 from modelserver.server.clock import Clock
-from modelserver.server.journal.segments import Ring
-from modelserver.server.journal.writer import make_writer
-from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
-from modelserver.server.persistence.stores import PersistentStores, open_stores
+from modelserver.server.journal.writer import Ring, make_writer
+from modelserver.server.persistence import FileLock, LockHeldError, PersistentStores, describe_error, open_stores
 
 ORIGIN = make_origin(500_000.0, 5_500_000.0, 700.0, 12, True)
 NOW = Instant(PERSISTED.monotonic_ns, PERSISTED.utime)
@@ -102,7 +100,7 @@ def test_given_a_directory_that_cannot_be_used_then_no_lock_keeps_anybody_off(tm
 HOLDING = """
 import sys
 from pathlib import Path
-from modelserver.server.persistence.directory import FileLock
+from modelserver.server.persistence import FileLock
 FileLock(Path(sys.argv[1])).acquire()
 print("held", flush=True)
 sys.stdin.read()
@@ -215,7 +213,7 @@ def test_given_a_user_without_a_home_then_nothing_is_persisted_and_that_is_logge
 ) -> None:
     from dataclasses import replace
 
-    from modelserver.server.persistence import stores
+    from modelserver.server import persistence as stores
 
     monkeypatch.setattr(stores, "get_state_directory", lambda named: None)
     open_stores(replace(config, state_directory=""), localizes=True).close()

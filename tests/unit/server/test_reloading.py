@@ -43,8 +43,8 @@ from modelserver.messages import (
     SnapshotPart,
 )
 from modelserver.server import reloading
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import MAX_RELOADS, Hooks, Loop, LoopSettings, SnapshotEncoder
 from modelserver.server.reloading import GeometryReader, PollReload, read_geometry
 from modelserver.server.vehicle import Vehicle, load_vehicle

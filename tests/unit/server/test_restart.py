@@ -17,9 +17,8 @@ from support_persistence import PERSISTED, POSE, UTIME
 
 from modelserver.core import Instant
 from modelserver.messages import PersistedState, RestoredState
-from modelserver.server.persistence import stores as restart
-from modelserver.server.persistence.directory import write_atomically
-from modelserver.server.persistence.stores import (
+from modelserver.server import persistence as restart
+from modelserver.server.persistence import (
     MAX_BYTES,
     PersistedStateError,
     StateStore,
@@ -27,6 +26,7 @@ from modelserver.server.persistence.stores import (
     decode_state,
     encode_state,
     read_boot_id,
+    write_atomically,
 )
 
 NOW = Instant(PERSISTED.monotonic_ns + 7_000_000_000, UTIME + 7_000_000)
@@ -263,7 +263,7 @@ def test_given_a_unit_without_proc_sys_then_the_boot_id_comes_from_its_environme
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As systemd's specifier %b writes it, without hyphens; the same id as outside of the unit."""
-    monkeypatch.setattr("modelserver.server.persistence.stores.BOOT_ID", tmp_path / "hidden")
+    monkeypatch.setattr("modelserver.server.persistence.BOOT_ID", tmp_path / "hidden")
     for named, found in (
         ("143ed63e8a1544ff9db3048c46529278", "143ed63e-8a15-44ff-9db3-048c46529278"),
         ("", ""),

@@ -11,12 +11,12 @@ from support_samples import START, ScriptedLocalizer, cart, gps, imu, start_core
 from modelserver.core import CoreState
 from modelserver.core.commands import ModelLoaded
 from modelserver.messages import Estimate, HealthWarning, Invalid, LoadModel, ReloadModel, RequestHeader
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import PollReload
-from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
+from modelserver.server.supervision import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
 from modelserver.wire.codec import encode
 
 HZ = 50

@@ -35,9 +35,9 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.server.bus import Inboxes
-from modelserver.server.journal.segments import files_of, list_segments
-from modelserver.server.journal.verify import VerificationReport, verify
-from modelserver.server.requests.deferred import DeferredReply
+from modelserver.server.journal.verify import VerificationReport, files_of, verify
+from modelserver.server.journal.writer import list_segments
+from modelserver.server.requests import DeferredReply
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import encode_event
 from modelserver.wire.journal import JournalRecord, encode_batch, read_segment

@@ -23,7 +23,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.server.stamp_axis import StampAxis
+from modelserver.server.recordings import StampAxis
 from mstools.report.findings import collect_findings
 from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
 from mstools.report.sensor_motion import (
