@@ -24,8 +24,7 @@ import tempfile
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, Final, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 from uuid import UUID
 
 import msgspec
@@ -290,25 +289,27 @@ _Text = Annotated[str, msgspec.Meta(max_length=MAX_NAME_LENGTH)]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 _Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
-_FIELDS: Final[Mapping[Any, tuple[Any, str]]] = MappingProxyType(
-    {
-        str: (_Text, f"a text of at most {MAX_NAME_LENGTH} characters"),
-        int: (_Count, "a count"),
-        float: (_Number, f"a number within +-{_MAX_NUMBER:g}"),
-        Vector3: (tuple[_Number, _Number, _Number], "3 numbers"),
-        Quaternion: (tuple[_Number, _Number, _Number, _Number], "4 numbers"),
-        tuple[float, ...]: (tuple[_Number, ...], "numbers"),
-        tuple[str, ...]: (tuple[_Text, ...], f"texts of at most {MAX_NAME_LENGTH} characters"),
-        tuple[tuple[str, float], ...]: (
-            Annotated[list[Any], msgspec.Meta(max_length=MAX_WHEELS)],
-            f"at most {MAX_WHEELS} pairs",
-        ),
-        PersistedPose | None: (Any, ""),
-    }
-)
-"""What is valid for a field of each declared type, and its description."""
 
-_Row = TypeVar("_Row", PersistedState, PersistedPose)
+def _make_struct(row: type, types: Mapping[Any, Any]) -> Any:
+    """Return the class that checks a mapping for a NamedTuple: its keys, and of each field the type and the bounds."""
+    fields = [(name, types[hint]) for name, hint in get_type_hints(row).items()]
+    return msgspec.defstruct(row.__name__, fields, forbid_unknown_fields=True)
+
+
+_TYPES: Final = {
+    str: _Text,
+    int: _Count,
+    float: _Number,
+    Vector3: tuple[_Number, _Number, _Number],
+    Quaternion: tuple[_Number, _Number, _Number, _Number],
+    tuple[float, ...]: tuple[_Number, ...],
+    tuple[str, ...]: tuple[_Text, ...],
+    tuple[tuple[str, float], ...]: Annotated[tuple[tuple[_Text, _Number], ...], msgspec.Meta(max_length=MAX_WHEELS)],
+}
+"""What is valid for a field of each declared type."""
+
+_Pose: Final = _make_struct(PersistedPose, _TYPES)
+_State: Final = _make_struct(PersistedState, {**_TYPES, PersistedPose | None: _Pose | None})
 
 
 class PersistedStateError(ValueError):
@@ -330,7 +331,7 @@ def _pack(content: dict[str, Any]) -> bytes:
     return f"{_MAGIC} {VERSION} {hashlib.sha256(text).hexdigest()}\n".encode() + text + b"\n"
 
 
-def _unpack(data: bytes) -> dict[str, Any]:
+def _unpack(data: bytes) -> bytes:
     if not data:
         raise PersistedStateError("the file is empty")
     if len(data) > MAX_BYTES:
@@ -345,21 +346,16 @@ def _unpack(data: bytes) -> dict[str, Any]:
         )
     if not text.endswith(b"\n") or hashlib.sha256(text[:-1]).hexdigest().encode() != words[2]:
         raise PersistedStateError("it is damaged: the checksum is wrong")
+    return text
+
+
+def _parse_state(text: bytes) -> PersistedState:
     try:
-        content = json.loads(text, parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise PersistedStateError(f"it is damaged: {error}") from None
-    if not isinstance(content, dict):
-        raise PersistedStateError("it is no mapping")
-    return content
-
-
-def _reject_constant(word: str) -> float:
-    raise PersistedStateError(f"it contains {word}")
-
-
-def _parse_state(content: object) -> PersistedState:
-    state = _convert_fields(content, PersistedState)
+        found = msgspec.json.decode(text, type=_State)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise PersistedStateError(str(error)) from None
+    pose = None if found.pose is None else _check_pose(PersistedPose(*msgspec.structs.astuple(found.pose)))
+    state = PersistedState(*msgspec.structs.astuple(found))._replace(pose=pose)
     count = len(state.names)
     if not 15 <= count <= MAX_STATES:
         raise PersistedStateError(f"names: expected 15 to {MAX_STATES} error states")
@@ -368,33 +364,17 @@ def _parse_state(content: object) -> PersistedState:
             raise PersistedStateError(f"{key}: expected {expected} numbers")
     if min(state.covariance[:: count + 1]) < 0.0:
         raise PersistedStateError("covariance: negative variance")
-    return state if state.pose is None else state._replace(pose=_parse_pose(state.pose))
+    return state
 
 
-def _parse_pose(content: object) -> PersistedPose:
-    pose = _convert_fields(content, PersistedPose)
+def _check_pose(pose: PersistedPose) -> PersistedPose:
     if abs(pose.latitude_deg) > 90.0 or abs(pose.longitude_deg) > 360.0:
         raise PersistedStateError(f"latitude {pose.latitude_deg:g}, longitude {pose.longitude_deg:g}: out of range")
     if not abs(math.hypot(*pose.attitude) - 1.0) < 1e-6:
         raise PersistedStateError("attitude: expected a unit quaternion")
     if min(*pose.correlated_error_variance, pose.allowance) < 0.0 or pose.gnss_noise_inflation < 1.0:
         raise PersistedStateError("correlated_error_variance, allowance or gnss_noise_inflation: out of range")
-    pairs = tuple[tuple[str, _Number], ...]
-    return pose._replace(wheels=_convert("wheels", pose.wheels, pairs, "pairs of a name and a distance"))
-
-
-def _convert_fields(content: object, row: type[_Row]) -> _Row:
-    """Convert a mapping to a NamedTuple, each field as declared. Raises PersistedStateError."""
-    if not isinstance(content, dict) or set(content) != set(row._fields):
-        raise PersistedStateError("unknown or missing keys")
-    return row(*(_convert(key, content[key], *_FIELDS[hint]) for key, hint in get_type_hints(row).items()))
-
-
-def _convert(key: str, value: object, kind: Any, expected: str) -> Any:
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError:
-        raise PersistedStateError(f"{key}: expected {expected}") from None
+    return pose
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
