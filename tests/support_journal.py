@@ -15,7 +15,7 @@ from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
 from modelserver.server.journal import JournalQueue
 from modelserver.server.journal import writer as environment
-from modelserver.server.journal.writer import JournalContext, JournalWriter, Ring, list_segments
+from modelserver.server.journal.writer import JournalWriter, Ring, list_segments
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, read_geometry
 from modelserver.server.vehicle import load_vehicle
@@ -62,8 +62,10 @@ class JournalRig:
         self.queue = JournalQueue()
         self.ring = ring(self.directory, max_bytes, segment_bytes)
         known = {**environment.collect_facts(), "run": run, **(facts or {})}
-        context = JournalContext(known, [(str(path), path.read_bytes())], self.vehicle.config)
-        self.writer = JournalWriter(self.queue, self.ring, context, self.clock, pause=lambda: None, key=key)
+        files = [(str(path), path.read_bytes())]
+        self.writer = JournalWriter(
+            self.queue, self.ring, self.vehicle.config, known, files, self.clock, pause=lambda: None, key=key
+        )
         reader = GeometryReader(self.vehicle, str(path), read_geometry)
         self.loop = Loop(
             self.bus,

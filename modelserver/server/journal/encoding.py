@@ -11,7 +11,7 @@ itself, an int for what follows:
     DEFINE        name and description of the next class      16 + n        record of the n-th class: its fields
 
 The stream is a sequence of blocks, each a length (4 bytes, big-endian) and a flat MessagePack array. A float is its 8
-bytes, so that NaN payloads and signed zeros survive.
+bytes, so that NaN payloads and signed zeros survive. Arrays are little-endian, as all machines of this project.
 
 The fields of a class are those of a NamedTuple, a dataclass, or of annotated `__slots__`; of any other class the
 parameters of its constructor, each an attribute of the same name. Only the last are rebuilt by their constructor. A
@@ -26,7 +26,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import struct
-import sys
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Sequence
@@ -205,15 +204,11 @@ class _Writer:
                 write(pair[0])
                 write(pair[1])
         elif cls is array:
-            data = value if sys.byteorder == "little" else array(value.typecode, value)
-            if data is not value:
-                data.byteswap()
-            tokens += (ARRAY, value.typecode, data.tobytes())
+            tokens += (ARRAY, value.typecode, value.tobytes())
         elif cls is np.ndarray and value.dtype in (np.float64, np.int64):
             # the order (C or Fortran) affects sums
             order = "F" if value.flags.f_contiguous and not value.flags.c_contiguous else "C"
-            data = value.astype(value.dtype.newbyteorder("<"), copy=False).tobytes(order)
-            tokens += (NDARRAY, value.dtype.name, order, value.ndim, *value.shape, data)
+            tokens += (NDARRAY, value.dtype.name, order, value.ndim, *value.shape, value.tobytes(order))
         else:
             tokens.append(RECORD + self._define(cls))
             layout = _get_layout(cls)
@@ -239,6 +234,8 @@ class _Writer:
             text = _get_layout(cls).text
             name = f"{cls.__module__}:{cls.__qualname__}"
             self._tokens += (DEFINE, name, text if self._is_described else zlib.crc32(text.encode()))
+            if self._is_described:
+                self._pause()  # the layouts of a state together take 4 ms the first time
         return number
 
     def _flush(self) -> None:
@@ -327,10 +324,7 @@ class _Reader:
                 raise ValueError("a duplicate key")
             return mapping if token == DICT else MappingProxyType(mapping)
         if token == ARRAY:
-            elements = array(self._take(), self._take())
-            if sys.byteorder != "little":
-                elements.byteswap()
-            return elements
+            return array(self._take(), self._take())
         if token == NDARRAY:
             return self._read_ndarray()
         layout = self._classes[token - RECORD] if token >= RECORD else None
@@ -364,10 +358,9 @@ class _Reader:
         if name not in ("float64", "int64") or order not in ("C", "F") or dimensions > MAX_DIMENSIONS:
             raise ValueError(f"an array of {dimensions} dimensions of {name}")
         *shape, data = islice(self._tokens, dimensions + 1)
-        stored = np.dtype(name).newbyteorder("<")
-        if prod(map(_to_count, shape)) * stored.itemsize != len(data) or max(shape, default=0) > MAX_DIMENSION_LENGTH:
+        if prod(map(_to_count, shape)) * 8 != len(data) or max(shape, default=0) > MAX_DIMENSION_LENGTH:
             raise ValueError(f"an array of shape {shape} with {len(data)} bytes")
-        return np.frombuffer(data, stored).astype(np.dtype(name)).reshape(shape, order=order)
+        return np.frombuffer(data, name).copy().reshape(shape, order=order)
 
     def _define(self, name: str, text: str | int) -> None:
         """Process the definition of a class. Raises RecordingError where this build has it otherwise."""

@@ -30,7 +30,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -52,6 +51,7 @@ from modelserver.server.persistence import (
     create_directory,
     describe_error,
     get_state_directory,
+    sync_directory,
     to_file_name,
     write_atomically,
 )
@@ -192,22 +192,16 @@ class Segment:
 
 
 class Ring:
-    """Directory of segments with a maximum size; the oldest are deleted. One writer at a time. Methods raise OSError.
+    """Directory of segments with a maximum size; the oldest are deleted. One writer at a time. Raises OSError."""
 
-    `outer_lock`: the lock of a directory around it that another service may hold, None = there is none.
-    """
-
-    def __init__(self, directory: Path, max_bytes: int, segment_bytes: int, outer_lock: FileLock | None = None):
+    def __init__(self, directory: Path, max_bytes: int, segment_bytes: int):
         self.directory = directory
         self.max_bytes = max_bytes
         self.segment_bytes = segment_bytes
-        self._outer_lock = outer_lock
         self._lock = FileLock(directory / LOCK_NAME)
 
     def acquire(self) -> None:
         """Acquire the directory for this writer."""
-        if self._outer_lock is not None:
-            self._outer_lock.claim()
         create_directory(self.directory)
         self._lock.acquire()
 
@@ -228,7 +222,7 @@ class Ring:
         newest = get_number(held[-1]) if held else None
         number = max(0 if newest is None else newest + 1, min_number)
         segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
-        self._sync_directory()
+        sync_directory(self.directory)
         return segment
 
     def make_room(self) -> bool:
@@ -241,13 +235,6 @@ class Ring:
 
     def release(self) -> None:
         self._lock.release()
-
-    def _sync_directory(self) -> None:
-        file = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(file)
-        finally:
-            os.close(file)
 
 
 SEGMENT_DOMAIN: Final = b"modelserver journal segment, version 1\n"
@@ -355,22 +342,6 @@ MAX_FILE_BYTES: Final = 4 << 20
 """Greatest size of a file that is copied into every segment; of a larger one only the beginning."""
 
 
-@dataclass(frozen=True, slots=True)
-class JournalContext:
-    """What every segment begins with in addition to the state.
-
-    Attributes
-    ----------
-    facts: about service, build and machine, as JSON.
-    files: name and bytes of the files that the service was started with, for people; the replay does not use them.
-    config: configuration of the vehicle.
-    """
-
-    facts: Mapping[str, Any]
-    files: Iterable[tuple[str, bytes]]
-    config: VehicleConfig
-
-
 def pause() -> None:
     """Release the interpreter to another thread."""
     time.sleep(PAUSE_S)
@@ -379,14 +350,20 @@ def pause() -> None:
 class JournalWriter:
     """Writes the records of a queue into a ring, on a thread between `start` and `close`.
 
-    `key`: seals the segments; None: without authentication.
+    Parameters
+    ----------
+    facts: about service, build and machine, as JSON.
+    files: name and bytes of the files that the service was started with, for people; the replay does not use them.
+    key: seals the segments; None: without authentication.
     """
 
     def __init__(
         self,
         queue: JournalQueue,
         ring: Ring,
-        context: JournalContext,
+        config: VehicleConfig,
+        facts: Mapping[str, Any],
+        files: Iterable[tuple[str, bytes]],
         clock: Clock,
         pause: Callable[[], object] = pause,
         key: Key | None = None,
@@ -396,9 +373,9 @@ class JournalWriter:
         self._previous = ""
         self._queue = queue
         self._ring = ring
-        self._context = context
+        self._config, self._facts, self._files = config, facts, files
         self._clock = clock
-        self._sync_ns = round(context.config.journal.sync_s * 1e9)
+        self._sync_ns = round(config.journal.sync_s * 1e9)
         self._pause = pause
         self._segment: Segment | None = None
         self._part = 0
@@ -500,18 +477,18 @@ class JournalWriter:
         lost = self._lost + beginning.lost
         try:
             self._end_segment()
-            run = encoding.RunState(self._context.config, encoding.detach(beginning.state))
+            run = encoding.RunState(self._config, encoding.detach(beginning.state))
             state = encoding.encode_run(run, self._pause)
             segment = self._create_segment()
             facts: dict[str, Any] = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime}
-            facts |= self._context.facts
+            facts |= self._facts
             facts["history_s"] = encoding.HISTORY_S if len(beginning.state.history) else None
             facts["key"] = "" if self._key is None else self._key.name
             facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
             self._previous = ""
             self._segment, self._batch = segment, 0
             segment.append(journal.encode_head(facts, now.utime))
-            for name, data in self._context.files:
+            for name, data in self._files:
                 segment.append(journal.encode_file(name, data[:MAX_FILE_BYTES], now.utime))
             segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
@@ -616,19 +593,18 @@ def get_max_bytes(config: VehicleConfig) -> int:
 
 
 def make_writer(
-    config: VehicleConfig, file: str, clock: Clock, lock: FileLock | None = None, key: Key | None = None
+    config: VehicleConfig, file: str, clock: Clock, key: Key | None = None
 ) -> tuple[JournalQueue, JournalWriter] | None:
     """Return the queue for the loop and its writer, None where no journal is written.
 
-    `file`: the vehicle file. `lock`: that of the state directory, used if the journal is inside. `key`: seals segments.
+    `file`: the vehicle file. `key`: seals segments.
     """
     directory = get_journal_directory(config)
     if directory is None:
         return None
     most = get_max_bytes(config)
     log.info("the journal is written in %s, %d MB at most", directory, most >> 20)
-    within = lock if lock is not None and directory.is_relative_to(lock.path.parent) else None
-    ring = Ring(directory, most, min(MAX_SEGMENT_BYTES, most // MIN_SEGMENTS), within)
+    ring = Ring(directory, most, min(MAX_SEGMENT_BYTES, most // MIN_SEGMENTS))
     facts = {
         **collect_facts(),
         "vehicle": config.vehicle,
@@ -638,5 +614,4 @@ def make_writer(
     paths = [path for path in (Path(file), Path(config.geometry)) if path.is_file()]
     files = [(str(path), read_regular(path, LARGEST_FILE)) for path in paths]
     queue = JournalQueue()
-    origins = JournalContext(facts, files, config)
-    return queue, JournalWriter(queue, ring, origins, clock, key=key)
+    return queue, JournalWriter(queue, ring, config, facts, files, clock, key=key)

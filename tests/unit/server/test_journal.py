@@ -284,8 +284,8 @@ def test_given_a_vehicle_file_when_the_writer_is_made_then_it_holds_the_files_an
     _, writer = made
     assert writer._ring.directory == tmp_path / "box"
     assert (writer._ring.max_bytes, writer._ring.segment_bytes) == (64 << 20, 8 << 20)
-    assert [Path(name).name for name, _ in writer._context.files] == ["vehicle.yaml", "geometry.yaml"]
-    assert writer._context.facts["vehicle"] == "cart"
+    assert [Path(name).name for name, _ in writer._files] == ["vehicle.yaml", "geometry.yaml"]
+    assert writer._facts["vehicle"] == "cart"
 
 
 def test_given_a_default_loop_then_it_writes_no_journal(tmp_path: Path) -> None:
