@@ -633,14 +633,14 @@ class _Verifier:
         self.close()
         self._replay, self._at_ns = None, 0
         try:
-            self._replay = replay = ReplayLoop(state.data)
+            replay = ReplayLoop(state.data)
+            if facts is not None and facts.get("history_s") is not None and len(history := replay.state.history):
+                self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
         except Exception as error:
+            # a forged state may contain anything
             self._add_finding(f"cannot be replayed: {error}", is_damage=True)
             return
-        if facts is not None and facts.get("history_s") is not None:
-            history = replay.state.history
-            if len(history):
-                self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
+        self._replay = replay
 
     def _process(self, record: JournalRecord) -> None:
         report, replay = self.report, self._replay
@@ -661,7 +661,7 @@ class _Verifier:
         self._at_ns = record.monotonic_ns
         if self._group is not None and not self._is_interleaved(record):
             self._compare()
-            if report.difference is not None:
+            if report.difference is not None or self._replay is None:
                 return
         try:
             published = replay.handle(record)
@@ -687,6 +687,14 @@ class _Verifier:
 
     def _compare(self) -> None:
         """Compare the recorded and the replayed outputs of the group, and count them by channel."""
+        try:
+            self._compare_group()
+        except Exception as error:
+            # a forged state may contain anything
+            self._add_finding(f"cannot be compared: {error}", is_damage=True)
+            self._replay = self._follows = None
+
+    def _compare_group(self) -> None:
         group, self._group = self._group, None
         assert group is not None
         assert self._replay is not None
