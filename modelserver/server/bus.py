@@ -1,4 +1,6 @@
-"""The bus: what the loop needs of LCM (`Bus`), its implementation (`LcmBus`), and one within a process (`FakeBus`).
+"""The bus: that of LCM (`LcmBus`), and one within a process (`FakeBus`).
+
+A bus has an inbox for samples, one for requests, `publish` and `wait`. Handlers run only while an inbox is drained.
 
 - Samples and requests have a receiver each (`wire.receiver`), so that a flood of requests cannot delay samples in a
   shared queue.
@@ -22,7 +24,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 from modelserver.server.clock import FakeClock
 from modelserver.wire.provider import open_lcm, resolve_url
@@ -98,40 +100,6 @@ Handler: TypeAlias = Callable[[str, bytes, Sender], None]
 Inboxes: TypeAlias = Literal["samples", "requests", "both"]
 
 
-class Inbox(Protocol):
-    """A queue of received messages. Handlers run only within `drain`."""
-
-    def subscribe(self, channel: str, handler: Handler) -> None:
-        """Call `handler` with every message of exactly `channel`."""
-
-    def pop_refused(self) -> dict[str, int]:
-        """Return how many messages were too long since the last call, by channel."""
-
-    def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
-
-        Returns the number of handled messages. One that is in progress when the time is up is the last.
-        """
-
-
-class Bus(Protocol):
-    """An inbox for samples, one for requests, and `publish`."""
-
-    @property
-    def sensors(self) -> Inbox:
-        """Received samples."""
-
-    @property
-    def requests(self) -> Inbox:
-        """Received requests."""
-
-    def publish(self, channel: str, data: bytes) -> None:
-        """Publish a message."""
-
-    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
-        """Wait until a message has arrived in an inbox, or the time is up."""
-
-
 MAX_READ_AHEAD: Final = 1000
 """Messages that a drain queues at most; some two milliseconds."""
 
@@ -178,7 +146,7 @@ class ReceiverInbox:
         self._receiver.close()
 
     def pop_refused(self) -> dict[str, int]:
-        """See `Inbox`."""
+        """Return how many messages were too long since the last call, by channel."""
         refused = self._receiver.refused
         if not refused:
             return {}
@@ -187,7 +155,10 @@ class ReceiverInbox:
         return found
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """See `Inbox`."""
+        """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
+
+        Returns the number of handled messages. One that is in progress when the time is up is the last.
+        """
         expected, self.expected = self.expected, None
         if expected == 0 or not limit or not self._handlers:
             return 0
@@ -337,3 +308,7 @@ class FakeBus:
 
     def get_published(self, channel: str) -> list[bytes]:
         return [data for name, data in self.published if name == channel]
+
+
+Inbox: TypeAlias = ReceiverInbox | FakeInbox
+Bus: TypeAlias = LcmBus | FakeBus

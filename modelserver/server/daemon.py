@@ -162,9 +162,9 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     if journal is not None:
         journal[1].start()
     try:
-        with supervisor.notify_at_exit():
-            loop.run()
+        loop.run()
     finally:
+        notifier.notify_stopping()
         reader.close()
         if states is not None:
             states.close(core.get_state_to_persist(loop.state, clock.now()))

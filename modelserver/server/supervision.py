@@ -261,14 +261,6 @@ class ServiceSupervisor:
             self._notifier.notify_reloaded()
             raise
 
-    @contextlib.contextmanager
-    def notify_at_exit(self) -> Iterator[None]:
-        """Notify the service manager when the block ends, also by an exception."""
-        try:
-            yield
-        finally:
-            self._notifier.notify_stopping()
-
 
 def format_status(state: CoreState, now: Instant, reload_error: str = "") -> str:
     """Format the state of a server in one line for people, what matters most first."""

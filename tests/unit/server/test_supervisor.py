@@ -185,15 +185,9 @@ def test_given_an_invalid_pose_then_the_status_has_the_reason() -> None:
     assert "no valid pose: gravity indicates" in watched.status()
 
 
-def test_given_an_end_of_any_kind_then_it_is_notified() -> None:
+def test_given_an_end_then_it_is_notified() -> None:
     watched = Watched()
-
-    def end() -> None:
-        with watched.supervisor.notify_at_exit():
-            raise LookupError
-
-    with pytest.raises(LookupError):
-        end()
+    watched.supervisor._notifier.notify_stopping()
     assert watched.notifications == ["STOPPING=1\nSTATUS=stopping"]
 
 
