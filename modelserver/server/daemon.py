@@ -117,7 +117,8 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         Hooks(
             on_origin=lambda output: origins.save(output.origin) if origins is not None else None,
             on_mode_switch=log_mode_switch,
-            on_load=supervisor.wrap_load(reader.begin),
+            on_load=reader.begin,
+            on_reload=supervisor.on_reload,
             snapshot=reader.encode_snapshot,
             channels=lambda state: vehicle.sensor_channels(state.model),
             on_persist=states.save if states is not None else lambda state: "",

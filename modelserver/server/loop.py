@@ -86,6 +86,7 @@ class Hooks:
     on_origin: persists an origin that was captured.
     on_mode_switch: gets a mode command and the states before and after it.
     on_load: begins to read the geometry again.
+    on_reload: gets None when a reload begins, and its result when it has ended.
     snapshot: encodes the snapshot of a model for the bus.
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
@@ -98,6 +99,7 @@ class Hooks:
     on_origin: Callable[[messages.PersistOrigin], None] = lambda origin: None
     on_mode_switch: Callable[[messages.SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
     on_load: Callable[[messages.LoadModel, CoreState], PollReload] = _report_no_file
+    on_reload: Callable[[ModelLoaded | None], None] = lambda loaded: None
     snapshot: Callable[[Model], bytes] = lambda model: b""
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
@@ -443,6 +445,7 @@ class Loop:
         command, before = self._reloads[0], self.state.model.revision
         try:
             if self._poll_reload is None:
+                self._hooks.on_reload(None)
                 self._poll_reload = self._hooks.on_load(command, self.state)
             loaded = self._poll_reload(self.state)
         except Exception as error:
@@ -452,6 +455,7 @@ class Loop:
             return
         self._reloads.popleft()
         self._poll_reload = None
+        self._hooks.on_reload(loaded)
         self.step(loaded, self._clock.now())
         if loaded.model is None:
             log.error(

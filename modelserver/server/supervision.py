@@ -22,7 +22,7 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -32,9 +32,7 @@ from modelserver.server.log import escape_text
 if TYPE_CHECKING:
     from modelserver.core import CoreState, Instant
     from modelserver.core.commands import ModelLoaded
-    from modelserver.messages import LoadModel
     from modelserver.server.clock import Clock
-    from modelserver.server.reloading import PollReload
 
 MAX_STATUS_LENGTH: Final = 400
 """Characters of a status line."""
@@ -230,36 +228,14 @@ class ServiceSupervisor:
         if self._stall_detector.is_progressing(successes, failures, now.monotonic_ns):
             notifier.ping_watchdog()
 
-    def wrap_load(
-        self, load: Callable[[LoadModel, CoreState], PollReload]
-    ) -> Callable[[LoadModel, CoreState], PollReload]:
-        """Wrap a function that reloads the geometry, so that the service manager is notified."""
-
-        def load_and_notify(command: LoadModel, state: CoreState) -> PollReload:
+    def on_reload(self, loaded: ModelLoaded | None) -> None:
+        """Notify that a reload of the geometry begins (None), or how it ended."""
+        if loaded is None:
             self._notifier.notify_reloading()
-            with self._notify_error():
-                poll = load(command, state)
-
-            def poll_and_notify(state: CoreState) -> ModelLoaded | None:
-                with self._notify_error():
-                    result = poll(state)
-                if result is not None:
-                    self._notifier.notify_reloaded()
-                    if command.request is None or not command.request.dry_run:
-                        self._reload_error = "" if result.model is not None else result.why
-                return result
-
-            return poll_and_notify
-
-        return load_and_notify
-
-    @contextlib.contextmanager
-    def _notify_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            self._notifier.notify_reloaded()
-            raise
+            return
+        self._notifier.notify_reloaded()
+        if loaded.request is None or not loaded.request.dry_run:
+            self._reload_error = "" if loaded.model is not None else loaded.why
 
 
 def format_status(state: CoreState, now: Instant, reload_error: str = "") -> str:

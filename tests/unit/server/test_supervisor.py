@@ -49,7 +49,7 @@ class Watched:
             self.clock,
             start_core(localizer),
             settings,
-            Hooks(on_load=self.supervisor.wrap_load(self._load), on_tick=self.supervisor.on_tick),
+            Hooks(on_load=self._load, on_reload=self.supervisor.on_reload, on_tick=self.supervisor.on_tick),
         )
         self.answer = ModelLoaded(None, why="the file is empty")
 
@@ -159,15 +159,16 @@ def test_given_a_reload_that_fails_then_the_status_has_the_reason_until_one_succ
     watched.answer = ModelLoaded(None, cart())
     watched.loop.reload()
     watched.runs(2.0)
-    assert "refused" not in watched.status()
+    assert "reload failed" not in watched.status()
 
 
 def test_given_a_dry_run_that_fails_then_the_status_stays() -> None:
     watched = Watched()
-    load = watched.supervisor.wrap_load(lambda command, state: lambda state: ModelLoaded(command.request, why="no"))
-    load(LoadModel(ReloadModel(RequestHeader(1, "REPLY_TEST"), True)), watched.loop.state)(watched.loop.state)
+    request = ReloadModel(RequestHeader(1, "REPLY_TEST"), True)
+    watched.answer = ModelLoaded(request, why="no")
+    watched.loop.send((LoadModel(request),))
     watched.runs(2.0)
-    assert "refused" not in watched.status()
+    assert "reload failed" not in watched.status()
 
 
 def test_given_a_warning_then_the_status_has_it() -> None:
