@@ -39,7 +39,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.journal import encoding
 from modelserver.server.journal.writer import (
-    COMPARED_FACTS,
+    INFORMATIVE_FACTS,
     NEWEST_NAME,
     SEGMENT_NAME,
     NewestMarker,
@@ -304,10 +304,10 @@ def list_differences(then: Mapping[str, Any]) -> list[str]:
     An unknown processor counts as equal: a unit with a restricted /proc cannot read it.
     """
     now = collect_facts()
-    changed = [key for key in COMPARED_FACTS if then.get(key) != now[key]]
+    changed = [key for key in now if key not in INFORMATIVE_FACTS and then.get(key) != now[key]]
     if not (then.get("processor") and now["processor"]):
         changed = [key for key in changed if key != "processor"]
-    return [f"{COMPARED_FACTS[key]} was {then.get(key)}, is {now[key]}" for key in changed]
+    return [f"{key} was {then.get(key)}, is {now[key]}" for key in changed]
 
 
 class _Link(NamedTuple):

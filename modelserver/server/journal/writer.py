@@ -35,8 +35,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.errors import RecordingError
@@ -63,34 +61,19 @@ from modelserver.wire.eventlog import Buffer
 log = logging.getLogger(__name__)
 
 
-COMPARED_FACTS: Final = {
-    "modelserver": "version of modelserver",
-    "source": "source of modelserver",
-    "python": "Python",
-    "numpy": "numpy",
-    "filterpy": "filterpy",
-    "pyproj": "pyproj",
-    "pinocchio": "Pinocchio",
-    "libc": "C library",
-    "machine": "machine type",
-    "processor": "processor",
-    "threads": "threads of the linear algebra",
-}
-"""Facts that affect the last bits of results, with their names in messages."""
+INFORMATIVE_FACTS: Final = frozenset({"host", "kernel"})
+"""Facts that do not affect results."""
 
 
 @cache
 def collect_facts() -> Mapping[str, str]:
-    """Return the facts of `COMPARED_FACTS`, and host name and kernel, which do not affect results."""
+    """Return the facts of build and machine that affect the last bits of results, and the informative ones."""
     return {
         "modelserver": __version__,
         "source": _hash_source(),
         "python": f"{platform.python_implementation()} {platform.python_version()}",
-        "numpy": np.__version__,
-        # read from the metadata, without importing them
-        "filterpy": version("filterpy"),
-        "pyproj": version("pyproj"),
-        "pinocchio": _read_version("pin"),
+        # read from the metadata, without importing them; pin is Pinocchio
+        **{name: _read_version(name) for name in ("numpy", "filterpy", "pyproj", "pin")},
         "libc": " ".join(platform.libc_ver()),
         "machine": platform.machine(),
         "processor": _read_processor(),
