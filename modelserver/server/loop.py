@@ -112,23 +112,6 @@ class Hooks:
 _NO_HOOKS = Hooks()
 
 
-class SnapshotEncoder:
-    """Encodes the model snapshot once per model."""
-
-    def __init__(self, encode_snapshot: Callable[[Model], bytes]):
-        self._encode_snapshot = encode_snapshot
-        self._model: Model | None = None
-        self._parts: list[messages.SnapshotPart] = []
-
-    def encode_parts(self, state: CoreState, utime: int) -> list[messages.SnapshotPart]:
-        """Return the messages to publish at `utime`."""
-        if self._model is not state.model:
-            self._parts = split_snapshot(self._encode_snapshot(state.model), state.model.revision, utime)
-            # last: after an error it is encoded again
-            self._model = state.model
-        return [replace(part, utime=utime) for part in self._parts]
-
-
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
     """Settings of a loop; see `modelserver.config.vehicle_file` for those not listed.
@@ -161,7 +144,7 @@ class Loop:
         self._settings = settings
         self._hooks = hooks
         self._journal = hooks.journal
-        self._snapshot = SnapshotEncoder(hooks.snapshot)
+        self._snapshot: tuple[Model | None, list[messages.SnapshotPart]] = (None, [])
         self._log = RateLimitedLog(log, clock)
         self._logged: set[tuple[str, str]] = set()
         self._timer = TickTimer(clock, settings.period_ns)
@@ -466,8 +449,11 @@ class Loop:
             log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
 
     def _send_snapshot(self, output: messages.PublishSnapshot) -> None:
-        for part in self._snapshot.encode_parts(self.state, output.utime):
-            self.publish(self._model, encode(part))
+        model = self.state.model
+        if self._snapshot[0] is not model:
+            self._snapshot = (model, split_snapshot(self._hooks.snapshot(model), model.revision, output.utime))
+        for part in self._snapshot[1]:
+            self.publish(self._model, encode(replace(part, utime=output.utime)))
         for held in self.state.view.joints.get_newest_samples(output.utime):
             self.publish(self._held, encode(held))
 
