@@ -15,12 +15,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from benchmarks.support import RAPTOR, print_verdict, ratio
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.messages import GpsSample, ImuSample, Sample, WheelsSample
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.queue import JournalQueue
-from modelserver.server.journal.segments import Ring
-from modelserver.server.journal.writer import JournalContext, JournalWriter, pause
+from modelserver.server.journal import JournalQueue
+from modelserver.server.journal import encoding as journal_state
+from modelserver.server.journal.writer import JournalWriter, Ring, pause
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import encode
@@ -91,7 +90,7 @@ def main() -> int:
         queue = JournalQueue()
         with_it, without = LoopBench(vehicle, queue), LoopBench(vehicle, JournalQueue())
         ring = Ring(Path(folder) / "journal", 1 << 30, 16 << 20)
-        write = JournalWriter(queue, ring, JournalContext({"run": "bench"}, [], config), with_it.clock)
+        write = JournalWriter(queue, ring, config, {"run": "bench"}, [], with_it.clock)
         samples = simulate_samples(config)
         costs: dict[str, list[float]] = {"with": [], "without": [], "thread": []}
         for number in range(ROUNDS):

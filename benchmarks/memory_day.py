@@ -36,9 +36,9 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.diagnostics.machine import read_resident_bytes
-from modelserver.server.fake_bus import FakeBus
+from modelserver.server.diagnostics import read_resident_bytes
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel

@@ -31,8 +31,8 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import Event

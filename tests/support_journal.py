@@ -11,12 +11,11 @@ from support_signing import ALLOWED, KEY, envelope, write_test_key
 
 from modelserver.config.vehicle_file import LimitsConfig, load_config
 from modelserver.messages import CHANNEL_OF
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.journal import environment
-from modelserver.server.journal.queue import JournalQueue
-from modelserver.server.journal.segments import Ring, list_segments
-from modelserver.server.journal.writer import JournalContext, JournalWriter
+from modelserver.server.journal import JournalQueue
+from modelserver.server.journal import writer as environment
+from modelserver.server.journal.writer import JournalWriter, Ring, list_segments
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, read_geometry
 from modelserver.server.vehicle import load_vehicle
@@ -63,8 +62,10 @@ class JournalRig:
         self.queue = JournalQueue()
         self.ring = ring(self.directory, max_bytes, segment_bytes)
         known = {**environment.collect_facts(), "run": run, **(facts or {})}
-        context = JournalContext(known, [(str(path), path.read_bytes())], self.vehicle.config)
-        self.writer = JournalWriter(self.queue, self.ring, context, self.clock, pause=lambda: None, key=key)
+        files = [(str(path), path.read_bytes())]
+        self.writer = JournalWriter(
+            self.queue, self.ring, self.vehicle.config, known, files, self.clock, pause=lambda: None, key=key
+        )
         reader = GeometryReader(self.vehicle, str(path), read_geometry)
         self.loop = Loop(
             self.bus,

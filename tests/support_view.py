@@ -14,8 +14,8 @@ from support_daemon import Trial, trial, write_raptor
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, ImuSample, JointSample, JointsSample, SensorHeader, WheelsSample
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import encode

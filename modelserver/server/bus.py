@@ -1,4 +1,6 @@
-"""The bus: what the loop needs of LCM (`Bus`), and its implementation (`LcmBus`).
+"""The bus: that of LCM (`LcmBus`), and one within a process (`FakeBus`).
+
+A bus has an inbox for samples, one for requests, `publish` and `wait`. Handlers run only while an inbox is drained.
 
 - Samples and requests have a receiver each (`wire.receiver`), so that a flood of requests cannot delay samples in a
   shared queue.
@@ -6,6 +8,7 @@
   drops the membership with the interface. It delivers a group's packets to every socket bound to their port as long as
   any socket of the machine is a member (IP_MULTICAST_ALL, ip(7)), so `MulticastMembership` joins again on a socket of
   its own.
+- `FakeBus` is for replays and tests: it delivers at once, in order, without loss.
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
+from modelserver.server.clock import FakeClock
 from modelserver.wire.provider import open_lcm, resolve_url
 from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, Sender, open_receiver
 
@@ -96,40 +100,6 @@ Handler: TypeAlias = Callable[[str, bytes, Sender], None]
 Inboxes: TypeAlias = Literal["samples", "requests", "both"]
 
 
-class Inbox(Protocol):
-    """A queue of received messages. Handlers run only within `drain`."""
-
-    def subscribe(self, channel: str, handler: Handler) -> None:
-        """Call `handler` with every message of exactly `channel`."""
-
-    def pop_refused(self) -> dict[str, int]:
-        """Return how many messages were too long since the last call, by channel."""
-
-    def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
-
-        Returns the number of handled messages. One that is in progress when the time is up is the last.
-        """
-
-
-class Bus(Protocol):
-    """An inbox for samples, one for requests, and `publish`."""
-
-    @property
-    def sensors(self) -> Inbox:
-        """Received samples."""
-
-    @property
-    def requests(self) -> Inbox:
-        """Received requests."""
-
-    def publish(self, channel: str, data: bytes) -> None:
-        """Publish a message."""
-
-    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
-        """Wait until a message has arrived in an inbox, or the time is up."""
-
-
 MAX_READ_AHEAD: Final = 1000
 """Messages that a drain queues at most; some two milliseconds."""
 
@@ -176,7 +146,7 @@ class ReceiverInbox:
         self._receiver.close()
 
     def pop_refused(self) -> dict[str, int]:
-        """See `Inbox`."""
+        """Return how many messages were too long since the last call, by channel."""
         refused = self._receiver.refused
         if not refused:
             return {}
@@ -185,7 +155,10 @@ class ReceiverInbox:
         return found
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """See `Inbox`."""
+        """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
+
+        Returns the number of handled messages. One that is in progress when the time is up is the last.
+        """
         expected, self.expected = self.expected, None
         if expected == 0 or not limit or not self._handlers:
             return 0
@@ -272,3 +245,70 @@ class LcmBus:
         self._membership.close()
         for inbox in (self.sensors, self.requests):
             inbox.close()
+
+
+class FakeInbox:
+    """One queue of a `FakeBus`."""
+
+    def __init__(self, clock: FakeClock) -> None:
+        self._clock = clock
+        self._handlers: dict[str, list[Handler]] = {}
+        self._queue: deque[tuple[str, bytes, Sender]] = deque()
+
+    def subscribe(self, channel: str, handler: Handler) -> None:
+        """Call `handler` with every message of exactly `channel`."""
+        self._handlers.setdefault(channel, []).append(handler)
+
+    def put(self, channel: str, data: bytes, sender: Sender = None) -> None:
+        """Queue a message for the subscribers of its channel."""
+        if channel in self._handlers:
+            self._queue.append((channel, data, sender))
+
+    def pop_refused(self) -> dict[str, int]:
+        """None is too long."""
+        return {}
+
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
+        """Handle the queued messages, at most `limit` and for at most `seconds`; return how many."""
+        count = 0
+        end_ns = self._clock.monotonic_ns() + seconds * 1e9
+        while self._queue and count < limit and (not count or self._clock.monotonic_ns() < end_ns):
+            channel, data, sender = self._queue.popleft()
+            count += 1
+            for handler in self._handlers[channel]:
+                handler(channel, data, sender)
+        return count
+
+    @property
+    def pending(self) -> int:
+        """Messages that wait to be drained."""
+        return len(self._queue)
+
+
+class FakeBus:
+    """Both inboxes and all published messages; `wait` advances the fake clock to its deadline."""
+
+    def __init__(self, clock: FakeClock):
+        self._clock = clock
+        self.sensors = FakeInbox(clock)
+        self.requests = FakeInbox(clock)
+        self.published: list[tuple[str, bytes]] = []
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Publish a message, also to the own inboxes."""
+        self.published.append((channel, data))
+        self.sensors.put(channel, data)
+        self.requests.put(channel, data)
+
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        """Advance the clock if no message is pending in an inbox."""
+        has_samples = inboxes != "requests" and self.sensors.pending
+        if not has_samples and (inboxes == "samples" or not self.requests.pending):
+            self._clock.advance(max(seconds, 0.0))
+
+    def get_published(self, channel: str) -> list[bytes]:
+        return [data for name, data in self.published if name == channel]
+
+
+Inbox: TypeAlias = ReceiverInbox | FakeInbox
+Bus: TypeAlias = LcmBus | FakeBus

@@ -18,15 +18,14 @@ from modelserver.errors import quote
 from modelserver.messages import Mode, SwitchMode
 from modelserver.server.bus import LcmBus
 from modelserver.server.clock import Clock
-from modelserver.server.diagnostics.bus_probe import DuplicateServerMonitor, probe_bus, report_findings
-from modelserver.server.diagnostics.machine import read_gauges, read_run_delay
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.diagnostics import DuplicateServerMonitor, probe_bus, read_gauges, report_findings
+from modelserver.server.journal import JournalQueue
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.persistence.stores import SUBJECT as RESTART
-from modelserver.server.persistence.stores import PersistentStores, open_stores
+from modelserver.server.persistence import SUBJECT as RESTART
+from modelserver.server.persistence import PersistentStores, open_stores
 from modelserver.server.reloading import GeometryReader
-from modelserver.server.supervision.systemd import Notifier, ServiceSupervisor
+from modelserver.server.supervision import Notifier, ServiceSupervisor
 from modelserver.server.vehicle import Vehicle
 from modelserver.version import __version__
 from modelserver.wire.provider import resolve_url
@@ -109,7 +108,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     )
     reader = GeometryReader(vehicle, file)
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))
-    journal = make_writer(config, file, clock, store.lock, next(iter(vehicle.read_keys(file)), None))
+    journal = make_writer(config, file, clock, next(iter(vehicle.read_keys(file)), None))
     loop = Loop(
         bus,
         clock,
@@ -118,12 +117,12 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         Hooks(
             on_origin=lambda output: origins.save(output.origin) if origins is not None else None,
             on_mode_switch=log_mode_switch,
-            on_load=supervisor.wrap_load(reader.begin),
+            on_load=reader.begin,
+            on_reload=supervisor.on_reload,
             snapshot=reader.encode_snapshot,
             channels=lambda state: vehicle.sensor_channels(state.model),
             on_persist=states.save if states is not None else lambda state: "",
             gauges=read_gauges,
-            run_delay=read_run_delay,
             on_tick=supervisor.on_tick,
             verifier=verifier,
             journal=JournalQueue() if journal is None else journal[0],
@@ -164,9 +163,9 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     if journal is not None:
         journal[1].start()
     try:
-        with supervisor.notify_at_exit():
-            loop.run()
+        loop.run()
     finally:
+        notifier.notify_stopping()
         reader.close()
         if states is not None:
             states.close(core.get_state_to_persist(loop.state, clock.now()))

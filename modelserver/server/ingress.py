@@ -1,10 +1,14 @@
-"""Ingress: decode samples, correct their latency, detect publisher conflicts, count what is rejected.
+"""Ingress: decode samples, correct their latency, detect publisher conflicts, verify commands, count what is rejected.
 
 For each message on a sensor's channel the loop
 
 1. reads source, seq and utime from the header at a fixed offset (`peek_sample_id`), without decoding the message;
 2. drops it if it is from a second publisher, unless configured otherwise (`PublisherConflictMonitor`);
 3. decodes it and subtracts the configured latency of the sensor (`SensorChannel.decode`).
+
+A signed command needs a known key, a valid signature, a permitted channel and a fresh time stamp, and must be decodable
+(`CommandVerifier`). Each check that fails has a reason that is counted. Until the signature is verified, the sender
+gets no reply. A replay attack fails by its time stamp and counter.
 
 A flood of messages that are not used (undecodable bytes, a second publisher, unsigned commands) must not displace the
 vehicle's data in the journal, nor load the core. So `RejectionCounter` limits both by rate: `MAX_PER_SECOND` messages
@@ -14,19 +18,34 @@ of a channel are recorded and counted one by one, the others are counted togethe
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Container, Hashable, Mapping
+from collections.abc import Callable, Container, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
-from modelserver.core import Instant
+from modelserver.core import Instant, commands
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
-from modelserver.errors import quote
-from modelserver.messages import Event, HealthWarning, JointsSample, Rejected, RelativePoseSample, Sample, SwitchMode
+from modelserver.errors import WireError, quote
+from modelserver.messages import (
+    CHANNEL_OF,
+    Denied,
+    Envelope,
+    Event,
+    HealthWarning,
+    JointsSample,
+    Rejected,
+    RelativePoseSample,
+    Request,
+    Sample,
+    SignedCommand,
+    SwitchMode,
+)
 from modelserver.named_tuples import new_tuple
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog
-from modelserver.wire.codec import decode, encode
+from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.wire.channels import BY_NAME, SIGNED
+from modelserver.wire.codec import decode, encode, read_request_header
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
@@ -252,3 +271,46 @@ class PublisherConflictMonitor:
             f" (its stamps are {age:,.0f} s old: a recording is played onto the bus?)" if age > RECORDING_AGE_S else ""
         )
         return f"{who} publish on {subject} at once, and {done}{old}: stop one of them"
+
+
+COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in commands.COMMANDS}
+"""Request types that must be signed, by channel."""
+
+MODE_TYPE: Final = "localization_mode_t"
+
+
+class CommandVerifier:
+    """Verifies signed envelopes. `prefix` is that of the vehicle's channels; mode commands name `mode_channel`."""
+
+    def __init__(self, keys: Iterable[Key], prefix: str, window_s: float, mode_channel: str, started_ns: int):
+        self._keys = {key.name: key for key in keys}
+        self._prefix = prefix
+        self._window_us = round(window_s * 1e6)
+        self._mode_channel = mode_channel
+        self._started_ns = started_ns
+        self._freshness = Freshness()
+
+    def verify(self, data: bytes, now: Instant) -> SignedCommand | Denied:
+        """Return the command in an envelope, or why it is denied. Raises WireError if `data` is no envelope."""
+        envelope: Envelope = decode("signed_t", data)
+        key = self._keys.get(envelope.key_name)
+        if key is None:
+            return Denied(f"{self._prefix}{SIGNED}", "unknown_key")
+        if not has_valid_signature(key, self._prefix, envelope):
+            return Denied(f"{self._prefix}{SIGNED}", "bad_signature")
+        # from here on the sender knows the key
+        kind = COMMANDS.get(envelope.channel)
+        if kind is None and (not self._mode_channel or envelope.channel != self._mode_channel):
+            return Denied(f"{self._prefix}{SIGNED}", "channel")
+        source = f"{self._prefix}{envelope.channel}"
+        header = read_request_header(envelope.payload) if kind is not None else None
+        uptime_us = (now.monotonic_ns - self._started_ns) // 1000
+        check = check_freshness(self._freshness, envelope, now.utime, uptime_us, self._window_us)
+        self._freshness = check.freshness
+        if check.reason:
+            return Denied(source, check.reason, check.message, kind, header)
+        try:
+            command = decode(MODE_TYPE if kind is None else BY_NAME[envelope.channel].type_name, envelope.payload)
+        except WireError as error:
+            return Denied(source, error.reason, str(error), kind, header, is_malformed=True)
+        return SignedCommand(command, envelope.sender)

@@ -3,8 +3,7 @@
 - `RateLimitedLog` logs one cause at most every `LOG_PERIOD_S` seconds, so that a flood cannot fill the log.
 - Text from the bus is escaped, so that it cannot imitate a log line or a terminal sequence.
 - systemd's journal gets each record as one entry of fields, by its native protocol
-  (systemd.io/JOURNAL_NATIVE_PROTOCOL), or, if its socket cannot be reached, as lines with a priority prefix
-  (sd-daemon(3)).
+  (systemd.io/JOURNAL_NATIVE_PROTOCOL), or, if its socket cannot be reached, as lines.
 """
 
 from __future__ import annotations
@@ -142,27 +141,15 @@ class PlainFormatter(logging.Formatter):
         return "\n".join((f"{record.levelname} {record.name}: {first}", *rest))
 
 
-class PriorityFormatter(logging.Formatter):
-    """Formats with the syslog priority `<N>` before every line, and the cause at the end."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the record's lines."""
-        first, *rest = lines_of(record)
-        cause = getattr(record, CAUSE, "")
-        tail = f" cause={escape_text(str(cause))}" if cause else ""
-        head = f"<{get_priority(record.levelno)}>"
-        return "\n".join(f"{head}{line}" for line in (f"{record.name}: {first}{tail}", *rest))
-
-
 class JournalHandler(logging.StreamHandler[TextIO]):
-    """Sends records to the journal; if it cannot, writes them with priorities to a stream connected to it.
+    """Sends records to the journal; if it cannot, writes them as lines to a stream connected to it.
 
     It never waits: if the journal does not keep up, entries are lost, and the next one reports how many.
     """
 
     def __init__(self, stream: TextIO, identifier: str, path: str = JOURNAL_SOCKET):
         super().__init__(stream)
-        self.setFormatter(PriorityFormatter())
+        self.setFormatter(PlainFormatter())
         self._identifier, self._path = identifier, path
         self._lost = 0
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)

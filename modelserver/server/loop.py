@@ -33,18 +33,18 @@ from modelserver.query.answers import DeferredAnswer
 from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock, TickTimer
 from modelserver.server.ingress import (
+    MODE_TYPE,
     PUBLISHER_CONFLICT,
+    CommandVerifier,
     PublisherConflictMonitor,
     RejectionCounter,
     SensorChannel,
     peek_sample_id,
 )
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.reloading import PollReload
-from modelserver.server.requests.handler import RequestHandler
-from modelserver.server.requests.scheduler import RunDelay
-from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
+from modelserver.server.requests import LATE_TICK_NS, RequestHandler
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
@@ -86,11 +86,11 @@ class Hooks:
     on_origin: persists an origin that was captured.
     on_mode_switch: gets a mode command and the states before and after it.
     on_load: begins to read the geometry again.
+    on_reload: gets None when a reload begins, and its result when it has ended.
     snapshot: encodes the snapshot of a model for the bus.
     channels: returns the sensor channels of a new geometry, which may have joints.
     on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
     gauges: reads resources of the process for the health report, given the number of waiting requests.
-    run_delay: reads the run-queue delay of the loop's thread; None if unknown.
     on_tick: called after each tick without error.
     verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
     journal: records everything that is handled and published; one that nothing begins records nothing.
@@ -99,34 +99,17 @@ class Hooks:
     on_origin: Callable[[messages.PersistOrigin], None] = lambda origin: None
     on_mode_switch: Callable[[messages.SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
     on_load: Callable[[messages.LoadModel, CoreState], PollReload] = _report_no_file
+    on_reload: Callable[[ModelLoaded | None], None] = lambda loaded: None
     snapshot: Callable[[Model], bytes] = lambda model: b""
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
     gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
-    run_delay: Callable[[], RunDelay | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
     journal: JournalQueue = field(default_factory=JournalQueue)
 
 
 _NO_HOOKS = Hooks()
-
-
-class SnapshotEncoder:
-    """Encodes the model snapshot once per model."""
-
-    def __init__(self, encode_snapshot: Callable[[Model], bytes]):
-        self._encode_snapshot = encode_snapshot
-        self._model: Model | None = None
-        self._parts: list[messages.SnapshotPart] = []
-
-    def encode_parts(self, state: CoreState, utime: int) -> list[messages.SnapshotPart]:
-        """Return the messages to publish at `utime`."""
-        if self._model is not state.model:
-            self._parts = split_snapshot(self._encode_snapshot(state.model), state.model.revision, utime)
-            # last: after an error it is encoded again
-            self._model = state.model
-        return [replace(part, utime=utime) for part in self._parts]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +144,7 @@ class Loop:
         self._settings = settings
         self._hooks = hooks
         self._journal = hooks.journal
-        self._snapshot = SnapshotEncoder(hooks.snapshot)
+        self._snapshot: tuple[Model | None, list[messages.SnapshotPart]] = (None, [])
         self._log = RateLimitedLog(log, clock)
         self._logged: set[tuple[str, str]] = set()
         self._timer = TickTimer(clock, settings.period_ns)
@@ -182,7 +165,7 @@ class Loop:
         self._sensor_channels: set[str] = set()
         self._subscribe(settings.sensors)
         self._requests = RequestHandler(
-            self, bus, clock, self._log, self._journal, prefix, settings.limits, hooks.verifier, hooks.run_delay
+            self, bus, clock, self._log, self._journal, prefix, settings.limits, hooks.verifier
         )
 
     def run(self) -> None:
@@ -232,8 +215,6 @@ class Loop:
         elif not requests.is_ready:
             if requests.waiting:
                 seconds = min(seconds, FLOOD_PAUSE_S)
-            elif requests.prepare(begin_ns):
-                seconds = 0.0
             self._bus.wait(seconds)
 
     def _drain_sensors(self, begin_ns: int) -> int:
@@ -246,7 +227,7 @@ class Loop:
         now_ns = self._clock.monotonic_ns()
         has_backlog = count == SAMPLES_PER_PASS or now_ns - begin_ns >= limit_ns
         if has_backlog and self._has_backlog:
-            self._requests.contention.add_sensor_backlog(now_ns)
+            self._requests.report_backlog(now_ns)
         self._has_backlog = has_backlog
         return now_ns
 
@@ -255,9 +236,8 @@ class Loop:
         if tick is None:
             return
         now, missed, latency_ns = tick
-        self._requests.contention.add_tick(
-            missed * self._settings.period_ns if missed else latency_ns, now.monotonic_ns
-        )
+        if max(missed * self._settings.period_ns, latency_ns) > LATE_TICK_NS:
+            self._requests.report_late_tick(now.monotonic_ns)
         self._conflicts.clear_expired(now)
         is_report_due = now.monotonic_ns >= self.state.health_due_ns
         for inbox in (self._bus.sensors, self._bus.requests):
@@ -448,6 +428,7 @@ class Loop:
         command, before = self._reloads[0], self.state.model.revision
         try:
             if self._poll_reload is None:
+                self._hooks.on_reload(None)
                 self._poll_reload = self._hooks.on_load(command, self.state)
             loaded = self._poll_reload(self.state)
         except Exception as error:
@@ -457,6 +438,7 @@ class Loop:
             return
         self._reloads.popleft()
         self._poll_reload = None
+        self._hooks.on_reload(loaded)
         self.step(loaded, self._clock.now())
         if loaded.model is None:
             log.error(
@@ -467,8 +449,11 @@ class Loop:
             log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
 
     def _send_snapshot(self, output: messages.PublishSnapshot) -> None:
-        for part in self._snapshot.encode_parts(self.state, output.utime):
-            self.publish(self._model, encode(part))
+        model = self.state.model
+        if self._snapshot[0] is not model:
+            self._snapshot = (model, split_snapshot(self._hooks.snapshot(model), model.revision, output.utime))
+        for part in self._snapshot[1]:
+            self.publish(self._model, encode(replace(part, utime=output.utime)))
         for held in self.state.view.joints.get_newest_samples(output.utime):
             self.publish(self._held, encode(held))
 

@@ -20,9 +20,8 @@ from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
-from modelserver.server.ingress import SensorChannel
-from modelserver.server.requests.signed_commands import MODE_TYPE
-from modelserver.server.stamp_axis import StampAxis, align
+from modelserver.server.ingress import MODE_TYPE, SensorChannel
+from modelserver.server.recordings import StampAxis, align
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms.so3 import Quaternion
 from modelserver.wire.channels import SIGNED

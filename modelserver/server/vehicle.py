@@ -25,8 +25,7 @@ from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
 from modelserver.geometry.plausibility import is_far
-from modelserver.server.ingress import SensorChannel
-from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
+from modelserver.server.ingress import MODE_TYPE, CommandVerifier, SensorChannel
 from modelserver.signing.key_files import read_keys
 from modelserver.signing.signatures import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse

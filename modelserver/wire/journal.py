@@ -31,7 +31,7 @@ CHANNEL: Final = "MODELSERVER_JOURNAL"
 MAGIC: Final = b"MSjrnl1\n"
 """In place of a message's fingerprint."""
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 
 
 class SectionType(IntEnum):

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from support_lcm import TIMEOUT_S, reserved_url
 
 from modelserver.errors import BusError
-from modelserver.server.bus import SENSOR_QUEUE_BYTES, Bus, Inbox, LcmBus, ReceiverInbox
+from modelserver.server.bus import SENSOR_QUEUE_BYTES, Bus, FakeBus, Inbox, LcmBus, ReceiverInbox
 from modelserver.server.clock import Clock, FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.wire.channels import CHANNELS
 from modelserver.wire.receiver import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, MIN_QUEUED, Message, QueueLimit, Sender
 

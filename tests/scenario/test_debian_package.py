@@ -86,7 +86,7 @@ for package in (modelserver, msdrivers, mslcm, mstools):
             __import__(each.name)
         except ModuleNotFoundError as error:
             print(error.name)
-from modelserver.server.journal.environment import collect_facts
+from modelserver.server.journal.writer import collect_facts
 collect_facts()
 """
 

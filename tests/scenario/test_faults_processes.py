@@ -15,13 +15,13 @@ from support_lcm import TIMEOUT_S
 from modelserver.client.mirror import PlatformMirror
 from modelserver.earth.geodesy import origin_at
 from modelserver.errors import NoPoseError, NoServerError
-from modelserver.server.persistence.stores import OriginStore
+from modelserver.server.persistence import OriginStore
 
 SAVING = """
 import sys
 from pathlib import Path
 from modelserver.earth.geodesy import origin_at
-from modelserver.server.persistence.stores import OriginStore
+from modelserver.server.persistence import OriginStore
 store, n = OriginStore(Path(sys.argv[1]), "raptor"), 0
 while True:
     n += 1

@@ -22,7 +22,7 @@ from support_lcm import MODELSERVER, TIMEOUT_S, invoke
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.messages import Invalid
-from modelserver.server.diagnostics.bus_probe import discover_servers, probe_delivery
+from modelserver.server.diagnostics import discover_servers, probe_delivery
 
 StartDaemon = Callable[..., Daemon]
 NO_SENSORS = "".join(

@@ -16,7 +16,7 @@ from support_restart import TO_A_STOP
 from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
 from modelserver.messages import GpsSample, ImuSample
-from modelserver.server.persistence.stores import PersistedStateError, decode_state
+from modelserver.server.persistence import PersistedStateError, decode_state
 from modelserver.simulation import DrivePhase, Event
 from modelserver.wire.codec import encode
 

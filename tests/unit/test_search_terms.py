@@ -93,17 +93,17 @@ TERMS = {
     "Ackermann": "modelserver/estimation/sensor_rig.py",
     "UTM": "modelserver/earth/geodesy.py",
     # service and drivers
-    "rate limit": "modelserver/server/requests/scheduler.py",
-    "token bucket": "modelserver/server/requests/scheduler.py",
+    "rate limit": "modelserver/server/scheduler.py",
+    "token bucket": "modelserver/server/scheduler.py",
     "duplicate publisher": "modelserver/core/publisher_conflict.py",
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",
-    "watchdog": "modelserver/server/supervision/systemd.py",
+    "watchdog": "modelserver/server/supervision.py",
     "HMAC": "modelserver/signing/signatures.py",
-    "replay attack": "modelserver/server/requests/signed_commands.py",
+    "replay attack": "modelserver/server/ingress.py",
     "clock drift": "drivers/msdrivers/device_clock.py",
     "checksum": "drivers/msdrivers/devices/stream.py",
-    "multicast": "modelserver/server/diagnostics/checks.py",
+    "multicast": "modelserver/server/diagnostics.py",
 }
 
 

@@ -1,35 +1,409 @@
 """Verification of a journal by replay: every record is processed again, and what is published is compared bit for bit.
 
-Messages that differ within `comparison.TOLERANCE`, as on another build or machine, are a result of their own.
-`segments` checks that they are complete, in order and authentic.
+The same loop and core process the records, on a fake bus and clock (`ReplayLoop`). Outputs that are published are
+compared per record; the effects of others (a reloaded geometry, a persisted state) are records of their own.
 
 A run is the life of one service process. Its segments follow each other, and the replay continues from one into the
 next. After a gap (dropped by the ring, lost records, damaged bytes) it restarts from the state in the head of the next
 segment. That state has only the last seconds of the pose history: until the history is as long as in the recorded run,
 a differing reply about the past counts as `unverifiable`, not as a difference.
+
+Another numpy or Python may sum in another order, so that the last bits of a float differ. Two messages are equal within
+the tolerance if positions differ by at most 1e-9 m, orientations by 1e-9 rad, and other floats by 1e-9 of their
+magnitude (absolute below 1). Counts, texts, flags and non-finite numbers have to be equal. Such messages are a result
+of their own.
+
+`ChainVerifier` checks by the heads and seals that the segments are complete, in order and authentic.
 """
 
 from __future__ import annotations
 
+import hmac
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from itertools import zip_longest
+from functools import cache
+from itertools import islice, zip_longest
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from modelserver.errors import RecordingError, WireError
+import mslcm
+from modelserver import core, messages
+from modelserver.core import AllOutputs, Instant
+from modelserver.errors import RecordingError, Status, WireError
 from modelserver.messages import GetHistory, GetTransformations, HealthWarning, Rejected
-from modelserver.server.journal import environment
-from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.comparison import Deviation, compute_deviation
-from modelserver.server.journal.replay import PublishedMessage, ReplayLoop
-from modelserver.server.journal.segments import NEWEST_NAME, ChainVerifier, open_mapped, read_newest
+from modelserver.server.bus import FakeBus
+from modelserver.server.clock import FakeClock
+from modelserver.server.ingress import SensorChannel
+from modelserver.server.journal import encoding
+from modelserver.server.journal.writer import (
+    INFORMATIVE_FACTS,
+    NEWEST_NAME,
+    SEGMENT_NAME,
+    NewestMarker,
+    collect_facts,
+    find_key,
+    get_number,
+    list_segments,
+    open_mapped,
+    read_newest,
+    seal_segment,
+)
+from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.requests import REQUEST_TYPES
+from modelserver.server.vehicle import Vehicle
 from modelserver.signing.signatures import Key
 from modelserver.wire import journal
 from modelserver.wire.channels import BY_NAME
-from modelserver.wire.codec import decode
+from modelserver.wire.codec import decode, read_request_header
+from modelserver.wire.eventlog import LogEvent, scan
+from modelserver.wire.journal import JournalRecord, RecordKind
+
+MAX_SEARCHED_ENTRIES: Final = 1000
+"""Entries of a folder without segments that are searched for a journal."""
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the segments of a journal: those of a directory, or the one file.
+
+    Raises RecordingError with a hint for anything else; OSError.
+    """
+    if not path.is_dir():
+        _check_journal_file(path)
+        return [path]
+    found = list_segments(path)
+    if not found:
+        raise RecordingError(f"{path}: {_describe_missing_segments(path)}")
+    return found
+
+
+def _check_journal_file(path: Path) -> None:
+    """Raise RecordingError for a file that is no segment. A damaged segment is one."""
+    with open_mapped(path) as data:
+        if not data:
+            raise RecordingError(
+                f"{path}: the file is empty, so there is nothing to verify; give the folder of the journal"
+            )
+        if data.find(journal.MAGIC) >= 0 or SEGMENT_NAME.fullmatch(path.name):
+            return
+        is_log = isinstance(next(iter(scan(data)), None), LogEvent)
+    if is_log:
+        raise RecordingError(
+            f"{path}: is an LCM log, not a journal, so it has no output to verify; to play it: "
+            f"modelserver replay {path} (without --verify)"
+        )
+    raise RecordingError(
+        f"{path}: is neither a journal nor an LCM log; a journal is a folder of files journal-*.lcm, such as "
+        "/var/lib/modelserver/journal-NAME"
+    )
+
+
+def _describe_missing_segments(folder: Path) -> str:
+    """Return the message for a folder without segments, with a hint."""
+    entries = sorted(islice(folder.iterdir(), MAX_SEARCHED_ENTRIES))
+    if not entries:
+        return "the folder is empty; a journal is a folder of files journal-*.lcm"
+    for each in entries:
+        try:
+            if each.is_dir() and list_segments(each):
+                return f"contains no segment of a journal (journal-*.lcm); did you mean {each}?"
+        except OSError:
+            continue  # not readable
+    text = "contains no segment of a journal (journal-*.lcm)"
+    if any(each.suffix == ".lcm" for each in entries):
+        text += "; to play its LCM logs: modelserver replay LOG, without --verify"
+    return text
+
+
+TOLERANCE: Final = 1e-9
+"""Meters, radians, and relative difference of other numbers."""
+
+
+class FieldChange(NamedTuple):
+    """A field that differs: its full name with indices, and both values."""
+
+    name: str
+    recorded: Any
+    replayed: Any
+
+
+class Deviation(NamedTuple):
+    """Maximum differences in a message: meters, radians, and relative difference of other numbers."""
+
+    meters: float = 0.0
+    radians: float = 0.0
+    share: float = 0.0
+
+    @property
+    def is_tolerable(self) -> bool:
+        """Whether all differences are within the tolerance."""
+        return max(self) <= TOLERANCE
+
+    def elementwise_max(self, other: Deviation) -> Deviation:
+        return Deviation(*map(max, self, other))
+
+
+@cache
+def _types_by_fingerprint() -> dict[bytes, Any]:
+    return {
+        kind._get_packed_fingerprint(): kind
+        for kind in vars(mslcm).values()
+        if isinstance(kind, type) and hasattr(kind, "_get_packed_fingerprint")
+    }
+
+
+def diff_messages(was: bytes, now: bytes) -> list[FieldChange] | None:
+    """Return the fields in which two messages differ; None where they are not of one known type."""
+    message_type = _types_by_fingerprint().get(was[:8])
+    if message_type is None or was[:8] != now[:8]:
+        return None
+    try:
+        return list(_diff_fields("", message_type.decode(was), message_type.decode(now)))
+    except Exception:  # the generated classes raise exceptions of many types
+        return None
+
+
+def _diff_fields(name: str, was: Any, now: Any) -> Iterator[FieldChange]:
+    if hasattr(was, "_get_packed_fingerprint") and type(was) is type(now):
+        for slot in was.__slots__:
+            yield from _diff_fields(f"{name}.{slot}" if name else slot, getattr(was, slot), getattr(now, slot))
+    elif isinstance(was, (list, tuple)) and isinstance(now, (list, tuple)) and len(was) == len(now):
+        for index, pair in enumerate(zip(was, now, strict=True)):
+            yield from _diff_fields(f"{name}[{index}]", *pair)
+    elif repr(was) != repr(now):
+        yield FieldChange(name, was, now)
+
+
+def compute_deviation(was: bytes, now: bytes) -> Deviation | None:
+    """Return the maximum differences of two messages; None where more than numbers differ."""
+    found = diff_messages(was, now)
+    if not found:
+        # not of one type, or different only in the bits of a nan
+        return None
+    total = Deviation()
+    for change in found:
+        if not (isinstance(change.recorded, float) and isinstance(change.replayed, float)):
+            return None
+        off = abs(change.recorded - change.replayed)
+        if not math.isfinite(off):
+            return None
+        total = total.elementwise_max(_to_deviation(change, off))
+    return total
+
+
+def _to_deviation(change: FieldChange, off: float) -> Deviation:
+    field, *indices = change.name.rpartition(".")[2].replace("]", "").split("[")
+    place = int(indices[-1]) if indices else 0
+    if field in ("vec", "vector", "vectors"):  # a position in meters, then a quaternion
+        # a component changes by at most half the angle, in up to three components
+        return Deviation(meters=off) if place < 3 else Deviation(radians=4.0 * off)
+    if field == "position":
+        return Deviation(meters=off)
+    if field == "orientation":
+        return Deviation(radians=4.0 * off)
+    if field == "h_transform":
+        return Deviation(meters=off) if place == 3 else Deviation(radians=2.0 * off)
+    return Deviation(share=off / max(1.0, abs(change.recorded)))
+
+
+PublishedMessage = tuple[str, bytes]
+
+UNPUBLISHED_OUTPUTS = (messages.LoadModel, messages.PersistOrigin, messages.PersistState, messages.ReportStart)
+
+
+class _ContainsAll(Container[object]):
+    def __contains__(self, thing: object) -> bool:
+        return True
+
+
+class ReplayLoop(Loop):
+    """A loop that processes journal records and returns what it publishes."""
+
+    def __init__(self, state: bytes):
+        """Continue from the state of a segment. Raises RecordingError."""
+        config, known = encoding.decode_run(state)
+        self.config = config
+        self._fake_clock = FakeClock()
+        self._fake_bus = FakeBus(self._fake_clock)
+        vehicle = Vehicle(config, known.model, None)
+        settings = LoopSettings(period_ns=1, channel_prefix=config.lcm.channel_prefix)
+        super().__init__(self._fake_bus, self._fake_clock, known, settings, Hooks(snapshot=vehicle.encode_snapshot))
+        joints = config.sensors.joints
+        self._replayed_channels: Mapping[str, SensorChannel] = {
+            # stays subscribed after a reload from a geometry with joints to one without
+            f"{config.lcm.channel_prefix}{joints.channel}": SensorChannel("joints_t", round(joints.latency * 1e6)),
+            **vehicle.sensor_channels(),
+        }
+        # errors were logged by the recorded run
+        self._logged = _ContainsAll()  # type: ignore[assignment]
+
+    def handle(self, record: JournalRecord) -> list[PublishedMessage]:
+        """Process a record; return what is published. Raises RecordingError for an invalid record."""
+        published = self._fake_bus.published = []
+        now = Instant(record.monotonic_ns, record.utime)
+        self._fake_clock.set(now)
+        if record.kind is RecordKind.EVENT:
+            self._replay_event(encoding.decode_event(record.data), now)
+        elif record.kind is RecordKind.SAMPLE:
+            channel = self._replayed_channels.get(record.channel)
+            if channel is None:
+                raise RecordingError(f"{record.channel} is no sensor channel of the vehicle file")
+            self._replay_event(channel.decode(record.data), now)
+        elif record.kind is RecordKind.DEFERRED_PART:
+            self._requests.send_deferred(int.from_bytes(record.data, "big"))
+        elif record.kind not in (RecordKind.UNDECODABLE, RecordKind.DROPPED):
+            self._replay_request(record, now)
+        return published
+
+    def _replay_request(self, record: JournalRecord, now: Instant) -> None:
+        channel = BY_NAME.get(record.channel.removeprefix(self.config.lcm.channel_prefix))
+        if channel is None:
+            raise RecordingError(f"{record.channel} is no request channel")
+        try:
+            request: messages.Request = decode(channel.type_name, record.data)
+        except WireError as error:
+            header = read_request_header(record.data)
+            if record.kind is RecordKind.MALFORMED and header is not None:
+                self.send(
+                    core.reply_error(
+                        self.state, REQUEST_TYPES[channel.type_name], header, Status.MALFORMED, str(error), now
+                    )
+                )
+                return
+            raise RecordingError(f"a request on {record.channel} cannot be decoded: {error}") from error
+        if record.kind is RecordKind.REQUEST:
+            self._replay_event(request, now)
+        elif record.kind is RecordKind.CACHED:
+            # a static answer of the core equals the cached one; the state that counts it is discarded
+            self.send(core.step(self.state, request, now)[1])
+        elif record.kind is RecordKind.OVERLOAD:
+            self.send(core.reply_overloaded(self.state, request, now))
+        elif record.kind is RecordKind.FAILED:
+            self._requests.drop_deferred()
+            self.send(core.reply_internal_error(self.state, request, now))
+
+    def _replay_event(self, event: object, now: Instant) -> None:
+        try:
+            self.step(event, now)  # type: ignore[arg-type]
+        except Exception as error:
+            self.handle_error("", error)
+
+    def send(self, outputs: AllOutputs) -> None:
+        """Publish outputs; ignore the others."""
+        super().send(tuple(each for each in outputs if not isinstance(each, UNPUBLISHED_OUTPUTS)))
+
+    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
+        """Do nothing: the error is the next record of the journal."""
+
+
+def list_differences(then: Mapping[str, Any]) -> list[str]:
+    """Return the differences between the facts of a journal and those here, in words.
+
+    An unknown processor counts as equal: a unit with a restricted /proc cannot read it.
+    """
+    now = collect_facts()
+    changed = [key for key in now if key not in INFORMATIVE_FACTS and then.get(key) != now[key]]
+    if not (then.get("processor") and now["processor"]):
+        changed = [key for key in changed if key != "processor"]
+    return [f"{key} was {then.get(key)}, is {now[key]}" for key in changed]
+
+
+class _Link(NamedTuple):
+    path: Path
+    number: int
+    seal: str
+    """Hexadecimal; empty = the segment is not closed."""
+
+
+class ChainVerifier:
+    """Verifies segments in the given order. `genuine` counts those with a valid keyed seal.
+
+    `report` gets each finding about the current segment, and whether it is damage: segments that are missing, replaced,
+    or not authentic.
+    """
+
+    def __init__(self, report: Callable[[str, bool], object], keys: Sequence[Key] = ()):
+        self.genuine = 0
+        self.unsealed: list[Path] = []
+        """Segments without a verifiable seal: not closed, without a key, or the key is not given."""
+        self._report = report
+        self._keys = keys
+        self._before: _Link | None = None
+        self._places: dict[int, Path] = {}
+
+    def begin(self, path: Path, facts: dict[str, Any]) -> None:
+        """Check the position of a segment in the chain, by its head."""
+        number, previous = facts["number"], str(facts["previous"])
+        if get_number(path) not in (None, number):
+            self._report(f"is segment {number} by its own head: renamed, or put in place of another", True)
+        first = self._places.setdefault(number, path)
+        before = self._before
+        if first != path:
+            self._report(f"is a copy of {first.name}", True)
+        elif before is None:
+            if number > 0 or previous:
+                count = f"{number} earlier segments" if number > 0 else "earlier segments"
+                self._report(f"{count} were dropped by the ring, or removed", False)
+        elif number <= before.number:
+            self._report(f"is older than {before.path.name} before it: out of order", True)
+        elif number > before.number + 1:
+            missing = number - before.number - 1
+            self._report(f"{missing} segments before it are missing, after {before.path.name}: removed, or lost", True)
+        elif previous and not before.seal:
+            self._report(f"follows {before.path.name}, whose end was cut off after it was written", True)
+        elif previous != before.seal:
+            self._report(f"does not match {before.path.name} before it: one of the two was replaced", True)
+        self._before = _Link(path, number, "")
+
+    def end(self, facts: dict[str, Any], end: journal.SegmentEnd | None) -> None:
+        """Check the seal of the current segment; `end` None: it is not closed."""
+        before = self._before
+        assert before is not None
+        name = str(facts["key"])
+        if end is None:
+            self.unsealed.append(before.path)
+            return
+        self._before = before._replace(seal=end.seal.hex())
+        if not name or not self._keys:
+            self.unsealed.append(before.path)
+            if name or not end.mac:
+                return
+        try:
+            key = find_key(name, self._keys)
+        except RecordingError as error:
+            self._report(f"cannot be verified: {error}", True)
+            return
+        if not hmac.compare_digest(seal_segment(key, end.digest), end.mac):
+            self._report("its seal is wrong: it was not written with the key", True)
+            return
+        self.genuine += key is not None
+
+    def skip(self, path: Path) -> None:
+        """Skip a segment with an unreadable head, which counts as not closed."""
+        self.unsealed.append(path)
+        number = get_number(path)
+        if self._before is not None and number is not None:
+            self._before = _Link(path, number, "")
+
+    def finish(self, newest: NewestMarker | None) -> None:
+        """Check that the last segment is the one in `newest`; None: not known."""
+        before = self._before
+        if newest is None or before is None:
+            return
+        name = before.path.name
+        if newest.number > before.number:
+            count = newest.number - before.number
+            self._report(f"{count} segments after {name} are missing at the end: removed, or lost", True)
+        elif newest.number < before.number:
+            # a stop between creating a segment and updating the marker is normal
+            if newest.number != before.number - 1 or before.seal:
+                self._report(f"the file {NEWEST_NAME} is older than {name}: restored", True)
+        elif newest.seal and newest.seal != before.seal:
+            why = "was replaced" if before.seal else "was cut off after it was closed"
+            self._report(f"{name}, the last segment, {why}", True)
+
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
 
@@ -142,9 +516,9 @@ class _Group:
     """A record, or several records with interleaved outputs, and what was published."""
 
     segment: Path
-    record: journal.JournalRecord
+    record: JournalRecord
     replayed: list[PublishedMessage]
-    recorded: list[journal.JournalRecord] = field(default_factory=list)
+    recorded: list[JournalRecord] = field(default_factory=list)
 
 
 def verify(
@@ -196,7 +570,7 @@ class _Verifier:
             for item in journal.read_segment(data):
                 if report.difference is not None:
                     return
-                if isinstance(item, journal.JournalRecord):
+                if isinstance(item, JournalRecord):
                     if report.handled % 512 == 0:
                         self._on_progress(before + item.at)
                     self._process(item)
@@ -239,7 +613,7 @@ class _Verifier:
             )
         part, lost = facts["part"], facts["lost"]
         self._chain.begin(self._path, facts)
-        for each in environment.list_differences(facts):
+        for each in list_differences(facts):
             if each not in self.report.environment_differences:
                 self.report.environment_differences.append(each)
         if run != self._run:
@@ -259,24 +633,24 @@ class _Verifier:
         self.close()
         self._replay, self._at_ns = None, 0
         try:
-            self._replay = replay = ReplayLoop(state.data)
+            replay = ReplayLoop(state.data)
+            if facts is not None and facts.get("history_s") is not None and len(history := replay.state.history):
+                self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
         except Exception as error:
+            # a forged state may contain anything
             self._add_finding(f"cannot be replayed: {error}", is_damage=True)
             return
-        if facts is not None and facts.get("history_s") is not None:
-            history = replay.state.history
-            if len(history):
-                self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
+        self._replay = replay
 
-    def _process(self, record: journal.JournalRecord) -> None:
+    def _process(self, record: JournalRecord) -> None:
         report, replay = self.report, self._replay
         report.first_utime = report.first_utime or record.utime
         report.last_utime = record.utime
         if replay is None:
-            if record.kind is journal.RecordKind.PUBLISHED:
+            if record.kind is RecordKind.PUBLISHED:
                 report.skipped[record.channel] += 1
             return
-        if record.kind is journal.RecordKind.PUBLISHED:
+        if record.kind is RecordKind.PUBLISHED:
             if self._group is None:
                 self._group = _Group(self._path, record, [])
             self._group.recorded.append(record)
@@ -287,7 +661,7 @@ class _Verifier:
         self._at_ns = record.monotonic_ns
         if self._group is not None and not self._is_interleaved(record):
             self._compare()
-            if report.difference is not None:
+            if report.difference is not None or self._replay is None:
                 return
         try:
             published = replay.handle(record)
@@ -302,17 +676,25 @@ class _Verifier:
             self._group.replayed += published
 
     @staticmethod
-    def _is_interleaved(record: journal.JournalRecord) -> bool:
+    def _is_interleaved(record: JournalRecord) -> bool:
         """Return whether a record may come between outputs of one step: a publishing or persisting error."""
-        if record.kind is not journal.RecordKind.EVENT:
+        if record.kind is not RecordKind.EVENT:
             return False
         try:
-            return isinstance(journal_state.decode_event(record.data), (Rejected, HealthWarning))
+            return isinstance(encoding.decode_event(record.data), (Rejected, HealthWarning))
         except RecordingError:
             return False
 
     def _compare(self) -> None:
         """Compare the recorded and the replayed outputs of the group, and count them by channel."""
+        try:
+            self._compare_group()
+        except Exception as error:
+            # a forged state may contain anything
+            self._add_finding(f"cannot be compared: {error}", is_damage=True)
+            self._replay = self._follows = None
+
+    def _compare_group(self) -> None:
         group, self._group = self._group, None
         assert group is not None
         assert self._replay is not None
@@ -343,7 +725,7 @@ class _Verifier:
             )
             return
 
-    def _is_close(self, recorded: journal.JournalRecord, replayed: PublishedMessage) -> bool:
+    def _is_close(self, recorded: JournalRecord, replayed: PublishedMessage) -> bool:
         """Return whether a message is equal within the tolerance, and update the maximum deviation."""
         report = self.report
         off = compute_deviation(recorded.data, replayed[1]) if replayed[0] == recorded.channel else None
@@ -357,17 +739,17 @@ class _Verifier:
         report.max_deviation = report.max_deviation.elementwise_max(off)
         return True
 
-    def _needs_history(self, record: journal.JournalRecord) -> bool:
+    def _needs_history(self, record: JournalRecord) -> bool:
         """Return whether a reply may depend on poses before the restart of the replay."""
         replay = self._replay
         if replay is None or not len(replay.state.history) or replay.state.history.last >= self._held_until:
             return False
         if record.kind not in (
-            journal.RecordKind.REQUEST,
-            journal.RecordKind.CACHED,
-            journal.RecordKind.MALFORMED,
-            journal.RecordKind.OVERLOAD,
-            journal.RecordKind.FAILED,
+            RecordKind.REQUEST,
+            RecordKind.CACHED,
+            RecordKind.MALFORMED,
+            RecordKind.OVERLOAD,
+            RecordKind.FAILED,
         ):
             # a deferred request is answered later
             return True

@@ -1,54 +1,310 @@
-"""Writer of the journal: a thread that turns the queue of the loop into sealed segments, and where they are stored.
+"""Writer of the journal: a thread that turns the queue of the loop into a ring of sealed segments on disk.
 
 It never makes the loop wait for the disk, and for the interpreter (GIL) at most a fraction of a millisecond: records
 are sealed in small batches with pauses between them. `run_once` is one cycle, so that tests need no thread. After a
 disk error, records are dropped and counted, and every `RETRY_S` a new segment is tried.
+
+The head of each segment holds the facts of build and machine on which the bits of results depend, the number of the
+segment in the ring, the number of the run, its part number in the run, and the seal of the previous segment. A segment
+ends with its seal: with a key the HMAC-SHA256 of the digest of all its bytes including the head, without one the digest
+itself. So nobody without the key can forge, change, replace or reorder segments; without a key the checks find
+accidental damage only.
+
+The sealed file `newest` names the last segment, which detects missing segments at the end. Limit: an older `newest`
+restored together with fewer segments cannot be detected by anything on the same disk.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
+import hmac
+import json
 import logging
+import mmap
 import os
+import platform
+import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
-from modelserver.files.regular import read_regular
+from modelserver.errors import RecordingError
+from modelserver.files.regular import open_regular, read_regular, read_start
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import Clock
-from modelserver.server.journal import environment
-from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.queue import JournalEntry, JournalQueue, SegmentStart
-from modelserver.server.journal.segments import (
-    NEWEST_NAME,
-    NewestMarker,
-    Ring,
-    Segment,
-    read_last_segment,
-    read_newest,
-    seal_segment,
-)
+from modelserver.server.journal import JournalEntry, JournalQueue, SegmentStart, encoding
 from modelserver.server.log import escape_text, start_in_background
-from modelserver.server.persistence.directory import (
+from modelserver.server.persistence import (
     FileLock,
+    create_directory,
     describe_error,
     get_state_directory,
+    sync_directory,
     to_file_name,
     write_atomically,
 )
 from modelserver.signing.signatures import Key
+from modelserver.version import __version__
 from modelserver.wire import journal
+from modelserver.wire.eventlog import Buffer
 
 log = logging.getLogger(__name__)
+
+
+INFORMATIVE_FACTS: Final = frozenset({"host", "kernel"})
+"""Facts that do not affect results."""
+
+
+@cache
+def collect_facts() -> Mapping[str, str]:
+    """Return the facts of build and machine that affect the last bits of results, and the informative ones."""
+    return {
+        "modelserver": __version__,
+        "source": _hash_source(),
+        "python": f"{platform.python_implementation()} {platform.python_version()}",
+        # read from the metadata, without importing them; pin is Pinocchio
+        **{name: _read_version(name) for name in ("numpy", "filterpy", "pyproj", "pin")},
+        "libc": " ".join(platform.libc_ver()),
+        "machine": platform.machine(),
+        "processor": _read_processor(),
+        "threads": os.environ.get("OPENBLAS_NUM_THREADS", ""),
+        "host": platform.node(),
+        "kernel": platform.release(),
+    }
+
+
+def _read_version(name: str) -> str:
+    """Return the version of an installed package; empty for none."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+def _hash_source() -> str:
+    """Return a digest of the source files, which identifies the build."""
+    digest = hashlib.sha256()
+    root = Path(__file__).resolve().parents[2]
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _read_processor() -> str:
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
+            for line in file:
+                key, _, value = line.partition(":")
+                if key.strip() in ("model name", "Model", "CPU part"):
+                    return value.strip()
+    except OSError:
+        pass
+    return platform.processor()
+
+
+SEGMENT_NAME: Final = re.compile(r"journal-(\d{8})\.lcm")
+
+LOCK_NAME: Final = "lock"
+
+
+def list_segments(directory: Path) -> list[Path]:
+    """List the segments in a directory, the oldest first. Raises OSError."""
+    return sorted(path for path in directory.iterdir() if SEGMENT_NAME.fullmatch(path.name))
+
+
+def get_number(path: Path) -> int | None:
+    """Return the number in the name of a segment; None for another name."""
+    match = SEGMENT_NAME.fullmatch(path.name)
+    return int(match[1]) if match else None
+
+
+@contextlib.contextmanager
+def open_mapped(path: Path) -> Iterator[Buffer]:
+    """Map a regular file into memory, for reading. Raises OSError."""
+    with open_regular(path) as file:
+        if not file.seek(0, 2):
+            yield b""  # an empty file cannot be mapped
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            yield data
+
+
+class Segment:
+    """A segment that is being written and hashed. Never an existing file.
+
+    Every method raises OSError for an error of the disk.
+    """
+
+    def __init__(self, path: Path, number: int = 0):
+        self.path = path
+        self.number = number
+        """Number in the ring."""
+        self.size = 0
+        self.digest = hashlib.sha256()
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
+
+    def append(self, data: bytes) -> None:
+        """Write bytes to the page cache: from here on they survive the process."""
+        left = memoryview(data)
+        while left:
+            left = left[os.write(self._file, left) :]
+        self.size += len(data)
+        self.digest.update(data)
+
+    def sync(self) -> None:
+        """Sync to the disk: from here on the bytes survive the machine."""
+        if os.fstat(self._file).st_nlink == 0:
+            # writes to an unlinked file succeed, but the data are lost
+            raise FileNotFoundError(errno.ENOENT, "the segment was removed while it was written", str(self.path))
+        os.fdatasync(self._file)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            os.close(self._file)
+
+
+class Ring:
+    """Directory of segments with a maximum size; the oldest are deleted. One writer at a time. Raises OSError."""
+
+    def __init__(self, directory: Path, max_bytes: int, segment_bytes: int):
+        self.directory = directory
+        self.max_bytes = max_bytes
+        self.segment_bytes = segment_bytes
+        self._lock = FileLock(directory / LOCK_NAME)
+
+    def acquire(self) -> None:
+        """Acquire the directory for this writer."""
+        create_directory(self.directory)
+        self._lock.acquire()
+
+    def create_segment(self, min_number: int = 0) -> Segment:
+        """Create a segment with the next number, after deleting the oldest ones to make room for it.
+
+        Its number is at least `min_number`: there may have been segments that were deleted.
+        """
+        self.acquire()
+        held = list_segments(self.directory)
+        sizes = [path.stat().st_size for path in held]
+        excess = sum(sizes) + self.segment_bytes - self.max_bytes
+        for path, size in zip(held, sizes, strict=True):
+            if excess <= 0:
+                break
+            path.unlink()
+            excess -= size
+        newest = get_number(held[-1]) if held else None
+        number = max(0 if newest is None else newest + 1, min_number)
+        segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
+        sync_directory(self.directory)
+        return segment
+
+    def make_room(self) -> bool:
+        """Delete the oldest segment, except the newest; return whether there was one."""
+        held = list_segments(self.directory)
+        if len(held) < 2:
+            return False
+        held[0].unlink()
+        return True
+
+    def release(self) -> None:
+        self._lock.release()
+
+
+SEGMENT_DOMAIN: Final = b"modelserver journal segment, version 1\n"
+NEWEST_DOMAIN: Final = b"modelserver journal newest, version 1\n"
+"""Domain separation: prefix of the sealed bytes, which no other use of a key shares."""
+
+NEWEST_NAME: Final = "newest"
+
+MAX_NEWEST_BYTES: Final = 1024
+"""Bytes of the file."""
+
+
+def seal_segment(key: Key | None, digest: bytes) -> bytes:
+    """Return the MAC of a segment with this SHA-256 digest; empty without a key."""
+    return b"" if key is None else hmac.digest(key.secret, SEGMENT_DOMAIN + digest, hashlib.sha256)
+
+
+class NewestMarker(NamedTuple):
+    """The last segment: run, number in the ring, seal (hex; empty = not closed); the content of the file `newest`."""
+
+    run: int = -1
+    number: int = -1
+    seal: str = ""
+
+    def encode(self, key: Key | None) -> bytes:
+        line = json.dumps({"key": "" if key is None else key.name, **self._asdict()}).encode() + b"\n"
+        return line + _seal_newest(key, line).encode() + b"\n"
+
+
+def _seal_newest(key: Key | None, line: bytes) -> str:
+    data = NEWEST_DOMAIN + line
+    return (hashlib.sha256(data) if key is None else hmac.new(key.secret, data, hashlib.sha256)).hexdigest()
+
+
+def read_newest(directory: Path, keys: Sequence[Key], verify: bool = True) -> NewestMarker | None:
+    """Return the marker of a journal; None where there is no file.
+
+    With `verify`, raise RecordingError where it is damaged or not authentic; else such a file counts as missing. The
+    seal of a key is not checked if `keys` is empty.
+    """
+    try:
+        data = read_start(directory / NEWEST_NAME, MAX_NEWEST_BYTES)
+    except OSError:
+        return None
+    try:
+        return _parse_newest(data, keys)
+    except (RecordingError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        if not verify:
+            return None
+        raise RecordingError(f"the file {NEWEST_NAME} is damaged or not authentic: {error}") from error
+
+
+def _parse_newest(data: bytes, keys: Sequence[Key]) -> NewestMarker:
+    line, _, seal = data.partition(b"\n")
+    line += b"\n"
+    found = json.loads(line)
+    key = find_key(found["key"], keys)
+    if (key is not None or not found["key"]) and not hmac.compare_digest(_seal_newest(key, line).encode(), seal[:-1]):
+        raise RecordingError("its seal is wrong")
+    newest = NewestMarker(found["run"], found["number"], found["seal"])
+    if type(newest.run) is not int or type(newest.number) is not int or type(newest.seal) is not str:
+        raise RecordingError("its fields have wrong types")
+    return newest
+
+
+def find_key(name: str, keys: Sequence[Key]) -> Key | None:
+    """Return the named key; None where the journal has no key or no keys are given. Raises RecordingError."""
+    if not name or not keys:
+        return None
+    for key in keys:
+        if key.name == name:
+            return key
+    raise RecordingError(f"it is sealed with key {name[:64]!r}, which is not in the key file")
+
+
+def read_last_segment(directory: Path) -> NewestMarker:
+    """Return the last segment of a directory, as far as its head and end are readable. Raises OSError."""
+    held = list_segments(directory)
+    if not held:
+        return NewestMarker()
+    with open_mapped(held[-1]) as data:
+        head, end = next(iter(journal.read_segment(data)), None), journal.read_end(data)
+    run = head.facts.get("run_number") if isinstance(head, journal.SegmentHead) else None
+    return NewestMarker(
+        run if type(run) is int else -1, get_number(held[-1]) or 0, "" if end is None else end.seal.hex()
+    )
+
 
 PERIOD_S: Final = 0.2
 """Seconds between two cycles: what a killed process loses at most."""
@@ -69,22 +325,6 @@ MAX_FILE_BYTES: Final = 4 << 20
 """Greatest size of a file that is copied into every segment; of a larger one only the beginning."""
 
 
-@dataclass(frozen=True, slots=True)
-class JournalContext:
-    """What every segment begins with in addition to the state.
-
-    Attributes
-    ----------
-    facts: about service, build and machine, as JSON.
-    files: name and bytes of the files that the service was started with, for people; the replay does not use them.
-    config: configuration of the vehicle.
-    """
-
-    facts: Mapping[str, Any]
-    files: Iterable[tuple[str, bytes]]
-    config: VehicleConfig
-
-
 def pause() -> None:
     """Release the interpreter to another thread."""
     time.sleep(PAUSE_S)
@@ -93,28 +333,32 @@ def pause() -> None:
 class JournalWriter:
     """Writes the records of a queue into a ring, on a thread between `start` and `close`.
 
-    `key`: seals the segments; None: without authentication.
+    Parameters
+    ----------
+    facts: about service, build and machine, as JSON.
+    files: name and bytes of the files that the service was started with, for people; the replay does not use them.
+    key: seals the segments; None: without authentication.
     """
 
     def __init__(
         self,
         queue: JournalQueue,
         ring: Ring,
-        context: JournalContext,
+        config: VehicleConfig,
+        facts: Mapping[str, Any],
+        files: Iterable[tuple[str, bytes]],
         clock: Clock,
         pause: Callable[[], object] = pause,
         key: Key | None = None,
     ):
-        # compiled before the loop starts
-        journal_state.get_schema()
         self._key = key
         self._run_number = -1
         self._previous = ""
         self._queue = queue
         self._ring = ring
-        self._context = context
+        self._config, self._facts, self._files = config, facts, files
         self._clock = clock
-        self._sync_ns = round(context.config.journal.sync_s * 1e9)
+        self._sync_ns = round(config.journal.sync_s * 1e9)
         self._pause = pause
         self._segment: Segment | None = None
         self._part = 0
@@ -194,7 +438,7 @@ class JournalWriter:
     def _record(self, entry: JournalEntry) -> journal.JournalRecord:
         kind, data = entry.kind, entry.data
         if kind is journal.RecordKind.EVENT:
-            data = journal_state.encode_event(entry.event, self._pause)
+            data = encoding.encode_event(entry.event, self._pause)
         elif kind is journal.RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
             kind = journal.RecordKind.SAMPLE
         return journal.JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
@@ -216,18 +460,18 @@ class JournalWriter:
         lost = self._lost + beginning.lost
         try:
             self._end_segment()
-            run = journal_state.RunState(self._context.config, journal_state.detach(beginning.state))
-            state = journal_state.encode_run(run, self._pause)
+            run = encoding.RunState(self._config, encoding.detach(beginning.state))
+            state = encoding.encode_run(run, self._pause)
             segment = self._create_segment()
             facts: dict[str, Any] = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime}
-            facts |= self._context.facts
-            facts["history_s"] = journal_state.HISTORY_S if len(beginning.state.history) else None
+            facts |= self._facts
+            facts["history_s"] = encoding.HISTORY_S if len(beginning.state.history) else None
             facts["key"] = "" if self._key is None else self._key.name
             facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
             self._previous = ""
             self._segment, self._batch = segment, 0
             segment.append(journal.encode_head(facts, now.utime))
-            for name, data in self._context.files:
+            for name, data in self._files:
                 segment.append(journal.encode_file(name, data[:MAX_FILE_BYTES], now.utime))
             segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
@@ -332,21 +576,20 @@ def get_max_bytes(config: VehicleConfig) -> int:
 
 
 def make_writer(
-    config: VehicleConfig, file: str, clock: Clock, lock: FileLock | None = None, key: Key | None = None
+    config: VehicleConfig, file: str, clock: Clock, key: Key | None = None
 ) -> tuple[JournalQueue, JournalWriter] | None:
     """Return the queue for the loop and its writer, None where no journal is written.
 
-    `file`: the vehicle file. `lock`: that of the state directory, used if the journal is inside. `key`: seals segments.
+    `file`: the vehicle file. `key`: seals segments.
     """
     directory = get_journal_directory(config)
     if directory is None:
         return None
     most = get_max_bytes(config)
     log.info("the journal is written in %s, %d MB at most", directory, most >> 20)
-    within = lock if lock is not None and directory.is_relative_to(lock.path.parent) else None
-    ring = Ring(directory, most, min(MAX_SEGMENT_BYTES, most // MIN_SEGMENTS), within)
+    ring = Ring(directory, most, min(MAX_SEGMENT_BYTES, most // MIN_SEGMENTS))
     facts = {
-        **environment.collect_facts(),
+        **collect_facts(),
         "vehicle": config.vehicle,
         "run": secrets.token_hex(8),
         "pid": os.getpid(),
@@ -354,5 +597,4 @@ def make_writer(
     paths = [path for path in (Path(file), Path(config.geometry)) if path.is_file()]
     files = [(str(path), read_regular(path, LARGEST_FILE)) for path in paths]
     queue = JournalQueue()
-    origins = JournalContext(facts, files, config)
-    return queue, JournalWriter(queue, ring, origins, clock, key=key)
+    return queue, JournalWriter(queue, ring, config, facts, files, clock, key=key)

@@ -24,8 +24,8 @@ from modelserver.estimation.filter.measurements.own import OwnMeasurement, get_t
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.messages import Decision, ImuSample, MeasurementSample, Mode, SensorHeader, SwitchMode, Verdict
-from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.state import RunState
+from modelserver.server.journal import encoding as journal_state
+from modelserver.server.journal.encoding import RunState
 from modelserver.simulation import figure_eight
 
 EXAMPLE = runpy.run_path(str(Path(__file__).resolve().parents[3] / "examples" / "python" / "own_measurement.py"))

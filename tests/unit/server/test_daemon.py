@@ -25,9 +25,9 @@ from modelserver.messages import (
     SwitchMode,
     Tick,
 )
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
 from modelserver.server.daemon import log_mode_switch
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.vehicle import Vehicle, get_configured_origin, load_vehicle

@@ -25,10 +25,10 @@ from modelserver.messages import (
     Tick,
     Verdict,
 )
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.persistence.stores import StateStore
+from modelserver.server.persistence import StateStore
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode
 

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import BusError
-from modelserver.server.diagnostics.bus_probe import probe_bus, report_findings
-from modelserver.server.diagnostics.checks import (
+from modelserver.server.diagnostics import (
     BusFacts,
     ClockFacts,
     Diagnosis,
@@ -25,6 +24,8 @@ from modelserver.server.diagnostics.checks import (
     evaluate_servers,
     filter_by_level,
     get_worst_level,
+    probe_bus,
+    report_findings,
 )
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, resolve_url
@@ -251,7 +252,7 @@ def test_given_a_clock_that_was_never_set_then_it_is_an_error() -> None:
 
 @pytest.mark.parametrize("slewed", [3600.0, -3600.0, 0.01])
 def test_given_a_step_during_the_check_then_it_is_reported(slewed: float) -> None:
-    found = evaluate_clock(ClockFacts(NOW, True, None, slewed, 1.3, "chrony"), shared=False)
+    found = tuple(evaluate_clock(ClockFacts(NOW, True, None, slewed, 1.3, "chrony"), shared=False))
     assert (found[0].level, f"{slewed:+.3f}" in found[0].observed) == (DiagnosisLevel.WARNING, True)
 
 
@@ -295,24 +296,24 @@ def test_given_none_then_it_is_a_note_with_how_to_start_it() -> None:
 def test_given_two_daemons_then_it_is_an_error_and_one_is_to_be_stopped(
     answers: DiscoveredServers, command: str
 ) -> None:
-    found = evaluate_servers(answers, "", "1.0")[0]
+    found = next(evaluate_servers(answers, "", "1.0"))
     assert found.level is DiagnosisLevel.ERROR
     assert found.command.startswith(command)
 
 
 def test_given_servers_of_other_vehicles_then_their_prefixes_distinguish_them() -> None:
-    found = evaluate_servers(DiscoveredServers((ONE, Server("pc", 9, prefix="B_")), 1), "", "1.0")
+    found = tuple(evaluate_servers(DiscoveredServers((ONE, Server("pc", 9, prefix="B_")), 1), "", "1.0"))
     assert get_worst_level(found) is DiagnosisLevel.NOTE
     assert "'B_'" in found[-1].observed
 
 
 def test_given_a_daemon_of_another_version_then_it_is_to_be_restarted() -> None:
-    found = evaluate_servers(DiscoveredServers((ONE,), 1), "", "2.0")
+    found = tuple(evaluate_servers(DiscoveredServers((ONE,), 1), "", "2.0"))
     assert get_worst_level(found) is DiagnosisLevel.WARNING
 
 
 def test_given_an_odd_host_name_then_it_is_escaped() -> None:
-    found = evaluate_servers(DiscoveredServers((Server("\x1b[31m\n" * 99, 1, version="\x07"),), 1), "", "1.0")
+    found = tuple(evaluate_servers(DiscoveredServers((Server("\x1b[31m\n" * 99, 1, version="\x07"),), 1), "", "1.0"))
     assert all(each.observed.isprintable() and len(each.observed) < 400 for each in found)
 
 

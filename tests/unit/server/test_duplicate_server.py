@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from support_wire import EXAMPLES
 
 from modelserver.messages import Health
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.diagnostics.bus_probe import DUPLICATE_TIMEOUT_S, MAX_REPORTS_PER_S, DuplicateServerMonitor
-from modelserver.server.fake_bus import FakeBus
+from modelserver.server.diagnostics import DUPLICATE_TIMEOUT_S, MAX_REPORTS_PER_S, DuplicateServerMonitor
 from modelserver.wire.codec import encode
 
 

@@ -1,8 +1,7 @@
-"""Encoding by declared types: every bit survives, and differences of another build's types are named."""
+"""Encoding of values: every bit survives, and differences of another build's types are named."""
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from array import array
@@ -10,15 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Flag, IntEnum, StrEnum
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from modelserver.errors import RecordingError
-from modelserver.server.encoding.schema import Schema, SchemaError, read_document, write_document
-from modelserver.server.encoding.tokens import EncodingError
+from modelserver.server.journal import encoding
+from modelserver.server.journal.encoding import EncodingError, decode_value, encode_value
 
 
 class Color(IntEnum):
@@ -112,15 +111,14 @@ class Everything(NamedTuple):
     z: complex = 0j
 
 
-def schema(root: Any = Everything) -> Schema:
-    return Schema({"value": root}, {Shape: (Square, Circle)})
-
-
-SCHEMA = schema()
+@pytest.fixture(autouse=True)
+def own_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the classes of this file be stored, as those of an installed measurement."""
+    monkeypatch.setattr(encoding, "_list_installed", lambda: frozenset({__name__.partition(".")[0]}))
 
 
 def back(value: Everything) -> Everything:
-    found: Everything = SCHEMA.decode("value", SCHEMA.encode("value", value))
+    found: Everything = decode_value(encode_value(value))
     return found
 
 
@@ -168,7 +166,8 @@ def test_given_any_integer_when_read_back_then_it_is_the_same(count: int) -> Non
 def test_given_every_kind_of_value_when_read_back_then_it_is_the_same() -> None:
     value = Everything(
         text="Ä\0\ud800", data=b"\0\xff", mixed="word", mode="b", color=Color.GREEN, word=Word.YES,
-        marks=Marks.A | Marks.B, pairs=(("a", 1.0), ("b", -2.0)), named={"z": 1, "a": 2}, own={("x", "y"): 2.5},
+        marks=Marks.A | Marks.B, pairs=(("a", 1.0), ("b", -2.0)), named=MappingProxyType({"z": 1, "a": 2}),
+        own={("x", "y"): 2.5},
         shape=Circle(1.5, 2j), either=Square(3.0), kind=Circle, track=Track("t", array("q", [1, -2])),
         plain=Plain(4, ("u",)),
     )  # fmt: skip
@@ -207,11 +206,10 @@ def test_given_a_constructor_that_changes_its_values_then_it_is_not_called() -> 
 def test_given_shared_values_when_read_back_then_they_are_shared_and_written_once() -> None:
     row = tuple(map(float, range(100)))
     shared, apart = ((row,) * 50, tuple(tuple(map(float, range(100))) for _ in range(50)))
-    rows = Schema({"value": tuple[tuple[float, ...], ...]})
-    data = rows.encode("value", shared)
-    assert len(data) < len(rows.encode("value", apart)) / 40
-    assert len({id(each) for each in rows.decode("value", data)}) == 1
-    assert rows.decode("value", data) == shared
+    data = encode_value(shared)
+    assert len(data) < len(encode_value(apart)) / 40
+    assert len({id(each) for each in decode_value(data)}) == 1
+    assert decode_value(data) == shared
 
 
 def test_given_numbers_of_numpy_then_they_are_stored_as_numbers_of_the_same_bits() -> None:
@@ -223,96 +221,56 @@ def test_given_numbers_of_numpy_then_they_are_stored_as_numbers_of_the_same_bits
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (Everything(number="x"), "Everything.number is str, declared as float"),  # type: ignore[arg-type]
-        (Everything(count=1.5), "Everything.count is float, declared as int"),  # type: ignore[arg-type]
-        (Everything(number=(1.0,)), "Everything.number is tuple, declared as float"),  # type: ignore[arg-type]
-        (Everything(mode="c"), "Everything.mode is str, declared as str('a', 'b')"),  # type: ignore[arg-type]
-        (Everything(color=2), "Everything.color is int, declared as"),  # type: ignore[arg-type]
-        (Everything(vector=(1.0, 2.0)), "Everything.vector is 2 values, declared as"),  # type: ignore[arg-type]
-        (Everything(vector=[1.0, 2.0, 3.0]), "Everything.vector is list, declared as"),  # type: ignore[arg-type]
-        (Everything(shape=Plain(1)), "Everything.shape is Plain, declared as"),  # type: ignore[arg-type]
-        (Everything(matrix=np.zeros(2, np.float32)), "Everything.matrix is ndarray(float32), declared as"),  # type: ignore[arg-type]
-        (Everything(either=Circle(radius=None)), "Circle.radius is None, declared as float"),  # type: ignore[arg-type]
-        (Everything(plain=Plain(lambda: 1)), "Plain.first is function, declared as int"),  # type: ignore[arg-type]
+        (Everything(plain=Plain(lambda: 1)), "Plain.first is of builtins.function, which cannot be stored"),  # type: ignore[arg-type]
+        (Everything(count=object()), "Everything.count is of builtins.object, which"),  # type: ignore[arg-type]
+        (Everything(named={"a": {1}}), "Everything.named is of builtins.set, which"),  # type: ignore[dict-item]
+        (Everything(matrix=np.zeros(2, np.float32)), "Everything.matrix is of numpy.ndarray, which"),  # type: ignore[arg-type]
+        (Everything(either=Circle(radius=struct)), "Circle.radius is of builtins.module, which"),  # type: ignore[arg-type]
+        (struct.Struct("b"), "the value is of _struct.Struct, which"),
     ],
 )
-def test_given_a_value_that_is_not_of_its_type_then_the_error_names_the_field(value: Everything, words: str) -> None:
-    with pytest.raises(EncodingError, match="declared as") as raised:
-        SCHEMA.encode("value", value)
+def test_given_a_value_that_cannot_be_stored_then_the_error_names_the_field(value: object, words: str) -> None:
+    with pytest.raises(EncodingError, match="cannot be stored") as raised:
+        encode_value(value)
     assert words in str(raised.value)
-
-
-class _Bare:
-    def __init__(self, value):  # type: ignore[no-untyped-def]
-        self.value = value
-
-
-@pytest.mark.parametrize("hint", [Any, object, set[int], Shape, _Bare, tuple[Any, ...], dict[str, Any], Square | float])
-def test_given_a_type_that_cannot_be_stored_then_that_is_reported_before_anything_is_written(hint: Any) -> None:
-    with pytest.raises(SchemaError):
-        Schema({"value": NamedTuple("Holder", [("field", hint)])})
 
 
 # --- another build's types ------------------------------------------------------------------------------------------
 
 
-def written_elsewhere(changed: Mapping[str, Any], enums: Mapping[str, Any] = MappingProxyType({})) -> bytes:
-    """Return the bytes of a build with other types."""
-    description = json.loads(SCHEMA.description)
-    description["records"] |= changed
-    description["enums"] |= enums
-    other = schema()
-    object.__setattr__(other, "description", json.dumps({k: v for k, v in description.items() if v is not None}))
-    object.__setattr__(other, "fingerprint", bytes(32))
-    return write_document(other, "value", Everything())
+NAME = f"{__name__}:Circle"
+FIELDS = "radius: float\ncenter: complex"
 
 
-NAME = f"{__name__}.Circle"
+def test_given_a_class_then_its_definition_names_its_fields_with_their_types() -> None:
+    assert encoding._get_layout(Circle).text == FIELDS
+    assert encoding._get_layout(Plain).text == "first: int\nsecond: tuple[str, ...]"
+    assert encoding._get_layout(Track).text == "_times: array[int]\nname: str"
+    assert encoding._get_layout(Color).text == "GREEN: 2\nRED: 1"
 
 
 @pytest.mark.parametrize(
-    ("changed", "enums", "words"),
+    ("name", "text", "words"),
     [
-        (
-            {NAME: [["radius", "int"], ["center", "complex"]]},
-            {},
-            f"{NAME}.radius: written as int, this build has float",
-        ),
-        ({NAME: [["center", "complex"]]}, {}, f"{NAME}.radius: the writer had no such field"),
-        (
-            {NAME: [["radius", "float"], ["center", "complex"], ["color", "int"]]},
-            {},
-            f"{NAME}.color: this build has no such field",
-        ),
-        ({NAME: [["center", "complex"], ["radius", "float"]]}, {}, f"{NAME}: its fields are in another order"),
-        ({"x.Other": []}, {}, "x.Other: this build has no such type"),
-        ({}, {f"{__name__}.Color": {"RED": 1, "GREEN": 3}}, "Color: member GREEN was 3, is 2"),
+        (NAME, FIELDS.replace("float", "int"), "Circle.radius: written as int, this build has float"),
+        (NAME, "center: complex", "Circle.radius: the writer had no such field"),
+        (NAME, FIELDS + "\ncolor: int", "Circle.color: this build has no such field"),
+        (NAME, "center: complex\nradius: float", "Circle: its fields are in another order"),
+        (f"{__name__}:Other", "", "Other: this build has no such type"),
+        ("modelserver.core.none:Other", "", "Other: this build has no such type"),
+        (f"{__name__}:Color", "GREEN: 3\nRED: 1", "Color.GREEN: written as 3, this build has 2"),
+        (NAME, 7, "Circle: its fields are others"),
     ],
 )
-def test_given_a_build_with_other_types_then_the_error_names_the_field(
-    changed: dict[str, Any], enums: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(RecordingError) as raised:
-        read_document(SCHEMA, "value", written_elsewhere(changed, enums))
+def test_given_a_build_with_other_types_then_the_error_names_the_field(name: str, text: object, words: str) -> None:
+    with pytest.raises(RecordingError, match="it was written by a build with other types") as raised:
+        decode_value(stream(DEFINE, name, text, RECORD, 1.0, 2.0))
     assert words in str(raised.value)
 
 
-def test_given_a_description_that_is_damaged_or_huge_then_that_is_reported() -> None:
-    data = write_document(SCHEMA, "value", Everything())
-    other = data[:8] + bytes(32) + data[40:]
-    for damaged in (other, other[:44] + b"\xff" * (len(other) - 44)):
-        with pytest.raises(RecordingError, match="it was written by a build with other types"):
-            read_document(SCHEMA, "value", damaged)
-    import zlib
-
-    bomb = zlib.compress(b"[" * (64 << 20), 9)
-    with pytest.raises(RecordingError, match="their description is damaged"):
-        read_document(SCHEMA, "value", data[:8] + bytes(32) + struct.pack(">I", len(bomb)) + bomb)
-
-
-def test_given_the_same_types_then_the_fingerprint_is_the_same_and_another_where_a_field_is_added() -> None:
-    assert schema().fingerprint == SCHEMA.fingerprint
-    assert Schema({"value": Circle}).fingerprint != Schema({"value": Square}).fingerprint
+@pytest.mark.parametrize("is_described", [True, False])
+def test_given_the_same_types_then_the_value_is_read(is_described: bool) -> None:
+    assert decode_value(encode_value(Circle(2.0), is_described=is_described)) == Circle(2.0)
 
 
 # --- hostile bytes --------------------------------------------------------------------------------------------------
@@ -327,7 +285,24 @@ def test_given_the_same_types_then_the_fingerprint_is_the_same_and_another_where
 )  # fmt: skip
 def test_given_bytes_that_are_no_stream_then_that_is_reported(data: bytes) -> None:
     with pytest.raises(RecordingError):
-        SCHEMA.decode("value", data)
+        decode_value(data)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "os:system",
+        "subprocess:Popen",
+        "builtins:int",
+        "modelserver.server.persistence:FileLock",
+        "",
+        ":",
+        "modelserver:x",
+    ],
+)
+def test_given_a_name_that_is_no_class_of_a_state_then_it_is_rejected(name: str) -> None:
+    with pytest.raises(RecordingError, match="is no class of a state"):
+        decode_value(stream(DEFINE, name, "", RECORD))
 
 
 def stream(*tokens: object) -> bytes:
@@ -337,43 +312,60 @@ def stream(*tokens: object) -> bytes:
     return struct.pack(">I", len(data)) + data
 
 
+INT, _, TUPLE, _, DICT, _, COMPLEX, ARRAY, NDARRAY, ENUM, CLASS, DEFINE = range(12)
+RECORD = 16
+COLOR = (DEFINE, f"{__name__}:Color", "GREEN: 2\nRED: 1")
+
+
 @pytest.mark.parametrize(
-    ("hint", "tokens"),
+    "tokens",
     [
-        (tuple[int, ...], (1 << 62, 1, 2)),
-        (tuple[int, ...], (1 << 63, 1, 2)),
-        (tuple[int, ...], ((1 << 64) - 1,)),
-        (tuple[tuple[int, ...], ...], (2, 0, 1 << 40)),
-        (dict[str, int], (1 << 40, "a", 1)),
-        (dict[str, int], (2, "a", 1, "a", 2)),
-        (npt.NDArray[np.float64], (2, False, 1 << 40, 1 << 40, b"")),
-        (npt.NDArray[np.float64], (2, False, 0, 1 << 40, b"")),
-        (npt.NDArray[np.float64], (100, *([False] + [1] * 99), b"12345678")),
-        (npt.NDArray[np.float64], (1, False, -1, b"")),
-        (tuple[int, ...], (-1,)),
-        (int, (b"\1" * 100_000,)),
-        (Color, (7,)),
-        (type[Square], (99,)),
-        (bool, (1,)),
-        (int, (1.0,)),
-        (float, (None,)),
+        (TUPLE, 1 << 62, 1.0, 2.0),
+        (TUPLE, (1 << 64) - 1),
+        (TUPLE, 2, TUPLE, 0, TUPLE, 1 << 40),
+        (TUPLE, -1),
+        (TUPLE, None),
+        (DICT, 1 << 40, "a", 1.0),
+        (DICT, 2, "a", 1.0, "a", 2.0),
+        (DICT, 1, DICT, 0, None),
+        (NDARRAY, "float64", "C", 2, 1 << 40, 1 << 40, b""),
+        (NDARRAY, "float64", "C", 2, 0, 1 << 40, b""),
+        (NDARRAY, "float64", "C", 100, *([1] * 100), b"12345678"),
+        (NDARRAY, "float64", "C", 1, -1, b""),
+        (NDARRAY, "object", "C", 1, 1, b"12345678"),
+        (ARRAY, "q", b"123"),
+        (ARRAY, "u", 7),
+        (COMPLEX, "1", "2"),
+        (INT, b"\1" * 100_000),
+        (INT, 1.0),
+        (*COLOR, ENUM, 0, 7),
+        (*COLOR, ENUM, 1, 1),
+        (*COLOR, CLASS, 99),
+        (*COLOR, CLASS, -1),
+        (RECORD,),
+        (15,),
+        (-1,),
+        (1 << 63,),
+        (None, None),
     ],
 )
-def test_given_counts_and_references_that_lie_then_nothing_is_allocated_for_them(
-    hint: Any, tokens: tuple[object, ...]
-) -> None:
+def test_given_counts_and_references_that_lie_then_nothing_is_allocated_for_them(tokens: tuple[object, ...]) -> None:
     with pytest.raises(RecordingError):
-        Schema({"value": hint}).decode("value", stream(*tokens))
+        decode_value(stream(*tokens))
 
 
-def test_given_references_that_multiply_then_no_constructor_walks_over_all_of_them() -> None:
-    class Holder:
-        def __init__(self, rows: tuple[tuple[tuple[int, ...], ...], ...]):
-            raise AssertionError("it was given all of it")
+class Holder:
+    """Its constructor may walk over all that it is given."""
 
-    Holder.__init__.__annotations__["rows"] = tuple[tuple[tuple[int, ...], ...], ...]
-    inner = (1000, 1000, *range(1000), *[-1] * 999)
-    # a thousand rows that are one row of a thousand rows that are one: 10^9 numbers in 4 kB
-    bomb = (0, 1000, *inner, *[-1] * 999)
+    def __init__(self, rows: tuple[tuple[tuple[int, ...], ...], ...]):
+        raise AssertionError("it was given all of it")
+
+
+@pytest.mark.parametrize("before", [(DEFINE, f"{__name__}:Holder", None, RECORD), (DICT, 1)], ids=["record", "key"])
+def test_given_references_that_multiply_then_nobody_walks_over_all_of_them(before: tuple[object, ...]) -> None:
+    text = encoding._get_layout(Holder).text
+    inner = (TUPLE, 1000, TUPLE, 1000, *map(float, range(1000)), *[-1] * 999)
+    # a thousand rows that are one row of a thousand rows that are one: 10^9 numbers in 12 kB
+    bomb = (TUPLE, 1000, *inner, *[-2] * 999)
     with pytest.raises(RecordingError, match="of more than"):
-        Schema({"value": Holder}).decode("value", stream(*bomb))
+        decode_value(stream(*(text if each is None else each for each in before), *bomb, None))

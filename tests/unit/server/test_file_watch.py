@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.server.supervision.file_watch import MAX_WAIT_S, POLL_S, FileWatcher
+from modelserver.server.supervision import MAX_WAIT_S, POLL_S, FileWatcher
 
 
 class Sleeper:

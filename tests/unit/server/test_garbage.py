@@ -12,8 +12,8 @@ from support_cart import drive, localizer, process_all
 from support_samples import START, ScriptedLocalizer, imu, start_core
 
 from modelserver.messages import GetExplanation, GetTransformation, GetTransformations, RequestHeader
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.wire.codec import encode

@@ -14,12 +14,11 @@ from support_wire import EXAMPLES
 import mslcm
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.messages import Rejected, Sample, SwitchMode
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
 from modelserver.server.daemon import log_mode_switch
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.ingress import SensorChannel
+from modelserver.server.ingress import COMMANDS, CommandVerifier, SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.signed_commands import COMMANDS, CommandVerifier
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import decode, encode
 

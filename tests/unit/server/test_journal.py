@@ -14,12 +14,11 @@ from support_journal import SMALL, JournalRig
 from modelserver.config.vehicle_file import JournalConfig, VehicleConfig
 from modelserver.core import Instant
 from modelserver.messages import GetBodyList, HealthWarning, Rejected, RequestHeader, Tick
-from modelserver.server.journal import queue as journal
+from modelserver.server import journal
+from modelserver.server.journal import JournalQueue
 from modelserver.server.journal import writer as journal_writer
-from modelserver.server.journal.queue import JournalQueue
-from modelserver.server.journal.segments import Ring, Segment
 from modelserver.server.journal.verify import verify
-from modelserver.server.journal.writer import RETRY_S, get_journal_directory, make_writer
+from modelserver.server.journal.writer import RETRY_S, Ring, Segment, get_journal_directory, make_writer
 from modelserver.server.loop import Loop
 from modelserver.wire.journal import JournalRecord, RecordKind, SegmentHead, read_segment
 
@@ -285,8 +284,8 @@ def test_given_a_vehicle_file_when_the_writer_is_made_then_it_holds_the_files_an
     _, writer = made
     assert writer._ring.directory == tmp_path / "box"
     assert (writer._ring.max_bytes, writer._ring.segment_bytes) == (64 << 20, 8 << 20)
-    assert [Path(name).name for name, _ in writer._context.files] == ["vehicle.yaml", "geometry.yaml"]
-    assert writer._context.facts["vehicle"] == "cart"
+    assert [Path(name).name for name, _ in writer._files] == ["vehicle.yaml", "geometry.yaml"]
+    assert writer._facts["vehicle"] == "cart"
 
 
 def test_given_a_default_loop_then_it_writes_no_journal(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 from support_journal import SMALL, JournalRig
 
 from modelserver.errors import RecordingError
-from modelserver.server.journal.segments import NEWEST_NAME, NewestMarker, read_newest, seal_segment
 from modelserver.server.journal.verify import VerificationReport, VerificationResult, verify
+from modelserver.server.journal.writer import NEWEST_NAME, NewestMarker, read_newest, seal_segment
 from modelserver.signing.signatures import Key
 from modelserver.wire.journal import (
     JournalRecord,
@@ -38,10 +38,10 @@ def journal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """A journal of five segments or more and two runs, and its key."""
     folder = tmp_path_factory.mktemp(request.param)
     key = KEY if request.param == "keyed" else None
-    first = JournalRig(folder, SMALL, segment_bytes=57_000, run="one", key=key)
+    first = JournalRig(folder, SMALL, segment_bytes=75_000, run="one", key=key)
     first.drive(0.85)
     first.finish()
-    second = JournalRig(folder, SMALL, segment_bytes=57_000, run="two", key=key, clock=first.clock)
+    second = JournalRig(folder, SMALL, segment_bytes=75_000, run="two", key=key, clock=first.clock)
     second.drive(0.6)
     assert 5 <= len(second.finish()) <= 14
     return second.directory, key
@@ -172,7 +172,7 @@ def test_given_a_segment_of_another_journal_of_the_same_key_then_it_is_found(
     copy_journal: tuple[Path, Key | None], tmp_path: Path
 ) -> None:
     directory, key = copy_journal
-    other = JournalRig(tmp_path, SMALL, segment_bytes=57_000, run="one", key=key)
+    other = JournalRig(tmp_path, SMALL, segment_bytes=75_000, run="one", key=key)
     other.directory, other.ring.directory = tmp_path / "other", tmp_path / "other"
     other.drive(0.85)
     shutil.copy(other.finish()[2], sorted(directory.glob("journal-*.lcm"))[2])
@@ -240,14 +240,14 @@ def test_given_another_key_then_nothing_is_authentic(tmp_path: Path, key: Key) -
 def test_given_a_service_that_was_killed_then_what_is_not_closed_is_reproduced_and_not_authentic(
     tmp_path: Path,
 ) -> None:
-    rig = JournalRig(tmp_path, SMALL, segment_bytes=57_000, key=KEY)
+    rig = JournalRig(tmp_path, SMALL, segment_bytes=75_000, key=KEY)
     rig.drive(0.9)
     rig.ring.release()
     found = looked_at(rig.directory, KEY)
     assert damages(found) == ""
     assert (found.result, found.unsealed, found.genuine) == (VerificationResult.REPRODUCED, 1, found.segments - 1)
     # the next run continues behind it, without the missing seal
-    second = JournalRig(tmp_path, SMALL, segment_bytes=57_000, run="two", key=KEY, clock=rig.clock)
+    second = JournalRig(tmp_path, SMALL, segment_bytes=75_000, run="two", key=KEY, clock=rig.clock)
     second.drive(0.2)
     second.finish()
     found = looked_at(second.directory, KEY)

@@ -10,9 +10,14 @@ from support_journal import SMALL, JournalRig
 
 from modelserver.messages import PoseAnswer
 from modelserver.server.journal import verify as journal_verify
-from modelserver.server.journal.comparison import Deviation, compute_deviation, diff_messages
-from modelserver.server.journal.replay import ReplayLoop
-from modelserver.server.journal.verify import VerificationResult, verify
+from modelserver.server.journal.verify import (
+    Deviation,
+    ReplayLoop,
+    VerificationResult,
+    compute_deviation,
+    diff_messages,
+    verify,
+)
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.codec import decode, encode

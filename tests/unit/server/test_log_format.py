@@ -20,7 +20,6 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.log import (
     JournalHandler,
     PlainFormatter,
-    PriorityFormatter,
     RateLimitedLog,
     encode_journal_entry,
     get_priority,
@@ -70,17 +69,11 @@ def test_given_a_message_of_several_lines_then_those_after_the_first_are_indente
     )
 
 
-def test_given_a_stream_to_the_journal_then_every_line_has_the_priority() -> None:
-    assert PriorityFormatter().format(record("one\ntwo", cause="GPS:malformed")) == (
-        "<4>modelserver.server.loop: one cause=GPS:malformed\n<4>    two"
-    )
-
-
 def test_given_a_trace_then_what_is_in_it_cannot_pass_for_a_line_of_its_own() -> None:
-    text = PriorityFormatter().format(record("failed", logging.ERROR, trace=True))
+    text = PlainFormatter().format(record("failed", logging.ERROR, trace=True))
     assert "\x1b" not in text
-    assert all(line.startswith("<3>    ") for line in text.splitlines()[1:])
-    assert "<3>    cause=forged" in text
+    assert all(line.startswith("    ") for line in text.splitlines()[1:])
+    assert "\n    cause=forged" in text
 
 
 @given(st.text())
@@ -133,11 +126,11 @@ def test_given_a_journal_that_does_not_keep_up_then_nothing_waits_and_the_loss_i
     assert stream.getvalue() == ""
 
 
-def test_given_no_journal_then_the_lines_go_to_the_stream_with_priorities(tmp_path: Path) -> None:
+def test_given_no_journal_then_the_lines_go_to_the_stream(tmp_path: Path) -> None:
     handler = JournalHandler(stream := io.StringIO(), "modelserver", str(tmp_path / "nothing"))
     handler.emit(record("one"))
     handler.close()
-    assert stream.getvalue() == "<4>modelserver.server.loop: one\n"
+    assert stream.getvalue() == "WARNING modelserver.server.loop: one\n"
 
 
 def test_given_a_message_that_is_too_long_then_it_is_cut(journal: tuple[socket.socket, str]) -> None:

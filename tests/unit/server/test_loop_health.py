@@ -7,8 +7,8 @@ from dataclasses import replace
 from support_samples import START, ScriptedLocalizer, start_core
 
 from modelserver.messages import Gauges, Health
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.wire.codec import decode
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import BusError
-from modelserver.server.diagnostics import machine
-from modelserver.server.diagnostics.machine import read_gauges, read_resident_bytes
+from modelserver.server import diagnostics as machine
+from modelserver.server.diagnostics import read_gauges, read_resident_bytes
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.urls import UdpAddress
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.server.supervision.systemd import MAX_STATUS_LENGTH, Notifier, get_watchdog_ns, open_manager_socket
+from modelserver.server.supervision import MAX_STATUS_LENGTH, Notifier, get_watchdog_ns, open_manager_socket
 
 SECOND = 1_000_000_000
 

@@ -32,7 +32,7 @@ from modelserver.messages import (
 )
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.offline import CSV_HEADER, OfflineRun, TrackRow
-from modelserver.server.stamp_axis import LOOKED_AT
+from modelserver.server.recordings import LOOKED_AT
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent

@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 from support_journal import OPEN, JournalRig
 
-from modelserver.server.journal.comparison import TOLERANCE
-from modelserver.server.journal.verify import VerificationResult
+from modelserver.server.journal.verify import TOLERANCE, VerificationResult
 
 ROOT = Path(__file__).resolve().parents[3]
 OTHER = os.environ.get("MODELSERVER_OTHER_PYTHON", "")

@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 from support_samples import ORIGIN
 
-from modelserver.server.persistence.directory import get_state_directory
-from modelserver.server.persistence.stores import OriginStore
+from modelserver.server.persistence import OriginStore, get_state_directory
 
 GOOD = {"version": 1, **dataclasses.asdict(ORIGIN)}
 
@@ -173,7 +172,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from modelserver.earth.geodesy import make_origin
-from modelserver.server.persistence.stores import OriginStore
+from modelserver.server.persistence import OriginStore
 def kill(*_): os.kill(os.getpid(), signal.SIGKILL)
 if sys.argv[2] == "sync": os.fsync = kill
 else: Path.replace = kill

@@ -11,23 +11,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from support_journal import SMALL
-from support_journal import JournalRig as Journalled
 from support_persistence import PERSISTED
 from support_samples import VEHICLE, write_vehicle
-from support_signing import write_test_key
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
-from modelserver.server.clock import Clock
-from modelserver.server.journal.segments import Ring
-from modelserver.server.journal.writer import make_writer
-from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
-from modelserver.server.persistence.stores import PersistentStores, open_stores
+from modelserver.server.persistence import FileLock, LockHeldError, PersistentStores, describe_error, open_stores
 
 ORIGIN = make_origin(500_000.0, 5_500_000.0, 700.0, 12, True)
 NOW = Instant(PERSISTED.monotonic_ns, PERSISTED.utime)
@@ -102,7 +94,7 @@ def test_given_a_directory_that_cannot_be_used_then_no_lock_keeps_anybody_off(tm
 HOLDING = """
 import sys
 from pathlib import Path
-from modelserver.server.persistence.directory import FileLock
+from modelserver.server.persistence import FileLock
 FileLock(Path(sys.argv[1])).acquire()
 print("held", flush=True)
 sys.stdin.read()
@@ -215,43 +207,11 @@ def test_given_a_user_without_a_home_then_nothing_is_persisted_and_that_is_logge
 ) -> None:
     from dataclasses import replace
 
-    from modelserver.server.persistence import stores
+    from modelserver.server import persistence as stores
 
     monkeypatch.setattr(stores, "get_state_directory", lambda named: None)
     open_stores(replace(config, state_directory=""), localizes=True).close()
     assert "no home directory" in caplog.text
-
-
-def test_given_a_state_directory_of_another_service_then_no_journal_is_written_in_it(tmp_path: Path) -> None:
-    holder = FileLock(tmp_path / "lock-cart")
-    holder.acquire()
-    within = FileLock(tmp_path / "lock-cart")
-
-    def ring(directory: Path, *bounds: Any) -> Ring:
-        return Ring(directory, *bounds, within)
-
-    rig = Journalled(tmp_path, SMALL, ring=ring)
-    rig.drive(0.2)
-    assert f"(process {os.getpid()}) writes there already" in rig.loop.state.warnings["journal"]
-    assert not rig.directory.exists()
-    holder.release()
-    rig.drive(6.0)
-    assert "journal" not in rig.loop.state.warnings
-    assert rig.finish()
-    within.release()
-
-
-@pytest.mark.parametrize(("directory", "within"), [("state/box", True), ("box", False)])
-def test_given_a_journal_elsewhere_then_the_state_directory_is_no_matter(
-    tmp_path: Path, directory: str, within: bool
-) -> None:
-    write_test_key(tmp_path)
-    config = load_config(write_vehicle(tmp_path, f"{VEHICLE}journal: {{directory: {directory}}}\n"))
-    store = open_stores(config, localizes=False)
-    made = make_writer(config, "", Clock(), store.lock)
-    assert made is not None
-    assert (made[1]._ring._outer_lock is store.lock) == within
-    store.close()
 
 
 # --- messages -------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from modelserver.server.clock import FakeClock
-from modelserver.server.playback import Player
+from modelserver.server.recordings import Player
 from modelserver.wire.eventlog import LogEvent
 
 

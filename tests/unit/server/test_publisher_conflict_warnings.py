@@ -10,8 +10,8 @@ from support_samples import START, ScriptedLocalizer, imu, start_core, write_veh
 from modelserver.config.vehicle_file import load_config
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS
 from modelserver.messages import Health, JointSample, JointsSample, SensorHeader
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode

@@ -35,6 +35,7 @@ from modelserver.messages import (
     JointSample,
     JointsSample,
     LoadModel,
+    PublishSnapshot,
     ReloadModel,
     ReloadReply,
     RequestHeader,
@@ -43,9 +44,9 @@ from modelserver.messages import (
     SnapshotPart,
 )
 from modelserver.server import reloading
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.loop import MAX_RELOADS, Hooks, Loop, LoopSettings, SnapshotEncoder
+from modelserver.server.loop import MAX_RELOADS, Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, PollReload, read_geometry
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode, encode
@@ -458,22 +459,36 @@ def counting(size: int) -> tuple[Callable[[Model], bytes], list[int]]:
     return write, calls
 
 
+def make_loop(write: Callable[[Model], bytes]) -> tuple[Loop, FakeBus]:
+    clock = FakeClock(START)
+    bus = FakeBus(clock)
+    return Loop(bus, clock, start_core(), LoopSettings(20_000_000), Hooks(snapshot=write)), bus
+
+
+def publish_snapshot(loop: Loop, bus: FakeBus, utime: int) -> list[SnapshotPart]:
+    bus.published.clear()
+    loop.send((PublishSnapshot(utime),))
+    return [decode("model_snapshot_t", data) for data in bus.get_published("MODEL_SNAPSHOT")]
+
+
 @pytest.mark.parametrize("size", [1, PART_BYTES, PART_BYTES + 1, 5 * PART_BYTES])
 def test_given_snapshots_of_one_model_then_its_bytes_are_written_once_and_parts_carry_their_instant(size: int) -> None:
     write, calls = counting(size)
-    writer, state = SnapshotEncoder(write), start_core()
-    first, second = writer.encode_parts(state, START), writer.encode_parts(state, START + S)
+    loop, bus = make_loop(write)
+    first, second = publish_snapshot(loop, bus, START), publish_snapshot(loop, bus, START + S)
     assert len(calls) == 1
     assert {part.utime for part in first} == {START}
     assert second == [replace(part, utime=START + S) for part in first]
     assert b"".join(part.data for part in second) == bytes(size)
-    assert {(part.parts, part.model_revision) for part in first} == {(-(-size // PART_BYTES), state.model.revision)}
+    revision = loop.state.model.revision
+    assert {(part.parts, part.model_revision) for part in first} == {(-(-size // PART_BYTES), revision)}
 
 
 def test_given_another_model_then_its_bytes_are_encoded_again() -> None:
     write, calls = counting(10)
-    writer, state = SnapshotEncoder(write), start_core()
-    writer.encode_parts(state, START)
+    loop, bus = make_loop(write)
+    publish_snapshot(loop, bus, START)
     # compared by identity, which is cheap: the current model or another one
-    writer.encode_parts(state._replace(view=state.view._replace(model=cart())), START)
+    loop.state = loop.state._replace(view=loop.state.view._replace(model=cart()))
+    publish_snapshot(loop, bus, START)
     assert len(calls) == 2

@@ -20,12 +20,11 @@ from modelserver.messages import (
     RequestHeader,
     TimeQuery,
 )
-from modelserver.server.bus import Inboxes
+from modelserver.server.bus import FakeBus, FakeInbox, Inboxes
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus, FakeInbox
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.scheduler import RunDelay
+from modelserver.server.requests import CONTENTION_NS
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.receiver import Sender
@@ -93,14 +92,12 @@ class TimedBus(FakeBus):
 class Rig:
     """A loop on a timed bus, with ticks at 100 Hz."""
 
-    def __init__(
-        self, answer_s: float = 200e-6, run_delay: Callable[[], RunDelay | None] = lambda: None, **limits: Any
-    ):
+    def __init__(self, answer_s: float = 200e-6, **limits: Any):
         self.clock = FakeClock(START, BEGIN_NS)
         self.bus = TimedBus(self.clock, answer_s)
         state = start_core(ScriptedLocalizer())
         loop_settings = LoopSettings(10 * MS, {"IMU": SensorChannel("imu_t")}, limits=LimitsConfig(**limits))
-        self.loop = Loop(self.bus, self.clock, state, loop_settings, Hooks(run_delay=run_delay))
+        self.loop = Loop(self.bus, self.clock, state, loop_settings, Hooks())
         for n in range(90):
             self.bus.sensors.put("IMU", encode(imu(START - 1_000_000 + n * 10_000)))
 
@@ -191,15 +188,40 @@ def test_given_an_idle_service_then_one_client_is_never_held_back() -> None:
 
 
 @pytest.mark.parametrize(("hz", "share", "rate"), [(250.0, 0.2, 1000.0), (250.0, 0.01, 250.0)])
-def test_given_a_processor_that_others_want_then_the_client_gets_the_share_of_the_time_and_its_rate_at_least(
+def test_given_samples_that_wait_then_the_client_gets_the_share_of_the_time_and_its_rate_at_least(
     hz: float, share: float, rate: float
 ) -> None:
-    # half of the time the thread was ready to run and had no processor; a reply takes 0.2 ms
-    delay = lambda: RunDelay((rig.clock.monotonic_ns() - BEGIN_NS) // 2, 0)  # noqa: E731
-    rig = Rig(run_delay=delay, client_hz=hz, request_share=share)
+    # more samples wait in every pass than it handles; a reply takes 0.2 ms
+    rig = Rig(client_hz=hz, request_share=share)
+    run_once = rig.loop.run_once
+
+    def run_with_backlog() -> None:
+        rig.loop._requests.report_backlog(rig.clock.monotonic_ns())
+        run_once()
+
+    rig.loop.run_once = run_with_backlog  # type: ignore[method-assign]
     begin = rig.seconds
     count = len(lone_client(rig, 4000))
     assert count / (rig.seconds - begin) == pytest.approx(rate, rel=0.15)
+
+
+def test_given_late_ticks_then_two_within_a_while_are_contention_and_that_ends() -> None:
+    rig = Rig()
+    requests = rig.loop._requests
+
+    def is_contended(now_ns: int) -> bool:
+        requests.serve(now_ns, now_ns)
+        return requests._scheduler._contended
+
+    assert not is_contended(BEGIN_NS)
+    requests.report_late_tick(BEGIN_NS)
+    # the machine may have been suspended
+    assert not is_contended(BEGIN_NS)
+    requests.report_late_tick(BEGIN_NS + CONTENTION_NS)
+    assert not is_contended(BEGIN_NS + CONTENTION_NS)
+    requests.report_late_tick(again := BEGIN_NS + CONTENTION_NS + 1)
+    assert is_contended(again + CONTENTION_NS - 1)
+    assert not is_contended(again + CONTENTION_NS)
 
 
 def long_request(name: str = "REPLY_LONG", pairs: int = 64) -> GetTransformations:
@@ -288,7 +310,7 @@ def test_given_a_reply_channel_that_may_not_be_used_then_a_long_request_is_count
 
 
 def test_given_a_flood_under_the_reply_channel_of_another_client_then_that_one_gets_its_replies() -> None:
-    rig = Rig(run_delay=lambda: None)
+    rig = Rig()
     victim, stranger = ("10.0.0.1", 4000), ("10.0.0.9", 5000)
     replies: list[int] = []
     rig.bus.on_reply = lambda channel, data: replies.append(

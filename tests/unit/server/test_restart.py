@@ -17,9 +17,8 @@ from support_persistence import PERSISTED, POSE, UTIME
 
 from modelserver.core import Instant
 from modelserver.messages import PersistedState, RestoredState
-from modelserver.server.persistence import stores as restart
-from modelserver.server.persistence.directory import write_atomically
-from modelserver.server.persistence.stores import (
+from modelserver.server import persistence as restart
+from modelserver.server.persistence import (
     MAX_BYTES,
     PersistedStateError,
     StateStore,
@@ -27,6 +26,7 @@ from modelserver.server.persistence.stores import (
     decode_state,
     encode_state,
     read_boot_id,
+    write_atomically,
 )
 
 NOW = Instant(PERSISTED.monotonic_ns + 7_000_000_000, UTIME + 7_000_000)
@@ -117,28 +117,29 @@ def _nan() -> bytes:
         (encode_state(PERSISTED).replace(b"56.25", b"56.26", 1), "the checksum is wrong"),
         (encode_state(PERSISTED) + b"x", "the checksum is wrong"),
         (b"x" * (MAX_BYTES + 1), f"the file is larger than {MAX_BYTES} bytes"),
-        (_nan(), "it contains NaN"),
-        (_pack({}), "unknown or missing keys"),
-        (_content(more=1), "unknown or missing keys"),
+        (_nan(), "JSON is malformed"),
+        (_pack({}), "missing required field `vehicle`"),
+        (_content(more=1), "unknown field `more`"),
         (_content(names=["a"] * 3), "names: expected 15 to 100"),
-        (_content(names=[7] * 21), "names: expected texts"),
-        (_content(gyro_bias=[0, 0]), "gyro_bias: expected 3 numbers"),
-        (_content(gyro_bias=[0, 0, True]), "gyro_bias: expected 3 numbers"),
-        (_content(gyro_bias=[0, 0, 1e300]), "gyro_bias: expected 3 numbers"),
-        (_content(gyro_bias=[0, 0, 10**400]), "gyro_bias: expected 3 numbers"),
+        (_content(names=[7] * 21), "Expected `str`, got `int` - at `$.names[0]`"),
+        (_content(gyro_bias=[0, 0]), "length 3 - at `$.gyro_bias`"),
+        (_content(gyro_bias=[0, 0, True]), "Expected `float`, got `bool` - at `$.gyro_bias[2]`"),
+        (_content(gyro_bias=[0, 0, 1e300]), "<= 1000000000.0 - at `$.gyro_bias[2]`"),
+        (_content(gyro_bias=[0, 0, 10**400]), "out of range - at `$.gyro_bias[2]`"),
         (_content(covariance=[0.0] * 5), "covariance: expected 441 numbers"),
         (_content(covariance=[-1.0] * 441), "covariance: negative variance"),
-        (_content(utime=-1), "utime: expected a count"),
-        (_content(utime=1.5), "utime: expected a count"),
-        (_content(vehicle=7), "vehicle: expected a text"),
-        (_content(vehicle="x" * 300), "vehicle: expected a text"),
-        (_content(pose=[]), "unknown or missing keys"),
+        (_content(utime=-1), "Expected `int` >= 0 - at `$.utime`"),
+        (_content(utime=1.5), "Expected `int`, got `float` - at `$.utime`"),
+        (_content(vehicle=7), "Expected `str`, got `int` - at `$.vehicle`"),
+        (_content(vehicle="x" * 300), "of length <= 256 - at `$.vehicle`"),
+        (_content(pose=[]), "at `$.pose`"),
         (_pose(latitude_deg=91.0), "latitude 91, longitude -111.18: out of range"),
         (_pose(attitude=[1.0, 1.0, 0.0, 0.0]), "attitude: expected a unit quaternion"),
         (_pose(correlated_error_variance=[-1.0, 0.0, 0.0]), "gnss_noise_inflation: out of range"),
-        (_pose(wheels=[["left"]]), "wheels: expected pairs"),
-        (_pose(wheels=[["left", "1"]]), "wheels: expected pairs"),
-        (_pose(wheels={}), "wheels: expected at most 64 pairs"),
+        (_pose(wheels=[["left"]]), "length 2 - at `$.pose.wheels[0]`"),
+        (_pose(wheels=[["left", "1"]]), "Expected `float`, got `str` - at `$.pose.wheels[0][1]`"),
+        (_pose(wheels=[["left", 1.0]] * 65), "length <= 64 - at `$.pose.wheels`"),
+        (_pose(wheels={}), "Expected `array`, got `object` - at `$.pose.wheels`"),
     ],
 )
 def test_given_an_invalid_file_then_the_start_is_cold_with_a_reason(store: StateStore, data: bytes, why: str) -> None:
@@ -263,7 +264,7 @@ def test_given_a_unit_without_proc_sys_then_the_boot_id_comes_from_its_environme
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As systemd's specifier %b writes it, without hyphens; the same id as outside of the unit."""
-    monkeypatch.setattr("modelserver.server.persistence.stores.BOOT_ID", tmp_path / "hidden")
+    monkeypatch.setattr("modelserver.server.persistence.BOOT_ID", tmp_path / "hidden")
     for named, found in (
         ("143ed63e8a1544ff9db3048c46529278", "143ed63e-8a15-44ff-9db3-048c46529278"),
         ("", ""),

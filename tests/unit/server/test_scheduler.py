@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.messages import GetBodyList, RequestHeader
-from modelserver.server.requests.handler import client_of
-from modelserver.server.requests.scheduler import (
+from modelserver.server.requests import client_of
+from modelserver.server.scheduler import (
     CLIENT_IDLE_NS,
     DEFERRED_PER_CLIENT,
     DEFERRED_TOTAL,

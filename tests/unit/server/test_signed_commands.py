@@ -23,12 +23,11 @@ from modelserver.messages import (
     SetStateVector,
     SwitchMode,
 )
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
-from modelserver.server.ingress import SensorChannel
+from modelserver.server.ingress import CommandVerifier, SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import PollReload
-from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.signing.signatures import Key
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode

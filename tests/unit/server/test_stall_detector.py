@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, StallDetector
+from modelserver.server.supervision import STALL_TIMEOUT_S, StallDetector
 
 MS = 1_000_000
 TIMEOUT_MS = round(STALL_TIMEOUT_S * 1000)

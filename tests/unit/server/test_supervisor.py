@@ -11,12 +11,12 @@ from support_samples import START, ScriptedLocalizer, cart, gps, imu, start_core
 from modelserver.core import CoreState
 from modelserver.core.commands import ModelLoaded
 from modelserver.messages import Estimate, HealthWarning, Invalid, LoadModel, ReloadModel, RequestHeader
+from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import PollReload
-from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
+from modelserver.server.supervision import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
 from modelserver.wire.codec import encode
 
 HZ = 50
@@ -49,7 +49,7 @@ class Watched:
             self.clock,
             start_core(localizer),
             settings,
-            Hooks(on_load=self.supervisor.wrap_load(self._load), on_tick=self.supervisor.on_tick),
+            Hooks(on_load=self._load, on_reload=self.supervisor.on_reload, on_tick=self.supervisor.on_tick),
         )
         self.answer = ModelLoaded(None, why="the file is empty")
 
@@ -159,15 +159,16 @@ def test_given_a_reload_that_fails_then_the_status_has_the_reason_until_one_succ
     watched.answer = ModelLoaded(None, cart())
     watched.loop.reload()
     watched.runs(2.0)
-    assert "refused" not in watched.status()
+    assert "reload failed" not in watched.status()
 
 
 def test_given_a_dry_run_that_fails_then_the_status_stays() -> None:
     watched = Watched()
-    load = watched.supervisor.wrap_load(lambda command, state: lambda state: ModelLoaded(command.request, why="no"))
-    load(LoadModel(ReloadModel(RequestHeader(1, "REPLY_TEST"), True)), watched.loop.state)(watched.loop.state)
+    request = ReloadModel(RequestHeader(1, "REPLY_TEST"), True)
+    watched.answer = ModelLoaded(request, why="no")
+    watched.loop.send((LoadModel(request),))
     watched.runs(2.0)
-    assert "refused" not in watched.status()
+    assert "reload failed" not in watched.status()
 
 
 def test_given_a_warning_then_the_status_has_it() -> None:
@@ -185,15 +186,9 @@ def test_given_an_invalid_pose_then_the_status_has_the_reason() -> None:
     assert "no valid pose: gravity indicates" in watched.status()
 
 
-def test_given_an_end_of_any_kind_then_it_is_notified() -> None:
+def test_given_an_end_then_it_is_notified() -> None:
     watched = Watched()
-
-    def end() -> None:
-        with watched.supervisor.notify_at_exit():
-            raise LookupError
-
-    with pytest.raises(LookupError):
-        end()
+    watched.supervisor._notifier.notify_stopping()
     assert watched.notifications == ["STOPPING=1\nSTATUS=stopping"]
 
 

@@ -35,12 +35,20 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.server.bus import Inboxes
-from modelserver.server.journal.segments import files_of, list_segments
-from modelserver.server.journal.verify import VerificationReport, verify
-from modelserver.server.requests.deferred import DeferredReply
+from modelserver.server.journal import encoding
+from modelserver.server.journal.verify import VerificationReport, files_of, verify
+from modelserver.server.journal.writer import list_segments
+from modelserver.server.requests import DeferredReply
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import encode_event
-from modelserver.wire.journal import JournalRecord, encode_batch, read_segment
+from modelserver.wire.journal import (
+    JournalRecord,
+    SegmentState,
+    encode_batch,
+    encode_head,
+    encode_state,
+    read_segment,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -274,6 +282,32 @@ def test_given_a_bit_of_one_pose_that_was_changed_when_verified_then_that_pose_i
     event = segment.read_bytes()[found.difference.at :]
     assert event[:4] == b"\xed\xa1\xda\x01"
     assert b"POSE" in event[:40]
+
+
+@pytest.mark.parametrize("value", [None, 7, "text", (), START], ids=repr)
+@pytest.mark.parametrize("where", ["lcm", "sensors", "vehicle", "limits", "history", "joints", "model", "settings"])
+def test_given_a_forged_state_of_other_types_when_verified_then_it_is_damage_at_most(
+    segment: Path, where: str, value: object
+) -> None:
+    data = segment.read_bytes()
+    items = list(read_segment(data))
+    (state,) = [each.data for each in items if isinstance(each, SegmentState)]
+    config, known = encoding.decode_run(state)
+    if where in ("history", "joints", "model", "settings"):
+        known = (
+            known._replace(view=known.view._replace(**{where: value}))
+            if where != "settings"
+            else known._replace(
+                settings=value  # type: ignore[arg-type]
+            )
+        )
+    else:
+        object.__setattr__(config, where, value)
+    begin = next(each.at for each in items if isinstance(each, JournalRecord))
+    head = next(each.facts for each in items if hasattr(each, "facts"))
+    forged = encode_head(head, START) + encode_state(encoding.encode_value((config, known)), START) + data[begin:]
+    segment.write_bytes(forged)
+    assert not verify([segment]).is_reproduced
 
 
 def test_given_a_sample_that_was_changed_when_verified_then_a_pose_after_it_differs(segment: Path) -> None:

@@ -14,8 +14,8 @@ from support_samples import GEOMETRY, VEHICLE, write_vehicle
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Problem, Severity
-from modelserver.server.diagnostics import bus_probe, machine
-from modelserver.server.diagnostics.checks import (
+from modelserver.server import diagnostics
+from modelserver.server.diagnostics import (
     BusFacts,
     ClockFacts,
     Diagnosis,
@@ -48,10 +48,10 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         from modelserver.version import __version__
 
         answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
-        monkeypatch.setattr(machine, "read_bus_facts", lambda url, delivery=None: facts)
-        monkeypatch.setattr(bus_probe, "discover_servers", lambda *_: answers)
+        monkeypatch.setattr(diagnostics, "read_bus_facts", lambda url, delivery=None: facts)
+        monkeypatch.setattr(diagnostics, "discover_servers", lambda *_: answers)
         monkeypatch.setattr(
-            machine.HostClockMonitor, "read_facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01)
+            diagnostics.HostClockMonitor, "read_facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01)
         )
         with pytest.raises(SystemExit) as ended:
             main(["doctor", *map(str, arguments)])

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any, cast
 
 from modelserver.messages import DriverPhase
-from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier
+from modelserver.server.supervision import STALL_TIMEOUT_S, Notifier
 from msdrivers.runner import Runner
 from mstools.commands.driver import DriverSupervision
 

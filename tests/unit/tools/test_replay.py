@@ -23,7 +23,7 @@ from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.earth.geodesy import origin_at
 from modelserver.messages import Decision, GetBodyList, GpsSample, PoseAnswer, RequestHeader, Verdict
-from modelserver.server import playback
+from modelserver.server import recordings as playback
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode

@@ -24,7 +24,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.server.stamp_axis import StampAxis
+from modelserver.server.recordings import StampAxis
 from mstools.report.findings import ReportFinding, collect_findings
 from mstools.report.replay_data import (
     ReplayData,

@@ -10,8 +10,7 @@ import typer
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
-from modelserver.server.supervision.file_watch import FileWatcher
-from modelserver.server.supervision.systemd import Notifier
+from modelserver.server.supervision import FileWatcher, Notifier
 from mstools.cli import main
 from mstools.deployment.service_start import ServiceStart, format_status
 

@@ -22,7 +22,7 @@ from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
-    from modelserver.server.diagnostics.checks import Diagnosis
+    from modelserver.server.diagnostics import Diagnosis
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
@@ -74,10 +74,16 @@ def check_exists(config: Path) -> None:
 def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
     """Return all findings. Takes two seconds, most of it waiting for replies."""
     from modelserver.config.vehicle_file import NOT_A_VEHICLE_FILE, load_config
-    from modelserver.server.diagnostics import checks
-    from modelserver.server.diagnostics.bus_probe import discover_servers, probe_delivery
-    from modelserver.server.diagnostics.checks import ERROR, OK, Diagnosis
-    from modelserver.server.diagnostics.machine import HostClockMonitor, read_bus_facts
+    from modelserver.server import diagnostics as checks
+    from modelserver.server.diagnostics import (
+        ERROR,
+        OK,
+        Diagnosis,
+        HostClockMonitor,
+        discover_servers,
+        probe_delivery,
+        read_bus_facts,
+    )
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import resolve_url
@@ -130,7 +136,7 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
 
 
 def get_exit_code(findings: Sequence[Diagnosis]) -> int:
-    from modelserver.server.diagnostics.checks import get_worst_level
+    from modelserver.server.diagnostics import get_worst_level
 
     return (0, 0, EXIT_WARNINGS, EXIT_ERRORS)[get_worst_level(findings)]
 

@@ -29,7 +29,7 @@ from mstools.terminal.output import escape, print_problems
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.messages import Sample
-    from modelserver.server.supervision.systemd import Notifier
+    from modelserver.server.supervision import Notifier
     from msdrivers.links import Link
     from msdrivers.raw_log import TimeSource
     from msdrivers.registry import DeviceKind
@@ -77,7 +77,7 @@ def command(
       modelserver driver gps -c config/raptor/vehicle.yaml
       modelserver driver imu -c vehicle.yaml --record-raw imu.raw
     """
-    from modelserver.server.supervision.systemd import Notifier
+    from modelserver.server.supervision import Notifier
     from mstools.deployment.service_start import ServiceStart
 
     check_log_options(log_level, log_format)
@@ -234,7 +234,7 @@ def run(
     vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: ServiceStart
 ) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
-    from modelserver.server.supervision.systemd import Notifier
+    from modelserver.server.supervision import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_driver
@@ -343,7 +343,7 @@ class DriverSupervision:
     """
 
     def __init__(self, runner: Runner[Any], notifier: Notifier, monotonic_ns: Callable[[], int] = time.monotonic_ns):
-        from modelserver.server.supervision.systemd import StallDetector
+        from modelserver.server.supervision import StallDetector
 
         self._runner, self._notifier, self._monotonic_ns = runner, notifier, monotonic_ns
         self._progress = StallDetector()

@@ -19,7 +19,7 @@ import typer
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.files.regular import check_links
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
-from modelserver.server.stamp_axis import LARGEST_DELAY_S, LOOKED_AT, StampAxis
+from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
 from mstools.recordings.bags import (
     CONVERTERS,

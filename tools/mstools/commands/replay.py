@@ -143,7 +143,7 @@ def replay_to_bus(
     """Publish a log on the bus: some channels, with an empty set all but a daemon's, with None all."""
     from modelserver.config.vehicle_file import load_config
     from modelserver.server.clock import Clock
-    from modelserver.server.playback import Player
+    from modelserver.server.recordings import Player
     from modelserver.wire.provider import open_lcm, resolve_url
 
     if not url and config is not None:

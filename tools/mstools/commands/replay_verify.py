@@ -27,8 +27,7 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
     `key`: the vehicle's key file. Without one authenticity is not verified, and a journal that is reproduced bit for
     bit exits with 0.
     """
-    from modelserver.server.journal.segments import files_of
-    from modelserver.server.journal.verify import VerificationResult, verify
+    from modelserver.server.journal.verify import VerificationResult, files_of, verify
     from modelserver.signing.key_files import read_keys
 
     keys = () if key is None else read_keys(key)
@@ -52,7 +51,7 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
 
 def format_result(found: VerificationReport, keyed: bool = False) -> list[str]:
     """Format the result; `keyed`: whether it was verified with a key."""
-    from modelserver.server.journal.comparison import TOLERANCE
+    from modelserver.server.journal.verify import TOLERANCE
 
     span = (found.last_utime - found.first_utime) * 1e-6
     text = [
@@ -124,7 +123,7 @@ def _format_difference(first: Difference) -> list[str]:
 
 def find_differences(was: bytes, now: bytes) -> list[tuple[str, str, str]]:
     """Return name and both values of the fields that differ; for a message that cannot be decoded its length."""
-    from modelserver.server.journal.comparison import diff_messages
+    from modelserver.server.journal.verify import diff_messages
 
     found = diff_messages(was, now)
     if found is None:

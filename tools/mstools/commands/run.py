@@ -36,7 +36,7 @@ def command(
     check_log_options(log_level, log_format)
     from modelserver.config.vehicle_file import load_config
     from modelserver.server import daemon
-    from modelserver.server.supervision.systemd import Notifier
+    from modelserver.server.supervision import Notifier
     from modelserver.server.vehicle import load_vehicle
     from mstools.deployment.service_start import ServiceStart
 

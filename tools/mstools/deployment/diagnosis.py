@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 from modelserver.config.vehicle_file import VehicleConfig, read_config_lines
 from modelserver.errors import KeyFileError, Problem, Severity
-from modelserver.server.diagnostics.checks import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
-from modelserver.server.journal.segments import LOCK_NAME, list_segments
-from modelserver.server.journal.writer import get_journal_directory, get_max_bytes
-from modelserver.server.persistence.directory import get_state_directory
+from modelserver.server.diagnostics import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
+from modelserver.server.journal.writer import LOCK_NAME, get_journal_directory, get_max_bytes, list_segments
+from modelserver.server.persistence import get_state_directory
 from modelserver.signing.key_files import find_group_writable_folder, read_keys
 from mstools.deployment.files import CREDENTIAL
 from mstools.deployment.plan import SERVICE, STATE, UNITS, VEHICLE
@@ -35,7 +34,7 @@ NO_JOURNAL: Final = "no journal is recorded"
 
 def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...]:
     """Return the findings on a vehicle file on this machine."""
-    from modelserver.server.diagnostics.machine import list_interfaces
+    from modelserver.server.diagnostics import list_interfaces
     from modelserver.server.vehicle import examine_vehicle
     from msdrivers.settings import SourceMap, read_drivers
 

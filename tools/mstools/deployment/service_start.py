@@ -9,8 +9,7 @@ from pathlib import Path
 import typer
 
 from modelserver.errors import ConfigError, GeometryError, Location, ModelServerError, Problem, Severity
-from modelserver.server.supervision.file_watch import FileWatcher
-from modelserver.server.supervision.systemd import Notifier
+from modelserver.server.supervision import FileWatcher, Notifier
 from mstools.terminal.output import print_problems
 
 

@@ -39,7 +39,7 @@ from modelserver.messages import (
     SensorHeader,
     WheelsSample,
 )
-from modelserver.server.stamp_axis import StampAxis
+from modelserver.server.recordings import StampAxis
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose

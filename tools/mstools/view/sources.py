@@ -16,7 +16,7 @@ from modelserver.formats.snapshot import ModelSnapshot
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
-from modelserver.server.stamp_axis import LOOKED_AT, measure
+from modelserver.server.recordings import LOOKED_AT, measure
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url

@@ -1,7 +1,8 @@
-"""systemd notification protocol (sd_notify(3)): READY, STATUS, RELOADING, STOPPING and the watchdog.
+"""Supervision by systemd: notification protocol (sd_notify(3)), watchdog, and the wait after a failed start.
 
-The protocol is one datagram of `KEY=value` lines to the socket that NOTIFY_SOCKET names. Without that variable, or if
-the socket is gone, nothing happens: a missing service manager is no error.
+The protocol is one datagram of `KEY=value` lines to the socket that NOTIFY_SOCKET names: READY, STATUS, RELOADING,
+STOPPING and the watchdog. Without that variable, or if the socket is gone, nothing happens: a missing service manager
+is no error.
 
 The watchdog is pinged only while the service makes progress (`StallDetector`). A restart helps a program that hangs or
 fails permanently, and nothing else. So only failures without any success in between count; a silent sensor or rejected
@@ -9,6 +10,10 @@ samples are no failure, since they would be the same after a restart.
 
 A server loop calls `ServiceSupervisor.on_tick` after each tick without error: the watchdog is not pinged either if the
 loop hangs or if ticks fail.
+
+A service manager restarts a failed service at once and repeatedly. With the same files it would fail for the same
+reason, at the cost of most of a processor and a full log. So after a failed start the service waits for a change of one
+of its files (`FileWatcher`), and then exits.
 """
 
 from __future__ import annotations
@@ -17,8 +22,9 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from modelserver.errors import quote
 from modelserver.server.log import escape_text
@@ -26,9 +32,7 @@ from modelserver.server.log import escape_text
 if TYPE_CHECKING:
     from modelserver.core import CoreState, Instant
     from modelserver.core.commands import ModelLoaded
-    from modelserver.messages import LoadModel
     from modelserver.server.clock import Clock
-    from modelserver.server.reloading import PollReload
 
 MAX_STATUS_LENGTH: Final = 400
 """Characters of a status line."""
@@ -224,44 +228,14 @@ class ServiceSupervisor:
         if self._stall_detector.is_progressing(successes, failures, now.monotonic_ns):
             notifier.ping_watchdog()
 
-    def wrap_load(
-        self, load: Callable[[LoadModel, CoreState], PollReload]
-    ) -> Callable[[LoadModel, CoreState], PollReload]:
-        """Wrap a function that reloads the geometry, so that the service manager is notified."""
-
-        def load_and_notify(command: LoadModel, state: CoreState) -> PollReload:
+    def on_reload(self, loaded: ModelLoaded | None) -> None:
+        """Notify that a reload of the geometry begins (None), or how it ended."""
+        if loaded is None:
             self._notifier.notify_reloading()
-            with self._notify_error():
-                poll = load(command, state)
-
-            def poll_and_notify(state: CoreState) -> ModelLoaded | None:
-                with self._notify_error():
-                    result = poll(state)
-                if result is not None:
-                    self._notifier.notify_reloaded()
-                    if command.request is None or not command.request.dry_run:
-                        self._reload_error = "" if result.model is not None else result.why
-                return result
-
-            return poll_and_notify
-
-        return load_and_notify
-
-    @contextlib.contextmanager
-    def _notify_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            self._notifier.notify_reloaded()
-            raise
-
-    @contextlib.contextmanager
-    def notify_at_exit(self) -> Iterator[None]:
-        """Notify the service manager when the block ends, also by an exception."""
-        try:
-            yield
-        finally:
-            self._notifier.notify_stopping()
+            return
+        self._notifier.notify_reloaded()
+        if loaded.request is None or not loaded.request.dry_run:
+            self._reload_error = "" if loaded.model is not None else loaded.why
 
 
 def format_status(state: CoreState, now: Instant, reload_error: str = "") -> str:
@@ -288,3 +262,56 @@ def _format_sensors(state: CoreState, now: Instant) -> str:
     active = len(ages) - len(silent)
     text = f"{active} sensor{'s' * (active != 1)} active"
     return text + (f", silent: {', '.join(silent[:MAX_SHOWN])}{', ...' * (len(silent) > MAX_SHOWN)}" if silent else "")
+
+
+MAX_WAIT_S: Final = 30.0
+"""Longest wait: the reason may not be a file's content."""
+
+POLL_S: Final = 0.25
+"""Period of checking the files."""
+
+FileStamp: TypeAlias = tuple[int, int, int, int] | None
+"""Identity of a file's content: device, inode, time of change (ns), size (bytes); None without a file."""
+
+
+def stat_file(path: Path) -> FileStamp:
+    """Return the stamp of a file; links are followed."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
+
+
+class FileWatcher:
+    """Detects changes of files since they were added; add them before they are read."""
+
+    def __init__(self, *paths: str | Path):
+        self._stamps: dict[Path, FileStamp] = {}
+        self.add(*paths)
+
+    def add(self, *paths: str | Path) -> None:
+        """Add files, also missing ones; a known file keeps its stamp."""
+        for path in map(Path, paths):
+            if path not in self._stamps:
+                self._stamps[path] = stat_file(path)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether a file has changed, is gone, or is new."""
+        return any(stat_file(path) != stamp for path, stamp in self._stamps.items())
+
+    def wait_for_change(
+        self,
+        seconds: float = MAX_WAIT_S,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> bool:
+        """Wait at most `seconds` until a file has changed; return whether one has."""
+        end_ns = monotonic_ns() + round(seconds * 1e9)
+        while not self.has_changed:
+            left = (end_ns - monotonic_ns()) * 1e-9
+            if left <= 0.0:
+                return False
+            sleep(min(POLL_S, left))
+        return True

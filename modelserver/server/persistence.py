@@ -1,7 +1,8 @@
-"""What a service persists in its state directory: the captured origin, and the state for a warm start.
+"""Persistence across restarts: the state directory, and what a service stores there.
 
-The state file is a line with magic, version and SHA-256, then JSON; anything else is rejected with a reason. It is
-written atomically by a thread, so that the loop never waits for the disk; only the newest state waits to be written.
+The directory has a lock, atomic files, and errors with their remedies. It holds the captured origin, and the state for
+a warm start: a line with magic, version and SHA-256, then JSON; anything else is rejected with a reason. It is written
+atomically by a thread, so that the loop never waits for the disk; only the newest state waits to be written.
 
 The age of a state is measured by the monotonic clock if the boot id is the same. After a reboot only the time of day is
 left, which may have been set: then the pose is dropped and the biases are used.
@@ -11,16 +12,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
+import fcntl
 import hashlib
 import json
 import logging
 import math
 import os
+import shlex
+import tempfile
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, Final, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 from uuid import UUID
 
 import msgspec
@@ -29,20 +33,196 @@ from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
 from modelserver.errors import quote
-from modelserver.files.regular import read_start
+from modelserver.files.regular import check_links, read_start
 from modelserver.messages import Origin, PersistedPose, PersistedState, RestoredState
 from modelserver.server.log import escape_text, start_in_background
-from modelserver.server.persistence.directory import (
-    FileLock,
-    LockHeldError,
-    describe_error,
-    get_state_directory,
-    to_file_name,
-    write_atomically,
-)
 from modelserver.transforms.so3 import Quaternion, Vector3
 
 log = logging.getLogger(__name__)
+
+FILE_MODE: Final = 0o640
+FOLDER_MODE: Final = 0o750
+
+MAX_PID_DIGITS: Final = 20
+"""Digits of the process id that are read from a lock file."""
+
+
+class LockHeldError(BlockingIOError):
+    """Another process, `pid` (0 = not known), holds the lock."""
+
+    def __init__(self, path: Path, pid: int = 0):
+        self.pid = pid
+        super().__init__(errno.EWOULDBLOCK, f"{self.holder} writes there already", str(path))
+
+    @property
+    def holder(self) -> str:
+        return f"another service (process {self.pid})" if self.pid else "another service"
+
+
+class FileLock:
+    """A lock file (flock(2)) with its holder's process id. Thread-safe; the kernel releases it when the process ends.
+
+    Releasing does not remove the file: then two processes could each lock one of the same name.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._file: int | None = None
+        self._mutex = threading.Lock()
+
+    def acquire(self) -> None:
+        """Acquire the lock if not held yet. Raises LockHeldError, OSError where the file cannot be opened."""
+        with self._mutex:
+            if self._file is not None:
+                # a directory that was removed and created again has another lock file
+                with contextlib.suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(self._file), self.path.stat()):
+                        return
+                self._close_file()
+            self._file = _open_locked(self.path)
+
+    def claim(self) -> None:
+        """Acquire the lock, creating its directory. Raises LockHeldError.
+
+        Other errors (disk full, read-only, missing) are ignored here: the write that follows reports them.
+        """
+        try:
+            create_directory(self.path.parent)
+            self.acquire()
+        except LockHeldError:
+            raise
+        except OSError:
+            return
+
+    def release(self) -> None:
+        with self._mutex:
+            self._close_file()
+
+    def _close_file(self) -> None:
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+
+def _open_locked(path: Path) -> int:
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, FILE_MODE)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pid = _read_pid(file)
+        os.close(file)
+        raise LockHeldError(path, pid) from None
+    except OSError:
+        os.close(file)
+        raise
+    # for people; the lock is valid without it, also on a full disk
+    with contextlib.suppress(OSError):
+        os.ftruncate(file, 0)
+        os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    return file
+
+
+def _read_pid(file: int) -> int:
+    with contextlib.suppress(OSError):
+        digits = os.pread(file, MAX_PID_DIGITS, 0).strip()
+        return int(digits) if digits.isdigit() else 0
+    return 0
+
+
+def get_state_directory(named: str) -> Path | None:
+    """Return the state directory: as named, else systemd's, else the user's; None without a home directory."""
+    if named:
+        return Path(named)
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    except RuntimeError:
+        return None
+    return Path(base) / "modelserver"
+
+
+def create_directory(path: Path) -> None:
+    """Create a directory and those above it, none of which others can write, whatever the umask. Raises OSError."""
+    check_links(path)
+    for each in (*reversed(path.parents), path):
+        if not each.exists():
+            each.mkdir(FOLDER_MODE, exist_ok=True)
+    if not path.is_dir():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
+def to_file_name(vehicle: str) -> str:
+    """Return a vehicle's name with the characters that are not safe in file names replaced by _."""
+    return "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file atomically and durably: after a power cut it has the old or the new content. Raises OSError.
+
+    Creates missing directories, and blocks until the data are on the disk.
+    """
+    temporary: Path | None = None
+    create_directory(path.parent)
+    try:
+        # temporary file, fsync, rename; then fsync the directory, or the new name may be lost
+        with tempfile.NamedTemporaryFile("wb", dir=path.parent, prefix=path.name, delete=False) as file:
+            temporary = Path(file.name)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        raise
+    sync_directory(path.parent)
+
+
+def sync_directory(path: Path) -> None:
+    """Sync the names in a directory to the disk. Raises OSError."""
+    directory = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+_FULL = "free space on its disk (df -h {place}), or set another {setting} in the vehicle file"
+_DENIED = (
+    "let the service's user write there (sudo chown -R {user} {place}), or set another {setting} in the vehicle file"
+)
+_BLOCKED = "move the file at this path away (ls -ld {place}), or set another {setting}"
+_READ_ONLY = (
+    "set a writable {setting} in the vehicle file (under systemd: /var/lib/modelserver), or mount its file system"
+)
+_REMEDIES: Final[Mapping[int | None, str]] = {
+    **dict.fromkeys((0, None), "the log has its traceback; report it"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), _FULL),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _DENIED),
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.ELOOP), _BLOCKED),
+    errno.EROFS: f"{_READ_ONLY} read-write",
+    errno.ENOENT: "it is created again",
+    errno.EWOULDBLOCK: "stop one of the two, or set another {setting} in the vehicle file of this one",
+}
+_OTHER_REMEDY = "see the kernel log (sudo dmesg | tail), or set another {setting} in the vehicle file"
+
+
+def describe_error(error: OSError, directory: Path, setting: str) -> str:
+    """Return cause and remedy of an error of a directory, in one line for people.
+
+    `setting` is the key of the vehicle file that names the directory. The cause is the system's message, with the path
+    where it is outside the directory (temporary names inside vary).
+    """
+    named, cause = str(error.filename or ""), error.strerror or str(error)
+    if named and not isinstance(error, LockHeldError) and not Path(named).is_relative_to(directory):
+        cause += f" ({named})"
+    place = shlex.quote(escape_text(str(directory)))
+    remedy = _REMEDIES.get(error.errno, _OTHER_REMEDY).format(place=place, setting=setting, user=os.geteuid())
+    return f"{escape_text(cause)}; {remedy}"
+
 
 VERSION: Final = 1
 """Version of both files."""
@@ -114,25 +294,27 @@ _Text = Annotated[str, msgspec.Meta(max_length=MAX_NAME_LENGTH)]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 _Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
-_FIELDS: Final[Mapping[Any, tuple[Any, str]]] = MappingProxyType(
-    {
-        str: (_Text, f"a text of at most {MAX_NAME_LENGTH} characters"),
-        int: (_Count, "a count"),
-        float: (_Number, f"a number within +-{_MAX_NUMBER:g}"),
-        Vector3: (tuple[_Number, _Number, _Number], "3 numbers"),
-        Quaternion: (tuple[_Number, _Number, _Number, _Number], "4 numbers"),
-        tuple[float, ...]: (tuple[_Number, ...], "numbers"),
-        tuple[str, ...]: (tuple[_Text, ...], f"texts of at most {MAX_NAME_LENGTH} characters"),
-        tuple[tuple[str, float], ...]: (
-            Annotated[list[Any], msgspec.Meta(max_length=MAX_WHEELS)],
-            f"at most {MAX_WHEELS} pairs",
-        ),
-        PersistedPose | None: (Any, ""),
-    }
-)
-"""What is valid for a field of each declared type, and its description."""
 
-_Row = TypeVar("_Row", PersistedState, PersistedPose)
+def _make_struct(row: type, types: Mapping[Any, Any]) -> Any:
+    """Return the class that checks a mapping for a NamedTuple: its keys, and of each field the type and the bounds."""
+    fields = [(name, types[hint]) for name, hint in get_type_hints(row).items()]
+    return msgspec.defstruct(row.__name__, fields, forbid_unknown_fields=True)
+
+
+_TYPES: Final = {
+    str: _Text,
+    int: _Count,
+    float: _Number,
+    Vector3: tuple[_Number, _Number, _Number],
+    Quaternion: tuple[_Number, _Number, _Number, _Number],
+    tuple[float, ...]: tuple[_Number, ...],
+    tuple[str, ...]: tuple[_Text, ...],
+    tuple[tuple[str, float], ...]: Annotated[tuple[tuple[_Text, _Number], ...], msgspec.Meta(max_length=MAX_WHEELS)],
+}
+"""What is valid for a field of each declared type."""
+
+_Pose: Final = _make_struct(PersistedPose, _TYPES)
+_State: Final = _make_struct(PersistedState, {**_TYPES, PersistedPose | None: _Pose | None})
 
 
 class PersistedStateError(ValueError):
@@ -154,7 +336,7 @@ def _pack(content: dict[str, Any]) -> bytes:
     return f"{_MAGIC} {VERSION} {hashlib.sha256(text).hexdigest()}\n".encode() + text + b"\n"
 
 
-def _unpack(data: bytes) -> dict[str, Any]:
+def _unpack(data: bytes) -> bytes:
     if not data:
         raise PersistedStateError("the file is empty")
     if len(data) > MAX_BYTES:
@@ -169,21 +351,16 @@ def _unpack(data: bytes) -> dict[str, Any]:
         )
     if not text.endswith(b"\n") or hashlib.sha256(text[:-1]).hexdigest().encode() != words[2]:
         raise PersistedStateError("it is damaged: the checksum is wrong")
+    return text
+
+
+def _parse_state(text: bytes) -> PersistedState:
     try:
-        content = json.loads(text, parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise PersistedStateError(f"it is damaged: {error}") from None
-    if not isinstance(content, dict):
-        raise PersistedStateError("it is no mapping")
-    return content
-
-
-def _reject_constant(word: str) -> float:
-    raise PersistedStateError(f"it contains {word}")
-
-
-def _parse_state(content: object) -> PersistedState:
-    state = _convert_fields(content, PersistedState)
+        found = msgspec.json.decode(text, type=_State)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise PersistedStateError(str(error)) from None
+    pose = None if found.pose is None else _check_pose(PersistedPose(*msgspec.structs.astuple(found.pose)))
+    state = PersistedState(*msgspec.structs.astuple(found))._replace(pose=pose)
     count = len(state.names)
     if not 15 <= count <= MAX_STATES:
         raise PersistedStateError(f"names: expected 15 to {MAX_STATES} error states")
@@ -192,33 +369,17 @@ def _parse_state(content: object) -> PersistedState:
             raise PersistedStateError(f"{key}: expected {expected} numbers")
     if min(state.covariance[:: count + 1]) < 0.0:
         raise PersistedStateError("covariance: negative variance")
-    return state if state.pose is None else state._replace(pose=_parse_pose(state.pose))
+    return state
 
 
-def _parse_pose(content: object) -> PersistedPose:
-    pose = _convert_fields(content, PersistedPose)
+def _check_pose(pose: PersistedPose) -> PersistedPose:
     if abs(pose.latitude_deg) > 90.0 or abs(pose.longitude_deg) > 360.0:
         raise PersistedStateError(f"latitude {pose.latitude_deg:g}, longitude {pose.longitude_deg:g}: out of range")
     if not abs(math.hypot(*pose.attitude) - 1.0) < 1e-6:
         raise PersistedStateError("attitude: expected a unit quaternion")
     if min(*pose.correlated_error_variance, pose.allowance) < 0.0 or pose.gnss_noise_inflation < 1.0:
         raise PersistedStateError("correlated_error_variance, allowance or gnss_noise_inflation: out of range")
-    pairs = tuple[tuple[str, _Number], ...]
-    return pose._replace(wheels=_convert("wheels", pose.wheels, pairs, "pairs of a name and a distance"))
-
-
-def _convert_fields(content: object, row: type[_Row]) -> _Row:
-    """Convert a mapping to a NamedTuple, each field as declared. Raises PersistedStateError."""
-    if not isinstance(content, dict) or set(content) != set(row._fields):
-        raise PersistedStateError("unknown or missing keys")
-    return row(*(_convert(key, content[key], *_FIELDS[hint]) for key, hint in get_type_hints(row).items()))
-
-
-def _convert(key: str, value: object, kind: Any, expected: str) -> Any:
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError:
-        raise PersistedStateError(f"{key}: expected {expected}") from None
+    return pose
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")

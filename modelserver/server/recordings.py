@@ -1,22 +1,26 @@
-"""The stamps of a recording beside the times of their receipt: one axis or two, and known amounts between them. Pure.
+"""Recordings: how their stamps are off their times of receipt, and playback onto the bus.
 
-A simulation stamps from 0 s and is recorded by the clock of the wall; a recorder may run an hour off. If all sources
-are off by one amount the recording is sound: its receive times are moved to the axis of the stamps. If one is off
-alone, it is that one's clock.
+The stamps of a recording and the times of their receipt have one axis, or two with known amounts between them. A
+simulation stamps from 0 s and is recorded by the clock of the wall; a recorder may run an hour off. If all sources are
+off by one amount the recording is sound: its receive times are moved to the axis of the stamps. If one is off alone, it
+is that one's clock.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from typing import Final, get_args
 
 from modelserver import messages
 from modelserver.core.source_clocks import SPREAD_S, format_offset
+from modelserver.server.clock import Clock
 from modelserver.server.ingress import peek_sample_id
 from modelserver.wire.codec import fingerprint_of, get_type_name
+from modelserver.wire.encoded import restamp
 from modelserver.wire.eventlog import LogEvent
 
 LARGEST_DELAY_S: Final = 5.0
@@ -85,3 +89,52 @@ def align(events: Iterable[LogEvent], channels: Container[str], axis: StampAxis)
     offset = round(axis.common * 1e6)
     for event in chain(first, waiting):
         yield event._replace(utime=event.utime + offset) if offset else event
+
+
+@dataclass(slots=True)
+class Player:
+    """Publishes events `speed` times as fast as they were recorded (infinite: at once).
+
+    Messages are published unchanged; with `restamp` the stamps of samples and mode commands are shifted by the age of
+    the log, so that they are current for a daemon.
+
+    Each event has an absolute deadline on the monotonic clock, relative to the first one, so delays do not accumulate.
+    If the log's time steps back, playback continues at once from there. The counts are valid also after an interrupt;
+    `max_delay` is the greatest delay of a message after its deadline, seconds.
+    """
+
+    publish: Callable[[str, bytes], object]
+    speed: float
+    clock: Clock
+    sleep: Callable[[float], object]
+    restamp: bool = False
+    sent: int = 0
+    max_delay: float = 0.0
+    first_utime: int = 0
+    last_utime: int = 0
+
+    def play(self, events: Iterable[LogEvent], on_sent: Callable[[LogEvent], object] = lambda event: None) -> None:
+        """Publish all events; call `on_sent` after each one."""
+        start_ns, start_utime, shift = self.clock.monotonic_ns(), 0, 0
+        for event in events:
+            if not self.sent:
+                self.first_utime = start_utime = event.utime
+                shift = self.clock.now().utime - event.utime
+            elif event.utime < self.last_utime:
+                start_ns, start_utime = self.clock.monotonic_ns(), event.utime
+            if not math.isinf(self.speed):
+                due_ns = start_ns + round((event.utime - start_utime) * 1000 / self.speed)
+                wait = (due_ns - self.clock.monotonic_ns()) * 1e-9
+                if wait > 0:
+                    self.sleep(wait)
+                else:
+                    self.max_delay = max(self.max_delay, -wait)
+            self.publish(event.channel, restamp(event.data, shift) if self.restamp else event.data)
+            self.sent += 1
+            self.last_utime = event.utime
+            on_sent(event)
+
+    @property
+    def duration(self) -> float:
+        """Seconds of the recording between the first and the last published message."""
+        return (self.last_utime - self.first_utime) * 1e-6

@@ -7,14 +7,7 @@ replies per second.
 Priority: requests of clients within their rate come first, round robin over the clients; then those of clients beyond
 their rate, round robin as well. The scheduler is work-conserving: work beyond the rates is done while there is time.
 Under contention (`set_contended`) it is limited to a share of the time, by a third token bucket (`spend`). A rate is
-therefore a guarantee, not a cap on an idle server.
-
-Contention (`ContentionDetector`): something else needs the time, such as ticks, sensors or other programs. There are
-three indications, each read outside: a late tick, a backlog of samples, and the run-queue delay of the server's thread
-(Linux: /proc/thread-self/schedstat), the time in which it was ready to run and had no processor. A client that asks
-again at once wakes the thread thousands of times a second, and each takes microseconds: what counts is a delay that is
-long each time, because another program has the processor. An indication counts for `CONTENTION_NS`, and the detector
-stays on at a lower share than it turns on: hysteresis.
+therefore a guarantee, not a cap on an idle server. Contention is that ticks are late or that samples wait.
 
 One program may have any number of clients, so the totals are bounded too: waiting requests, clients with a queue of
 their own, rejections with a reply. Beyond these bounds requests are dropped and counted.
@@ -30,73 +23,6 @@ from typing import Final, NamedTuple, TypeAlias
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.errors import quote
 from modelserver.messages import Request
-
-DELAY_PERIOD_NS: Final = 100_000_000
-"""Period of reading the run-queue delay."""
-
-ENTER_SHARE: Final = 0.2
-STAY_SHARE: Final = 0.1
-"""Share of time in the run queue above which contention begins and continues. A single client that waits for each reply
-causes a few hundredths."""
-
-LEAST_DELAY_NS: Final = 50_000
-"""Mean delay of a time slice, at least. With one client in a closed loop it was at most 18 us on an idle machine of two
-processors, and 150 us (median) with two programs that compute."""
-
-LATE_TICK_NS: Final = 2_000_000
-"""Two later ticks within `CONTENTION_NS` indicate contention: a single one may be a stall of the whole machine."""
-
-CONTENTION_NS: Final = 500_000_000
-"""How long an indication counts."""
-
-
-class RunDelay(NamedTuple):
-    """How long a thread was ready without a processor since its start, nanoseconds, and how often it got one."""
-
-    total_ns: int
-    slices: int
-
-
-class ContentionDetector:
-    """Detects contention from late ticks, sample backlogs and run-queue delays."""
-
-    def __init__(self) -> None:
-        self._until_ns = self._late_until_ns = 0
-        self._sampled_ns = 0
-        self._delay: RunDelay | None = None
-
-    def is_contended(self, now_ns: int) -> bool:
-        """Return whether there was an indication lately."""
-        return now_ns < self._until_ns
-
-    def wants_delay(self, now_ns: int) -> bool:
-        """Return whether the run-queue delay is due to be read for `add_delay`."""
-        return now_ns - self._sampled_ns >= DELAY_PERIOD_NS
-
-    def add_delay(self, delay: RunDelay | None, now_ns: int) -> None:
-        """Process a reading of the thread's run-queue delay; None if the system has none."""
-        before, self._delay = self._delay, delay
-        elapsed, self._sampled_ns = now_ns - self._sampled_ns, now_ns
-        if before is None or delay is None or elapsed <= 0:
-            return
-        delayed_ns = delay.total_ns - before.total_ns
-        if delayed_ns < LEAST_DELAY_NS * (delay.slices - before.slices):
-            return
-        share = delayed_ns / elapsed
-        if share > (STAY_SHARE if self.is_contended(now_ns) else ENTER_SHARE):
-            self._until_ns = now_ns + CONTENTION_NS
-
-    def add_tick(self, late_ns: int, now_ns: int) -> None:
-        """Process the latency of a tick."""
-        if late_ns > LATE_TICK_NS:
-            if now_ns < self._late_until_ns:
-                self._until_ns = now_ns + CONTENTION_NS
-            self._late_until_ns = now_ns + CONTENTION_NS
-
-    def add_sensor_backlog(self, now_ns: int) -> None:
-        """Process that more samples wait than one pass of the loop handles."""
-        self._until_ns = now_ns + CONTENTION_NS
-
 
 BURST_S: Final = 0.25
 """Burst of a client: what its rate permits in so many seconds."""

@@ -7,49 +7,120 @@ One pass of the server loop gives it a slice of at most a millisecond:
    answered before the next one is received: the latency of a single client.
 2. Answer queued requests in the order of the scheduler (`scheduler`).
 3. Work on the deferred reply in progress, one at a time: steps of about half a millisecond, begun only if they end
-   before the next tick (`deferred`).
+   before the next tick. Its messages are sent in portions that fit a receive buffer (`DeferredReply`).
 4. Reply to some of the requests that were dropped.
 
-A pass without work computes static replies ahead of time (`prepare`, `StaticReplyCache`) after the first such request.
+Replies that do not depend on time are cached (`StaticReplyCache`), and answered without decoding the request.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from functools import lru_cache
-from itertools import islice, product
 from typing import Final, Protocol
 
 from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import CoreState, Instant
-from modelserver.errors import QueryError, Status, WireError
-from modelserver.geometry import names
+from modelserver.errors import Status, WireError
+from modelserver.messages import GetDynamics, GetHistory, GetTransformations, Request
 from modelserver.named_tuples import new_tuple
-from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
+from modelserver.query import HISTORY_LIMIT
+from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer, effort_of, is_deferred
+from modelserver.query.steps import Steps, complete
 from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock
-from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.ingress import CommandVerifier
+from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_text
-from modelserver.server.requests.deferred import DeferredReply, estimate_reply_bytes
-from modelserver.server.requests.scheduler import (
+from modelserver.server.scheduler import (
+    MAX_REPLY_BYTES,
     SIGNED_CLIENT,
-    ContentionDetector,
     DeferredRequest,
     QueuedRequest,
     RequestScheduler,
-    RunDelay,
 )
-from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
-from modelserver.wire.codec import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache, decode, encode, read_request_header
+from modelserver.wire.codec import CACHED_TYPE, StaticReplyCache, decode, encode, read_request_header
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
 
 log = logging.getLogger(__name__)
+
+
+PORTION_BYTES: Final = 100_000
+"""Bytes of a portion: a receive buffer of the kernel's default size (212,992 bytes) holds it beside other messages."""
+
+MESSAGE_BYTES: Final = 300
+POSE_BYTES: Final = 74
+COVARIANCE_BYTES: Final = 288
+HISTORY_POSE_BYTES: Final = 500
+DYNAMICS_BYTES: Final = 90_000
+"""Bytes of a message without poses, of a pose, of its covariance, of a pose in a history, and of equations of motion
+with as many coordinates as there may be."""
+
+
+def estimate_reply_bytes(request: Request) -> int:
+    """Return an upper bound of the size of the reply to a request, bytes; not valid for an error reply."""
+    if isinstance(request, GetTransformations):
+        instants = len(request.at)
+        each = POSE_BYTES + COVARIANCE_BYTES * request.with_covariance
+        messages = -(-instants // COVARIANCES_IN_PART)
+        return min(len(request.pairs) * (MESSAGE_BYTES * messages + instants * each), MAX_REPLY_BYTES)
+    if isinstance(request, GetHistory):
+        poses = (request.end_utime - request.start_utime) * 1e-6 * request.rate_hz + 1.0
+        return MESSAGE_BYTES + round(HISTORY_POSE_BYTES * poses) if 0.0 < poses <= HISTORY_LIMIT else MESSAGE_BYTES
+    if isinstance(request, GetDynamics):
+        return DYNAMICS_BYTES if request.with_equations else 2 * MESSAGE_BYTES
+    return MESSAGE_BYTES
+
+
+class DeferredReply:
+    """The reply of a deferred answer: `step` until it is `ready`, then `pop` messages.
+
+    `queued` is the request as received; None in a replay of the journal.
+    """
+
+    def __init__(self, answer: DeferredAnswer, queued: QueuedRequest | None = None):
+        self.queued = queued
+        self.request = answer.request
+        self.channel = answer.request.header.reply_channel
+        self.ready = False
+        self._messages: deque[bytes] = deque()
+        self._work = self._encode(answer)
+
+    def step(self) -> None:
+        self.ready = next(self._work, self) is self
+
+    def complete(self) -> None:
+        """Do the rest of the work."""
+        if not self.ready:
+            complete(self._work)
+            self.ready = True
+
+    @property
+    def portion(self) -> int:
+        """Number of messages of the next portion; 0 if all are sent."""
+        count = size = 0
+        for message in self._messages:
+            size += len(message)
+            if count and size > PORTION_BYTES:
+                break
+            count += 1
+        return count
+
+    def pop(self, count: int) -> list[bytes]:
+        """Remove and return the next messages."""
+        return [self._messages.popleft() for _ in range(min(count, len(self._messages)))]
+
+    def _encode(self, answer: DeferredAnswer) -> Steps[None]:
+        replies = yield from answer.work()
+        for reply in replies:
+            self._messages.append(encode(reply))
+            yield
+
 
 SLICE_NS: Final = 1_000_000
 """Time of a pass for requests; the last request is finished."""
@@ -66,14 +137,11 @@ STEP_ROOM_NS: Final = 1_500_000
 STARVED_NS: Final = 50_000_000
 """Deferred work without a step for so long gets one in any case."""
 
-PREPARE_NS: Final = 20_000
-"""Time for preparing replies before the loop looks for messages again: for one, since a client may be about to ask."""
+LATE_TICK_NS: Final = 2_000_000
+"""Two later ticks within `CONTENTION_NS` are contention: a single one may be a stall of the whole machine."""
 
-PREPARE_ROOM_NS: Final = 200_000
-"""Preparing begins only this long before the next tick."""
-
-MAX_PREPARED: Final = 16
-"""Pairs of frames whose replies are prepared at once."""
+CONTENTION_NS: Final = 500_000_000
+"""How long it lasts after the last report."""
 
 REJECTIONS_PER_PASS: Final = 2
 REJECTIONS_WAITING: Final = 128
@@ -82,24 +150,19 @@ SIGNED_TYPE: Final = BY_NAME[SIGNED].type_name
 
 
 class RequestContext(Protocol):
-    """Services that the request handler gets from the server loop."""
+    """Services that the request handler gets from the server loop; see there."""
 
     state: CoreState
 
-    def step(self, event: messages.Event, now: Instant, received: tuple[str, bytes] | None = None) -> None:
-        """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
+    def step(self, event: messages.Event, now: Instant, received: tuple[str, bytes] | None = None) -> None: ...
 
-    def publish(self, channel: str, data: bytes) -> None:
-        """Publish a message."""
+    def publish(self, channel: str, data: bytes) -> None: ...
 
-    def send(self, outputs: tuple[messages.Output, ...]) -> None:
-        """Send outputs of the core."""
+    def send(self, outputs: tuple[messages.Output, ...]) -> None: ...
 
-    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
-        """Count and log an error while handling a message."""
+    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None: ...
 
-    def execute(self, command: messages.SignedCommand, now: Instant) -> None:
-        """Execute a signed command."""
+    def execute(self, command: messages.SignedCommand, now: Instant) -> None: ...
 
 
 class RequestHandler:
@@ -107,7 +170,7 @@ class RequestHandler:
 
     def __init__(
         self,
-        context: RequestContext,
+        loop: RequestContext,
         bus: Bus,
         clock: Clock,
         log: RateLimitedLog,
@@ -115,9 +178,8 @@ class RequestHandler:
         prefix: str,
         limits: LimitsConfig,
         verifier: CommandVerifier | None = None,
-        run_delay: Callable[[], RunDelay | None] = lambda: None,
     ):
-        self._context = context
+        self._loop = loop
         self._bus = bus
         self._clock = clock
         self._log = log
@@ -125,11 +187,9 @@ class RequestHandler:
         self._prefix = prefix
         self._verifier = verifier
         self._per_pass = limits.requests_per_pass
-        self._run_delay = run_delay
         self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
-        self.contention = ContentionDetector()
         self._cache = StaticReplyCache()
-        self._unprepared: Iterator[tuple[str, str]] | None = None
+        self._contended_ns = self._late_ns = clock.monotonic_ns()
         self._answered = 0
         self._dropped: dict[str, int] = {}
         self._rejections: deque[QueuedRequest] = deque()
@@ -165,10 +225,7 @@ class RequestHandler:
         Without `may_defer` no deferred reply is begun.
         """
         scheduler, clock = self._scheduler, self._clock
-        contention = self.contention
-        if contention.wants_delay(begin):
-            contention.add_delay(self._run_delay(), begin)
-        scheduler.set_contended(contention.is_contended(begin), begin)
+        scheduler.set_contended(begin < self._contended_ns, begin)
         self._is_first = True
         unread = self._receive(begin + SLICE_NS // 2)
         # the reply to a client that waits for it has been sent here: what follows is less urgent
@@ -199,8 +256,18 @@ class RequestHandler:
             self._count_dropped()
         if report is not None and report != self._report:
             self._report = report
-            self._context.step(messages.HealthWarning("requests", report), clock.now())
+            self._loop.step(messages.HealthWarning("requests", report), clock.now())
         return clock.monotonic_ns()
+
+    def report_late_tick(self, now_ns: int) -> None:
+        """Process that a tick was more than `LATE_TICK_NS` late."""
+        if now_ns < self._late_ns:
+            self._contended_ns = now_ns + CONTENTION_NS
+        self._late_ns = now_ns + CONTENTION_NS
+
+    def report_backlog(self, now_ns: int) -> None:
+        """Process that more samples wait than one pass of the loop handles."""
+        self._contended_ns = now_ns + CONTENTION_NS
 
     def serve_cached(self) -> None:
         """Receive a request that has arrived: answer it from the cache, or queue it."""
@@ -209,36 +276,6 @@ class RequestHandler:
             self._bus.requests.drain(1)
         finally:
             self._only_cached = False
-
-    def prepare(self, until_ns: int) -> bool:
-        """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
-
-        It begins with the first request for a transformation, and again after a change of model.
-        """
-        if self._unprepared is None:
-            return False  # first, since every idle pass asks
-        now = self._clock.now()
-        view = self._context.state.view
-        if (
-            until_ns - now.monotonic_ns < PREPARE_ROOM_NS
-            or not self._cache.is_of(view.model)
-            or self.contention.is_contended(now.monotonic_ns)
-        ):
-            return False
-        for _ in range(MAX_PREPARED):
-            pair = next(self._unprepared, None)
-            if pair is None:
-                self._unprepared = None
-                return False
-            with suppress(QueryError):
-                if view.model.rigid_transformation(*pair) is None:
-                    continue
-                request = messages.GetTransformation(messages.RequestHeader(0, ""), *pair, messages.TimeQuery())
-                for reply in compute_replies(view, request, now.utime):
-                    self._cache.add(encode(request), b"", reply, encode(reply))
-            if self._clock.monotonic_ns() - now.monotonic_ns >= PREPARE_NS:
-                break
-        return True
 
     def cache(self, output: messages.SendReply, encoded: bytes) -> None:
         """Cache a reply that has just been sent, if it answers the current request and does not depend on time."""
@@ -257,7 +294,7 @@ class RequestHandler:
             return
         deferred.complete()
         for message in deferred.pop(count):
-            self._context.publish(deferred.channel, message)
+            self._loop.publish(deferred.channel, message)
         if not deferred.portion:
             self.drop_deferred()
 
@@ -319,14 +356,14 @@ class RequestHandler:
             return  # counted already: as dropped
         now = self._clock.now()
         self._journal.record_message(RecordKind.OVERLOAD, (dropped.channel, dropped.data), now)
-        self._context.send(core.reply_overloaded(self._context.state, request, now))
+        self._loop.send(core.reply_overloaded(self._loop.state, request, now))
 
     def _count_dropped(self) -> None:
         """Count the dropped requests in the core, together: counting each one costs more than dropping it."""
         dropped, self._dropped = self._dropped, {}
         now = self._clock.now()
         for channel, count in dropped.items():
-            self._context.step(messages.Rejected(channel, "overload", count), now)
+            self._loop.step(messages.Rejected(channel, "overload", count), now)
 
     def _work_deferred(self, now_ns: int, end_ns: int, due_ns: int, may_defer: bool) -> bool:
         """Work on the deferred reply, or begin the next one; return whether the work can continue at once."""
@@ -366,7 +403,7 @@ class RequestHandler:
     def _answer(self, queued: QueuedRequest) -> None:
         """Answer a request, also a malformed one or one whose handling fails."""
         _, client, channel, type_name, data = queued
-        context = self._context
+        loop = self._loop
         try:
             if type_name == SIGNED_TYPE:
                 self._execute_signed(channel, data)
@@ -375,13 +412,13 @@ class RequestHandler:
                 return
             request = decode(type_name, data)
         except Exception as error:
-            context.handle_error(channel, error, data)
+            loop.handle_error(channel, error, data)
             header = read_request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
             kind = REQUEST_TYPES.get(type_name)
             if header is not None and kind is not None:
                 now = self._clock.now()
                 self._journal.record_message(RecordKind.MALFORMED, (channel, data), now)
-                context.send(core.reply_error(context.state, kind, header, Status.MALFORMED, str(error), now))
+                loop.send(core.reply_error(loop.state, kind, header, Status.MALFORMED, str(error), now))
             return
         effort = effort_of(request)
         if is_deferred(request):
@@ -397,7 +434,7 @@ class RequestHandler:
     def _handle(self, queued: QueuedRequest, request: messages.Request) -> None:
         self._current = queued
         try:
-            self._context.step(request, self._clock.now(), (queued.channel, queued.data))
+            self._loop.step(request, self._clock.now(), (queued.channel, queued.data))
         except Exception as error:
             self._fail(queued, request, error)
         self._current = None
@@ -405,32 +442,30 @@ class RequestHandler:
     def _send_cached(self, client: bytes, channel: str, data: bytes) -> bool:
         """Answer a request from the cache; return whether that was possible."""
         now = self._clock.now()
-        context = self._context
+        loop = self._loop
         reply = self._model_cache().find(data, client, now.utime)
         if reply is None:
             return False
-        reply_channel = _find_reply_channel(client, context.state.settings.reply_prefix)
+        reply_channel = _find_reply_channel(client, loop.state.settings.reply_prefix)
         if not reply_channel:
             return False
         self._journal.record_message(RecordKind.CACHED, (channel, data), now)
-        context.publish(reply_channel, reply)
+        loop.publish(reply_channel, reply)
         self._answered += 1
         return True
 
     def _model_cache(self) -> StaticReplyCache:
         """Return the cache, emptied after a change of model."""
-        model = self._context.state.view.model
+        model = self._loop.state.view.model
         if not self._cache.is_of(model):
-            frames = [names.join(body.name, frame.name) for body in model.bodies for frame in body]
-            self._cache.reset(model, len(frames))
-            self._unprepared = islice(product(frames, frames), MAX_ENTRIES)
+            self._cache.reset(model, sum(1 for body in model.bodies for _ in body))
         return self._cache
 
     def _fail(self, queued: QueuedRequest, request: messages.Request, error: Exception) -> None:
-        context, now = self._context, self._clock.now()
-        context.handle_error(queued.channel, error)
+        loop, now = self._loop, self._clock.now()
+        loop.handle_error(queued.channel, error)
         self._journal.record_message(RecordKind.FAILED, (queued.channel, queued.data), now)
-        context.send(core.reply_internal_error(context.state, request, now))
+        loop.send(core.reply_internal_error(loop.state, request, now))
 
     def _execute_signed(self, channel: str, data: bytes) -> None:
         """Execute the command in an envelope, or reply with the reason to a sender that knows the key."""
@@ -441,15 +476,15 @@ class RequestHandler:
         if isinstance(result, messages.SignedCommand):
             log.info("%s, signed by %s", type(result.command).__name__, escape_text(result.sender))
             try:
-                self._context.execute(result, now)
+                self._loop.execute(result, now)
             except Exception as error:
-                self._context.handle_error(channel, error)
+                self._loop.handle_error(channel, error)
                 if not isinstance(result.command, messages.SwitchMode):
                     own = f"{self._prefix}{messages.CHANNEL_OF[type(result.command)]}"
                     self._journal.record_message(RecordKind.FAILED, (own, encode(result.command)), now)
-                    self._context.send(core.reply_internal_error(self._context.state, result.command, now))
+                    self._loop.send(core.reply_internal_error(self._loop.state, result.command, now))
             return
-        self._context.step(result, now)
+        self._loop.step(result, now)
         self._log.warning(
             f"{channel}:{result.reason}",
             "denied a signed command (%s): %s",

@@ -1,0 +1,695 @@
+"""Diagnostics of bus, host clock, machine and other servers: read facts, evaluate them, probe the bus.
+
+- `evaluate_*` turn facts into diagnoses, each with the command that fixes it. Pure.
+- `read_*` read the facts off the machine: resources of the process, network interfaces, kernel buffers, clocks.
+- `probe_delivery` and `discover_servers` are active probes, `probe_bus` the check that the daemon makes at its start.
+- `DuplicateServerMonitor` watches the health reports while the daemon runs: two daemons on one bus receive each other's
+  reports, and warn until the other one is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import logging
+import os
+import secrets
+import shutil
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from modelserver.errors import BusError, WireError, quote
+from modelserver.messages import Gauges, GetBodyList, Health, RequestHeader
+from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, to_subscription_pattern
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, handle_message, open_lcm
+from modelserver.wire.urls import UdpAddress, make_route_command, parse_udp_address
+
+if TYPE_CHECKING:
+    import lcm
+
+    from modelserver.server.bus import Inbox
+    from modelserver.server.clock import Clock
+    from modelserver.wire.receiver import Sender
+
+log = logging.getLogger(__name__)
+
+
+class DiagnosisLevel(IntEnum):
+    """Severity. OK; NOTE: worth knowing, nothing to fix; WARNING: works, but may fail or lose data; ERROR: fails."""
+
+    OK = 0
+    NOTE = 1
+    WARNING = 2
+    ERROR = 3
+
+
+OK, NOTE, WARNING, ERROR = DiagnosisLevel
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Result of a check: its subject, the observation, why that matters, and the shell command that fixes it.
+
+    `why` and `command` are empty if there is nothing to fix.
+    """
+
+    level: DiagnosisLevel
+    subject: str
+    observed: str
+    why: str = ""
+    command: str = ""
+
+    def __str__(self) -> str:
+        text = f"{self.subject}: {self.observed}"
+        if self.why:
+            text += f"; {self.why}"
+        return f"{text}. Fix it with: {self.command}" if self.command else text
+
+
+def get_worst_level(findings: Iterable[Diagnosis]) -> DiagnosisLevel:
+    """Return the highest level among findings; OK without any."""
+    return max((each.level for each in findings), default=DiagnosisLevel.OK)
+
+
+def filter_by_level(
+    findings: Iterable[Diagnosis], min_level: DiagnosisLevel = DiagnosisLevel.WARNING
+) -> tuple[Diagnosis, ...]:
+    return tuple(each for each in findings if each.level >= min_level)
+
+
+MAX_SLEW_RATE = 500e-6
+"""The kernel's limit of slewing (ntp_adjtime(2)), s/s; more between two readings is a step."""
+
+MIN_TIME_S = 1_672_531_200
+"""Start of 2023: a clock before it was never set since power-on."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFacts:
+    """Readings of the host's clocks.
+
+    Attributes
+    ----------
+    synchronized: the kernel's state; None = unknown.
+    error: the kernel's bound of the error, s.
+    slew, duration: how far the time of day has advanced beyond the monotonic clock over a duration, s.
+    tool: installed time service: chrony, ntp, timesyncd or empty.
+    """
+
+    utime: int
+    synchronized: bool | None = None
+    error: float | None = None
+    slew: float = 0.0
+    duration: float = 0.0
+    tool: str = ""
+
+
+_SYNC_COMMANDS = {
+    "chrony": "sudo systemctl enable --now chrony && chronyc tracking",
+    "ntp": "sudo systemctl enable --now ntp && ntpq -p",
+    "timesyncd": "sudo timedatectl set-ntp true && timedatectl timesync-status",
+    "": "sudo apt install chrony",
+}
+
+
+def evaluate_clock(facts: ClockFacts, shared: bool) -> Iterator[Diagnosis]:
+    """Check the clock. On a `shared` bus, which leaves the machine, other machines' clocks matter."""
+    subject = "clock"
+    command = _SYNC_COMMANDS[facts.tool]
+    if facts.utime < MIN_TIME_S * 1_000_000:
+        why = "time stamps, the magnetic field model and logs depend on it; is the clock's battery empty?"
+        yield Diagnosis(ERROR, subject, "it was never set: its year is before 2023", why, command)
+        return
+    if abs(facts.slew) > MAX_SLEW_RATE * facts.duration + 1e-3:
+        observed = f"it was stepped by {facts.slew:+.3f} s during the check"
+        why = "poses are invalid until localization has samples of the new time; permit steps only at boot"
+        yield Diagnosis(WARNING, subject, observed, why, _SYNC_COMMANDS["chrony"] if facts.tool else command)
+    if facts.synchronized is None:
+        yield Diagnosis(NOTE, subject, "its synchronization state cannot be read on this system")
+    elif facts.synchronized:
+        error = "" if facts.error is None else f", to {facts.error * 1e3:.1f} ms or better"
+        yield Diagnosis(OK, subject, f"synchronized{error}")
+    elif shared:
+        why = "time stamps of several machines are not comparable"
+        yield Diagnosis(WARNING, subject, "not synchronized", why, command)
+    else:
+        why = "time stamps are consistent on this machine, but not true time"
+        yield Diagnosis(NOTE, subject, "not synchronized", why, command)
+
+
+SYSCTL_FILE = "/etc/sysctl.d/60-modelserver.conf"
+
+MIB = 1 << 20
+
+LOST_PACKETS = "lost packets"
+"""Subject of the diagnosis on dropped packets."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkInterface:
+    """A network interface and its flags."""
+
+    name: str
+    up: bool = True
+    multicast: bool = True
+    loopback: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BusFacts:
+    """Readings of the machine about the bus; None = unknown or not tried.
+
+    Attributes
+    ----------
+    interface: interface of the group's route, without a name if the kernel does not report it; None without a route.
+    interfaces: all interfaces.
+    delivered, delivered_large: whether an own message came back, and one of several packets.
+    buffer: receive buffer that the kernel granted for `RECEIVE_BUFFER_BYTES`, bytes.
+    buffer_default: receive buffer of programs that request none, bytes.
+    dropped: packets that receivers on the bus's port have lost so far, at most.
+    """
+
+    url: str
+    address: UdpAddress | None
+    interface: NetworkInterface | None = None
+    interfaces: tuple[NetworkInterface, ...] = ()
+    delivered: bool | None = None
+    delivered_large: bool | None = None
+    buffer: int | None = None
+    buffer_default: int | None = None
+    dropped: int | None = None
+
+
+def evaluate_bus(facts: BusFacts) -> tuple[Diagnosis, ...]:
+    """Check route, delivery, reach and buffers of the bus."""
+    address = facts.address
+    if address is None:
+        return (Diagnosis(NOTE, "bus", f"{quote(facts.url)} is no UDP multicast", "only udpm:// is checked"),)
+    return (
+        _check_route(facts, address),
+        *_check_delivery(facts, address),
+        _check_reach(facts, address),
+        *_check_buffers(facts, address),
+    )
+
+
+def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
+    subject = "multicast route"
+    group, interface = address.group, facts.interface
+    lo = next((each.name for each in facts.interfaces if each.loopback), "lo")
+    outward = next((each.name for each in facts.interfaces if each.up and each.multicast and not each.loopback), "")
+    by_lo = f"sudo ip link set {lo} up multicast on && sudo {make_route_command(group, lo)}"
+    if interface is None:
+        command = by_lo if address.ttl == 0 or not outward else f"sudo {make_route_command(group, outward)}"
+        why = "LCM cannot be joined, so nothing is received or published"
+        return Diagnosis(ERROR, subject, f"there is none to {group}", why, command)
+    if not interface.name:
+        return Diagnosis(OK, subject, f"there is one to {group}")
+    observed = f"{group} is routed through {interface.name}"
+    if not interface.up:
+        command = f"sudo ip link set {interface.name} up"
+        return Diagnosis(ERROR, subject, f"{observed}, which is down", "published messages are lost", command)
+    if interface.loopback and not interface.multicast:
+        why = "some programs skip an interface without the multicast flag"
+        command = f"sudo ip link set {interface.name} multicast on"
+        return Diagnosis(NOTE, subject, f"{observed}, which lacks the multicast flag", why, command)
+    if address.ttl == 0 and not interface.loopback:
+        why = (
+            f"nothing leaves the machine (ttl=0), but the bus fails whenever {interface.name} goes down; a route "
+            f"through {lo} stays"
+        )
+        return Diagnosis(NOTE, subject, observed, why, by_lo)
+    if address.ttl > 0 and interface.loopback:
+        why = f"the URL has ttl={address.ttl}, but no other machine receives anything"
+        flush = f"sudo ip route flush match {group} dev {lo}"
+        command = f"sudo {make_route_command(group, outward)}" if outward else flush
+        return Diagnosis(WARNING, subject, observed, why, command)
+    return Diagnosis(OK, subject, observed)
+
+
+def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+    subject = "own message"
+    if facts.delivered is None:
+        return
+    if not facts.delivered:
+        why = "programs on this machine do not receive each other: a firewall, or multicast without loopback"
+        command = f"sudo nft list ruleset; sudo iptables -I INPUT -d {address.group} -p udp -j ACCEPT"
+        yield Diagnosis(ERROR, subject, "it does not come back", why, command)
+    elif facts.delivered_large is False:
+        why = "long replies (histories, lists) are split into packets, and some of them are lost"
+        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+        yield Diagnosis(WARNING, subject, "a short one comes back, one of 100 kB does not", why, command)
+    else:
+        yield Diagnosis(OK, subject, "it comes back")
+
+
+def _check_reach(facts: BusFacts, address: UdpAddress) -> Diagnosis:
+    if address.ttl == 0:
+        return Diagnosis(OK, "reach", "nothing leaves the machine (ttl=0)")
+    through = f" through {facts.interface.name}" if facts.interface is not None and facts.interface.name else ""
+    hops = "its network" if address.ttl == 1 else f"and past {address.ttl - 1} routers"
+    observed = f"messages leave the machine{through}, for {hops} (ttl={address.ttl})"
+    why = "every host there receives all messages and may send requests; write ttl=0 in lcm.url to prevent that"
+    return Diagnosis(NOTE, "reach", observed, why)
+
+
+def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+    subject = "receive buffer"
+    if facts.buffer is not None and facts.buffer < RECEIVE_BUFFER_BYTES:
+        observed = f"{_format_mib(facts.buffer)} of {_format_mib(RECEIVE_BUFFER_BYTES)} requested (net.core.rmem_max)"
+        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+        yield Diagnosis(WARNING, subject, observed, "messages are lost in bursts", command)
+    elif facts.buffer is not None:
+        yield Diagnosis(OK, subject, f"{_format_mib(facts.buffer)}, as requested")
+    if facts.buffer_default is not None and facts.buffer_default < MIB:
+        observed = f"{_format_mib(facts.buffer_default)} for programs that request none (net.core.rmem_default)"
+        why = "lcm-spy, lcm-logger and clients without recv_buf_size in their URL lose messages in bursts"
+        yield Diagnosis(NOTE, subject, observed, why, _sysctl_command("net.core.rmem_default", RECEIVE_BUFFER_BYTES))
+    if facts.dropped:
+        observed = f"running programs on this bus have lost up to {facts.dropped} packets so far"
+        why = (
+            "one of them is too slow for the traffic, or its buffer is too small (recv_buf_size in its URL); the "
+            "command shows which: d of its skmem, which also counts packets that a socket filter drops"
+        )
+        yield Diagnosis(WARNING, LOST_PACKETS, observed, why, f"sudo ss -uanmp 'sport = :{address.port}'")
+
+
+def _sysctl_command(name: str, value: int) -> str:
+    return f"sudo sysctl -w {name}={value} && echo '{name} = {value}' | sudo tee -a {SYSCTL_FILE}"
+
+
+def _format_mib(count: int) -> str:
+    return f"{count / MIB:.1f} MiB" if count >= MIB / 10 else f"{count / 1024:.0f} KiB"
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A server that published a health report. `prefix` is that of its channels."""
+
+    host: str
+    pid: int
+    vehicle: str = ""
+    version: str = ""
+    prefix: str = ""
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {quote(self.host, 64)}"
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveredServers:
+    """Servers by their health reports, and the number of replies to one request; None = no request was sent."""
+
+    servers: tuple[Server, ...] = ()
+    replies: int | None = None
+
+
+def evaluate_servers(discovered: DiscoveredServers, prefix: str, version: str) -> Iterator[Diagnosis]:
+    """Check which servers are on the bus; `prefix` is that of the checked vehicle."""
+    subject = "daemon"
+    own = [each for each in discovered.servers if each.prefix == prefix]
+    replies = discovered.replies or 0
+    if len(own) > 1 or replies > 1:
+        who = f": {', '.join(map(str, own))}" if len(own) > 1 else ""
+        observed = f"{max(len(own), replies)} answer at once{who}"
+        why = "clients get the replies of either, and POSE is from both; stop all but one, or give each its own prefix"
+        command = f"kill {own[-1].pid}" if own else "systemctl stop modelserver, on each machine but one"
+        yield Diagnosis(ERROR, subject, observed, why, command)
+    elif own or replies:
+        yield Diagnosis(OK, subject, f"one answers{f': {own[0]}' if own else ''}")
+    else:
+        observed = f"none answers{f' with prefix {prefix}' if prefix else ''}"
+        yield Diagnosis(NOTE, subject, observed, "start one if it should run", "modelserver run -c vehicle.yaml")
+    for each in own:
+        if each.version != version:
+            observed = f"{each} is version {quote(each.version, 40)}, this command {version}"
+            why = "messages of one version may be undecodable for the other"
+            yield Diagnosis(WARNING, subject, observed, why, "sudo systemctl restart modelserver")
+    others = sorted({each.prefix for each in discovered.servers} - {prefix})
+    if others:
+        names = ", ".join(quote(each, 40) if each else "none" for each in others)
+        yield Diagnosis(NOTE, "other vehicles", f"daemons with these prefixes are on the bus: {names}")
+
+
+STATM = Path("/proc/self/statm")
+
+
+def read_gauges(queued: int, statm: Path = STATM) -> Gauges:
+    """Read the resources of this process for the health report; `queued` requests wait. Takes some 20 us."""
+    return Gauges(socket.gethostname(), os.getpid(), queued, read_resident_bytes(statm), time.process_time())
+
+
+def read_resident_bytes(statm: Path = STATM) -> int:
+    """Read the resident memory of this process, bytes; 0 if unknown."""
+    return (_read_int(statm, 1) or 0) * os.sysconf("SC_PAGE_SIZE")
+
+
+_SIOCGIFFLAGS: Final = 0x8913
+_IFF_UP, _IFF_LOOPBACK, _IFF_MULTICAST = 0x1, 0x8, 0x1000
+"""netdevice(7)."""
+
+_RTF_UP: Final = 0x1
+"""route(8)."""
+
+_STA_UNSYNC: Final = 0x40
+_TIME_ERROR: Final = 5
+"""adjtimex(2)."""
+
+PROC: Final = Path("/proc")
+
+
+def read_bus_facts(
+    url: str, probe_delivery: Callable[[str], tuple[bool, bool]] | None = None, proc: Path = PROC
+) -> BusFacts:
+    """Read the facts about the bus at `url`.
+
+    `probe_delivery` sends own messages and returns whether a short and a long one come back.
+    """
+    address = parse_udp_address(url)
+    if address is None:
+        return BusFacts(url, None)
+    interfaces = tuple(list_interfaces())
+    name = find_interface(address, proc)
+    delivered: bool | None = None
+    delivered_large: bool | None = None
+    if name is not None and probe_delivery is not None:
+        try:
+            delivered, delivered_large = probe_delivery(url)
+        except BusError:
+            delivered = False
+    return BusFacts(
+        url,
+        address,
+        None if name is None else next((each for each in interfaces if each.name == name), NetworkInterface(name)),
+        interfaces,
+        delivered,
+        delivered_large,
+        get_granted_buffer(address.buffer or RECEIVE_BUFFER_BYTES),
+        _read_int(proc / "sys/net/core/rmem_default"),
+        count_dropped(address.port, proc),
+    )
+
+
+def list_interfaces() -> Iterator[NetworkInterface]:
+    """Yield the network interfaces of this machine."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            try:
+                request = struct.pack("256s", name.encode()[:15])
+                flags = struct.unpack_from("16xH", fcntl.ioctl(probe.fileno(), _SIOCGIFFLAGS, request))[0]
+            except OSError:
+                continue  # removed meanwhile
+            yield NetworkInterface(
+                name, bool(flags & _IFF_UP), bool(flags & _IFF_MULTICAST), bool(flags & _IFF_LOOPBACK)
+            )
+
+
+def find_interface(address: UdpAddress, proc: Path = PROC) -> str | None:
+    """Return the interface of the route to a group; empty if unknown, None without a route."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # connecting sends nothing, but looks up the route
+            probe.connect((address.group, address.port))
+            own = socket.inet_aton(probe.getpeername()[0])
+        except OSError:
+            return None
+    try:
+        lines = (proc / "net/route").read_text().splitlines()[1:]
+    except OSError:
+        return ""
+    return _match_route(lines, int.from_bytes(own, sys.byteorder))
+
+
+def _match_route(lines: Iterable[str], group: int) -> str:
+    """Return the interface of an address's route by /proc/net/route, whose numbers are in host byte order."""
+    found = []
+    for name, destination, _, flags, _, _, metric, mask, *_ in (line.split() for line in lines if line.count("\t") > 7):
+        if int(flags, 16) & _RTF_UP and group & int(mask, 16) == int(destination, 16):
+            # longest prefix, then least metric
+            found.append((-int(mask, 16).bit_count(), int(metric), name))
+    return min(found)[2] if found else ""
+
+
+def get_granted_buffer(size: int) -> int:
+    """Return the receive buffer that the kernel grants for a request, bytes."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+        # the kernel doubles it for its own use, and reports the double (socket(7))
+        return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def count_dropped(port: int, proc: Path = PROC) -> int | None:
+    """Count the packets that the sockets on a port have lost, at most; None if unknown.
+
+    The kernel counts packets that a socket filter drops (`wire.socket_filter`) as drops of the socket, too. Its count
+    of full buffers has only lost ones, but those of all ports.
+    """
+    try:
+        lines = (proc / "net/udp").read_text().splitlines()[1:]
+        names, values = (line.split() for line in (proc / "net/snmp").read_text().splitlines() if line[:4] == "Udp:")
+    except (OSError, ValueError):
+        return None
+    rows = [line.split() for line in lines]
+    dropped = sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
+    return min(dropped, int(dict(zip(names, values, strict=True)).get("RcvbufErrors", dropped)))
+
+
+def _read_int(path: Path, word: int = 0) -> int | None:
+    try:
+        return int(path.read_bytes().split()[word])
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+_TIMEX: Final = struct.Struct("@I4li")
+"""Start of struct timex (adjtimex(2)): modes, offset, freq, maxerror, esterror, status."""
+
+
+def read_kernel_clock() -> tuple[bool | None, float | None]:
+    """Read whether the kernel considers the time of day synchronized, and its bound of the error, s."""
+    timex = ctypes.create_string_buffer(512)  # more than its size on any machine; modes 0: read only
+    try:
+        result = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
+    except (OSError, AttributeError):
+        return None, None
+    if result < 0:
+        return None, None
+    _, _, _, max_error_us, _, status = _TIMEX.unpack_from(timex)
+    if result == _TIME_ERROR or status & _STA_UNSYNC:
+        return False, None
+    return True, max_error_us * 1e-6
+
+
+def find_time_service() -> str:
+    """Return the installed time service: chrony, ntp, timesyncd or empty."""
+    folders = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
+    if shutil.which("chronyd", path=folders):
+        return "chrony"
+    if shutil.which("ntpd", path=folders):
+        return "ntp"
+    if any(Path(place, "systemd-timesyncd").exists() for place in ("/lib/systemd", "/usr/lib/systemd")):
+        return "timesyncd"
+    return ""
+
+
+class HostClockMonitor:
+    """Compares the time of day with the monotonic clock from construction until `read_facts`."""
+
+    def __init__(self) -> None:
+        self._start = self._read_clocks()
+
+    def read_facts(self) -> ClockFacts:
+        """Return the readings of the clocks."""
+        (utime, monotonic), (utime_now, monotonic_now) = self._start, self._read_clocks()
+        elapsed = monotonic_now - monotonic
+        slew = (utime_now - utime - elapsed) * 1e-9
+        is_synchronized, error = read_kernel_clock()
+        return ClockFacts(utime_now // 1000, is_synchronized, error, slew, elapsed * 1e-9, find_time_service())
+
+    @staticmethod
+    def _read_clocks() -> tuple[int, int]:
+        return time.time_ns(), time.monotonic_ns()
+
+
+ECHO_TIMEOUT_S: Final = 2.0
+"""Timeout of an own message, which takes less than a millisecond on a working bus."""
+
+RESEND_S: Final = 0.1
+"""Period of sending it again: a loaded machine may lose one."""
+
+LARGE_BYTES: Final = 100_000
+"""Size of a message that LCM splits into packets."""
+
+MAX_SERVERS: Final = 16
+
+REPLY_NAME: Final = "MODELSERVER_DOCTOR"
+
+
+def probe_delivery(url: str, seconds: float = ECHO_TIMEOUT_S) -> tuple[bool, bool]:
+    """Return whether a short and a long own message come back. Raises BusError."""
+    sender, receiver = open_lcm(url), open_lcm(url)
+    echoed: list[bool] = []
+    for size in (8, LARGE_BYTES):
+        echoed.append(_is_echoed(sender, receiver, secrets.token_bytes(size), seconds if all(echoed) else 0.0))
+    return echoed[0], echoed[1]
+
+
+def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, payload: bytes, seconds: float) -> bool:
+    matches: list[bool] = []
+    subscription = receiver.subscribe(
+        to_subscription_pattern(PROBE_CHANNEL), lambda _, data: matches.append(data == payload)
+    )
+    deadline = time.monotonic() + seconds
+    try:
+        while time.monotonic() < deadline:
+            sender.publish(PROBE_CHANNEL, payload)
+            if _receive_until(receiver, min(RESEND_S, seconds), lambda: any(matches)):
+                return True
+    finally:
+        receiver.unsubscribe(subscription)
+    return False
+
+
+def discover_servers(
+    url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds: float = 1.3
+) -> DiscoveredServers:
+    """Collect the servers that publish health reports, and count the replies to one request. Raises BusError.
+
+    The default time is longer than the period of health reports.
+    """
+    receiver = open_lcm(url)
+    servers: dict[Server, None] = {}
+    request = RequestHeader(secrets.randbits(62) + 1, f"{reply_prefix}{REPLY_NAME}")
+
+    def on_health(channel: str, data: bytes) -> None:
+        try:
+            health: Health = decode("health_t", data)
+        except WireError:
+            return
+        if len(servers) < MAX_SERVERS:
+            own_prefix = channel.removesuffix("MODELSERVER_HEALTH")
+            servers[Server(health.host, health.pid, health.vehicle, health.version, own_prefix)] = None
+
+    count = 0
+
+    def on_reply(_: str, data: bytes) -> None:
+        nonlocal count
+        # the request id follows the fingerprint
+        count += data[8:16] == request.request_id.to_bytes(8, "big", signed=True)
+
+    receiver.subscribe(r"[A-Za-z0-9_]*MODELSERVER_HEALTH", on_health)
+    receiver.subscribe(to_subscription_pattern(request.reply_channel), on_reply)
+    receiver.publish(f"{prefix}PLATFORM_GET_BODY_LIST", encode(GetBodyList(request)))
+    _receive_until(receiver, seconds, lambda: False)
+    return DiscoveredServers(tuple(servers), count)
+
+
+def _receive_until(receiver: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + seconds
+    while not until():
+        left = deadline - time.monotonic()
+        if left <= 0.0:
+            return False
+        handle_message(receiver, int(left * 1e3) + 1)
+    return True
+
+
+SERVERS_SUBJECT: Final = "servers"
+
+DUPLICATE_TIMEOUT_S: Final = 5.0
+"""Another server without a report for so long is gone."""
+
+MAX_REPORTS_PER_S: Final = 40
+"""Reports decoded per second; a server publishes at most ten. Further ones are dropped."""
+
+RECORDING_AGE_S: Final = 30.0
+"""A report whose stamp differs so much from now is from the playback of a recording."""
+
+
+class DuplicateServerMonitor:
+    """Warns about other servers on the bus by their health reports. `host` and `pid` are those of this process."""
+
+    def __init__(self, host: str, pid: int, set_warning: Callable[[str, str], None], clock: Clock):
+        self._own_process = (host, pid)
+        self._set_warning = set_warning
+        self._clock = clock
+        self._received_ns = 0
+        self._window_ns = 0
+        self._reports = 0
+        self._warning = ""
+
+    def subscribe(self, inbox: Inbox, prefix: str) -> None:
+        """Subscribe to the channel of the own health reports."""
+        inbox.subscribe(f"{prefix}MODELSERVER_HEALTH", self.on_health)
+
+    def on_health(self, channel: str, data: bytes, sender: Sender = None) -> None:
+        """Process a health report, the own one or another server's."""
+        now = self._clock.monotonic_ns()
+        if now - self._window_ns >= 1_000_000_000:
+            self._window_ns, self._reports = now, 0
+        self._reports += 1
+        if self._reports > MAX_REPORTS_PER_S:
+            return
+        try:
+            health: Health = decode("health_t", data)
+        except WireError:
+            return
+        if (health.host, health.pid) != self._own_process:
+            self._received_ns = now
+            self._update_warning(_describe(health, self._clock.utime()))
+        elif self._warning and now - self._received_ns > DUPLICATE_TIMEOUT_S * 1e9:
+            self._update_warning("")
+
+    def _update_warning(self, text: str) -> None:
+        if text != self._warning:
+            self._warning = text
+            self._set_warning(SERVERS_SUBJECT, text)
+
+
+def _describe(health: Health, utime: int) -> str:
+    who = f"modelserver process {health.pid} on {quote(health.host, 64)}, vehicle {quote(health.vehicle, 64)}"
+    if abs(health.utime - utime) > RECORDING_AGE_S * 1e6:
+        return (
+            f"a recording of {who}, is being played on this bus: clients cannot distinguish its poses from current "
+            "ones; stop the player, or play without the server's own channels (modelserver replay)"
+        )
+    return (
+        f"another server publishes on this bus: {who}; clients get the replies of either, and POSE is from both; stop "
+        f"one (kill {health.pid} there), or give it its own lcm.channel_prefix or port"
+    )
+
+
+BUS_SUBJECT = "bus"
+
+
+def probe_bus(
+    url: str, read: Callable[[str], BusFacts] = lambda url: read_bus_facts(url, probe_delivery)
+) -> tuple[Diagnosis, ...]:
+    """Check the bus at `url`; takes a few milliseconds if it works.
+
+    Raises BusError if it does not deliver an own message.
+    """
+    # packets that other programs lost before this one started are not reported
+    findings = evaluate_bus(replace(read(url), dropped=None))
+    errors = filter_by_level(findings, DiagnosisLevel.ERROR)
+    if errors:
+        raise BusError(f"the bus at {url} does not work: {'; '.join(map(str, errors))} (details: modelserver doctor)")
+    return findings
+
+
+def report_findings(findings: Iterable[Diagnosis], set_warning: Callable[[str, str], None]) -> None:
+    """Log the findings, and set a health warning for those to be fixed."""
+    findings = tuple(findings)
+    for finding in findings:
+        log.log(logging.WARNING if finding.level >= DiagnosisLevel.WARNING else logging.DEBUG, "%s", finding)
+    warnings = filter_by_level(findings)
+    if warnings:
+        set_warning(BUS_SUBJECT, "; ".join(map(str, warnings)))

@@ -1,1 +1,0 @@
-"""Diagnostics of bus, host clock, machine and other servers."""

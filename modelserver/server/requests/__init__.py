@@ -1,1 +1,0 @@
-"""Request handling: per-client queues, scheduling, signature verification, deferred replies."""

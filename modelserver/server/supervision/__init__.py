@@ -1,1 +1,0 @@
-"""Supervision by systemd: notification, watchdog, restart."""
