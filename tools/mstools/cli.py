@@ -17,8 +17,7 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
-from mstools.terminal.output import escape, print_problems
-from mstools.terminal.problems import suggest_path
+from mstools.terminal.output import escape, print_problems, suggest_path
 
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and show its answers.",

@@ -13,12 +13,14 @@ import pytest
 
 from modelserver.errors import ConfigError, ModelServerError, Severity
 from modelserver.signing.key_files import generate_key, write_key
+from mstools import deployment as install_steps
 from mstools.cli import main
 from mstools.commands import install
 from mstools.commands.check import check_vehicle
-from mstools.deployment import steps as install_steps
-from mstools.deployment.files import (
+from mstools.deployment import (
+    SYSCTL,
     SerialDriver,
+    SystemFacts,
     check_drivers,
     check_visible,
     find_hiding_setting,
@@ -29,7 +31,6 @@ from mstools.deployment.files import (
     render_udev_rules,
     render_units,
 )
-from mstools.deployment.plan import SYSCTL, SystemFacts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 OWN_KEY = "commands.key"
@@ -263,7 +264,7 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
     python.parent.chmod(0o700)
     monkeypatch.setattr(install_steps.sys, "executable", str(python))
     monkeypatch.setattr(install_steps.sys, "base_prefix", "/home/me/python")
-    monkeypatch.setattr(install_steps.install_files, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
+    monkeypatch.setattr(install_steps, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
     monkeypatch.setattr(install_steps, "files", lambda name: tmp_path)
     with pytest.raises(ConfigError) as caught:
         install_steps.check_installation()

@@ -20,7 +20,7 @@ from msdrivers.registry import KINDS
 from mstools import cli
 from mstools.commands.check import check_vehicle
 from mstools.launch.drive import make_simulation
-from mstools.scaffold.templates import TEMPLATES
+from mstools.scaffold import TEMPLATES
 
 Run = Callable[..., tuple[int, str, str]]
 

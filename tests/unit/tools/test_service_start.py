@@ -13,7 +13,7 @@ from modelserver.errors import BusError, ConfigError, Location, ModelServerError
 from modelserver.server.supervision.file_watch import FileWatcher
 from modelserver.server.supervision.systemd import Notifier
 from mstools.cli import main
-from mstools.deployment.service_start import ServiceStart, format_status
+from mstools.commands.run import ServiceStart, format_status
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")

@@ -28,7 +28,7 @@ from modelserver.messages import (
 )
 from modelserver.wire.codec import encode
 from mstools.commands import status
-from mstools.terminal.health_text import (
+from mstools.commands.status import (
     MAX_ROWS,
     as_data,
     format_clock,

@@ -18,8 +18,7 @@ from modelserver.errors import Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import GeometryItem, ItemKind
-from mstools.edit.session import EditedFile, EditSession
+from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
 from mstools.view.editor import Editing, Editor
 from mstools.view.item_fields import Snap
 from mstools.view.page import open_page

@@ -14,7 +14,7 @@ from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.export import check_foxglove
 from mstools.commands.listener import iter_batches
 from mstools.terminal.options import PrefixOption, UrlOption, argument, choose_name, option
-from mstools.terminal.progress import catch_signals
+from mstools.terminal.output import catch_signals
 
 PROTOCOLS: Final = ("foxglove",)
 

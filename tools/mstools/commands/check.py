@@ -17,8 +17,7 @@ from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.commands.driver import find_driver_problems
 from mstools.terminal.options import JsonOption, Variables, argument, option, parse_variables
-from mstools.terminal.output import describe_size, escape, format_count, print_problems, to_json
-from mstools.terminal.problems import find_nearest_path
+from mstools.terminal.output import describe_size, escape, find_nearest_path, format_count, print_problems, to_json
 
 if TYPE_CHECKING:
     from modelserver.server.vehicle import Vehicle

@@ -16,15 +16,16 @@ from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, Pos
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
-from mstools.deployment.steps import get_examples_folder
-from mstools.launch.connections import (
+from mstools.deployment import get_examples_folder
+from mstools.launch.processes import (
+    ChildProcesses,
     EmulatedConnections,
+    LaunchError,
     get_start_utime,
     make_connections,
     start_devices,
     start_programs,
 )
-from mstools.launch.processes import ChildProcesses, LaunchError
 from mstools.terminal.options import option
 from mstools.terminal.output import escape
 

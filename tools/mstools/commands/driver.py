@@ -23,20 +23,19 @@ from modelserver.errors import (
     quote,
 )
 from modelserver.server.log import set_up_logging
-from mstools.commands.run import LEVELS, FormatOption, check_log_options
+from modelserver.server.supervision.systemd import Notifier
+from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
 from mstools.terminal.options import UrlOption, argument, option
 from mstools.terminal.output import escape, print_problems
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.messages import Sample
-    from modelserver.server.supervision.systemd import Notifier
     from msdrivers.links import Link
     from msdrivers.raw_log import TimeSource
     from msdrivers.registry import DeviceKind
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
-    from mstools.deployment.service_start import ServiceStart
 
 
 def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
@@ -114,8 +113,6 @@ def command(
       modelserver driver gps -c config/raptor/vehicle.yaml
       modelserver driver imu -c vehicle.yaml --record-raw imu.raw
     """
-    from modelserver.server.supervision.systemd import Notifier
-    from mstools.deployment.service_start import ServiceStart
 
     check_log_options(log_level, log_format)
     if list_ports:
@@ -267,7 +264,6 @@ def run(
     vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: ServiceStart
 ) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
-    from modelserver.server.supervision.systemd import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.factory import make_driver
     from msdrivers.health import DriverPublisher

@@ -11,8 +11,7 @@ import typer
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.wire.eventlog import LogFile
 from mstools.terminal.options import PrefixOption, argument, option
-from mstools.terminal.output import check_writable, format_count
-from mstools.terminal.progress import show_progress
+from mstools.terminal.output import check_writable, format_count, show_progress
 
 PROGRESS_EVENTS = 5_000
 

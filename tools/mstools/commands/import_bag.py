@@ -33,8 +33,7 @@ from mstools.recordings.bag_messages import (
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
 from mstools.recordings.mcap_log import is_mcap, is_ros_mcap, open_mcap
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape
-from mstools.terminal.progress import show_progress
+from mstools.terminal.output import check_writable, escape, show_progress
 
 
 def command(

@@ -17,7 +17,7 @@ from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
 from mstools.terminal.options import KeyOption, UrlOption, argument, choose_name, option
-from mstools.terminal.problems import make_error
+from mstools.terminal.output import make_error
 
 if TYPE_CHECKING:
     import lcm

@@ -17,33 +17,31 @@ from modelserver.messages import GpsSample, ImuSample
 from msdrivers.line_settings import SerialSettings
 from msdrivers.registry import KINDS, DeviceKind
 from mstools.commands.check import check_vehicle
-from mstools.scaffold.files import (
+from mstools.scaffold import (
     DBC_FILE,
     GEOMETRY_FILE,
-    MARK,
-    VEHICLE_FILE,
-    Device,
-    NewVehicle,
-    list_kinds,
-    list_marks,
-    make_dbc,
-    make_geometry,
-    make_vehicle,
-)
-from mstools.scaffold.guesses import (
     GPS_WORDS,
     IMU_WORDS,
+    MARK,
+    TEMPLATES,
+    VEHICLE_FILE,
+    Device,
     FrameChoices,
     Mount,
+    NewVehicle,
     Wheel,
     add_wheel_frames,
     guess_base,
     guess_kind,
     guess_sensor,
+    list_kinds,
+    list_marks,
     list_wheels,
+    make_dbc,
+    make_geometry,
+    make_vehicle,
     note_axes,
 )
-from mstools.scaffold.templates import TEMPLATES
 from mstools.terminal.options import choose_name, option
 from mstools.terminal.output import escape, print_problems, write_file
 

@@ -23,22 +23,21 @@ from mstools.commands.check import check_vehicle
 from mstools.commands.driver import load_driver
 from mstools.commands.emulate import SCENARIOS
 from mstools.commands.run import LEVELS, check_log_options
-from mstools.commands.status import HealthListener
+from mstools.commands.status import HealthListener, describe_pose
 from mstools.commands.view import check_installed
-from mstools.launch.connections import (
+from mstools.launch.processes import (
+    MODELSERVER,
     SERVICE,
     STATE_FOLDER,
+    ChildProcesses,
     EmulatedConnections,
     get_start_utime,
     make_connections,
     start_devices,
     start_programs,
 )
-from mstools.launch.processes import MODELSERVER, ChildProcesses
-from mstools.terminal.health_text import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
-from mstools.terminal.output import escape, print_problems
-from mstools.terminal.progress import catch_signals
+from mstools.terminal.output import catch_signals, escape, print_problems
 
 DEFAULT_FILE: Final = Path("vehicle.yaml")
 

@@ -21,8 +21,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.placement import PlacementError
 from modelserver.messages import ReloadReply
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
-from mstools.edit.session import EditSession
+from mstools.edit.document import EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.view.item_fields import ItemFields, Snap, list_frames
 from mstools.view.panels import escape_markdown
 from mstools.view.placing import PlacePanel

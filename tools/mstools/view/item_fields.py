@@ -21,8 +21,7 @@ from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
-from mstools.edit.session import EditSession
+from mstools.edit.document import EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError
 from mstools.view.number_fields import PRECISION, NumberFields, parse_typed
 

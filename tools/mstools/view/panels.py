@@ -20,7 +20,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
-from mstools.terminal.health_text import format_body, format_duration
+from mstools.commands.status import format_body, format_duration
 from mstools.view.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.view.scene import CHI_SQUARE_3, NameLabels
 from mstools.view.sources import Source, list_coordinates

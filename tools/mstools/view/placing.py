@@ -21,8 +21,7 @@ from modelserver.geometry.placement import (
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, ItemKind
-from mstools.edit.session import EditSession
+from mstools.edit.document import SAME_RADIANS, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError
 from mstools.view.item_fields import ChangeItem, find_part, list_frames
 from mstools.view.number_fields import NumberFields

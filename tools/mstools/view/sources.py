@@ -24,9 +24,9 @@ from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import iter_batches
-from mstools.commands.pose_source import load_given_model
-from mstools.edit.session import EditedFile, EditSession
+from mstools.edit.document import EditedFile, EditSession
 from mstools.recordings.log_platform import LogPlatform, scan_log
+from mstools.terminal.output import load_given_model
 from mstools.view.drive import Drive
 
 FILE_UTIME: Final = 10**15
