@@ -18,8 +18,7 @@ from modelserver.errors import ModelServerError
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.driver import load_driver, warn_of_names
-from mstools.commands.emulate import DriveOptions, log_end, samples_of
+from mstools.commands.driver import DriveOptions, load_driver, log_end, samples_of, warn_of_names
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 

@@ -20,8 +20,7 @@ from modelserver.files.regular import check_links
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
-from mstools.commands.driver import load_driver
-from mstools.commands.emulate import SCENARIOS
+from mstools.commands.driver import SCENARIOS, load_driver
 from mstools.commands.run import LEVELS, check_log_options
 from mstools.commands.status import HealthListener, describe_pose
 from mstools.commands.view import check_installed
