@@ -19,8 +19,8 @@ from msdrivers.line_settings import SerialSettings
 from msdrivers.registry import KINDS
 from mstools import cli
 from mstools.commands.check import check_vehicle
+from mstools.commands.new import TEMPLATES
 from mstools.launch.drive import make_simulation
-from mstools.scaffold import TEMPLATES
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from modelserver.config.vehicle_file import VehicleConfig, read_config_lines
+from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.errors import BusError, ConfigError, KeyFileError, Problem, Severity
 from modelserver.server.diagnostics.checks import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
 from modelserver.server.journal.segments import LOCK_NAME, list_segments
@@ -175,17 +175,13 @@ NO_JOURNAL: Final = "no journal is recorded"
 def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...]:
     """Return the findings on a vehicle file on this machine."""
     from modelserver.server.diagnostics.machine import list_interfaces
-    from modelserver.server.vehicle import examine_vehicle
-    from msdrivers.settings import SourceMap, read_drivers
-    from mstools.commands.driver import find_driver_problems
+    from mstools.commands.check import check_vehicle
+    from mstools.commands.driver import load_drivers
 
-    geometry, of_vehicle = examine_vehicle(vehicle, str(file))
-    of_drivers = find_driver_problems(vehicle, str(file), geometry.constraints)
-    drivers, _ = read_drivers(vehicle.drivers, SourceMap(str(file), read_config_lines(file)))
     return (
-        diagnose_vehicle_file((*geometry.problems, *of_vehicle, *of_drivers), file),
+        diagnose_vehicle_file(check_vehicle(str(file))[1], file),
         *diagnose_files(vehicle, file),
-        *diagnose_connections(drivers.values(), list_interfaces()),
+        *diagnose_connections(load_drivers(file)[1].values(), list_interfaces()),
     )
 
 

@@ -547,7 +547,6 @@ def emulate(
     link: Annotated[Path | None, option("--link PATH", "With --pty: create a symbolic link to it here.")] = None,
     tcp: Annotated[int | None, option("--tcp PORT", "Listen on loopback; 0: any port.", min=0, max=65535)] = None,
     can: Annotated[str, option("--can CHANNEL", "Connect to a CAN bus.")] = "",
-    interface: Annotated[str, option("--interface NAME", "With --can: python-can's name. Default: the driver's.")] = "",
     log: Annotated[Path | None, option("--from LOG", "Replay the samples of an LCM log.")] = None,
     scenario: Annotated[str, option("--scenario NAME", f"The simulated drive: {', '.join(SCENARIOS)}.")] = SCENARIOS[0],
     faults: Annotated[
@@ -594,7 +593,7 @@ def emulate(
             f"device {settings.kind.name} follows its commands and cannot replay a log", param_hint="--from"
         )
     own_field = _parse_field(iron)
-    line = _make_device_link(settings, link, tcp, can, interface)
+    line = _make_device_link(settings, link, tcp, can)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
@@ -612,9 +611,7 @@ def emulate(
     runner.run(lambda: runner.stop() if time.monotonic() >= end else None)
 
 
-def _make_device_link(
-    settings: DriverSettings, link: Path | None, tcp: int | None, can: str, interface: str
-) -> Link[Any]:
+def _make_device_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str) -> Link[Any]:
     """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
     from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
     from msdrivers.links.pty import PtyLink
@@ -627,7 +624,7 @@ def _make_device_link(
         from msdrivers.links.can_bus import CanLink
 
         given = settings.line.interface if isinstance(settings.line, CanSettings) else ""
-        return CanLink(can, interface or given)
+        return CanLink(can, given)
     if CanSettings in kinds:
         raise typer.BadParameter(f"a {settings.kind.name} is on a CAN bus: --can CHANNEL", param_hint="--can")
     if tcp is not None:

@@ -206,8 +206,6 @@ def command(
         str, option("--policy", f"What is accepted at that time: {', '.join(POLICIES)}.")
     ] = "interpolated",
     wait_ms: Annotated[int, option("--wait-ms", "Let the daemon wait for data that cover it.", min=0, max=60_000)] = 0,
-    inverse: Annotated[bool, option("--inverse", "Exchange the two frames.")] = False,
-    matrix: Annotated[bool, option("--matrix", "Print the 4x4 transform too.")] = False,
     explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
     motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
     expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
@@ -246,8 +244,6 @@ def command(
     is_demanding = any((max_horizontal, max_heading, max_age, min_integrity))
     if is_demanding and (explain or motion):
         raise typer.BadParameter("--explain and --motion go without a demand; run one after the other")
-    if inverse:
-        frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
     source: FrameClient
     if log is not None:
         recorded = source = open_log_answers(log, model, settings, prefix)
@@ -281,7 +277,7 @@ def command(
             min_integrity=min_integrity,
         )
     met = "\n  demand          met" if is_demanding and not answer.unmet else ""
-    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix) + met)
+    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer) + met)
     if answer.unmet:
         raise typer.Exit(EXIT_UNMET)
 
@@ -302,7 +298,7 @@ def _parse_time(text: str) -> int:
         ) from None
 
 
-def describe(answer: PoseAnswer, matrix: bool = False) -> str:
+def describe(answer: PoseAnswer) -> str:
     """Format an answer."""
     transformation = answer.transformation
     x, y, z = transformation.pose.xyz
@@ -319,8 +315,6 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
         meters = "  ".join(f"{math.sqrt(value):.4f}" for value in variances[:3])
         degrees = "  ".join(f"{math.degrees(math.sqrt(value)):.3f}" for value in variances[3:])
         lines.append(f"  sigma           {meters}  m,  {degrees}  deg")
-    if matrix:
-        lines += ["  transform", *("    " + "  ".join(f"{v: .6f}" for v in row) for row in transformation.matrix)]
     if transformation.utime:
         when = datetime.fromtimestamp(transformation.utime * 1e-6, UTC)
         lines.append(f"  at              {when.isoformat()}  ({transformation.utime})")

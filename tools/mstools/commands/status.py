@@ -12,11 +12,12 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from threading import Event
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
@@ -128,13 +129,13 @@ def command(
 
 
 class HealthListener(DaemonListener):
-    """Receive the health reports of one daemon and its drivers; `reports` counts the daemon's."""
+    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's."""
 
-    def __init__(self, bus: lcm.LCM, prefix: str):
+    def __init__(self, bus: lcm.LCM, prefix: str, more: Mapping[str, Callable[[Any], object]] = MappingProxyType({})):
         self.health: Health | None = None
         self.reports = 0
         self.drivers: dict[str, DriverHealth] = {}
-        super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver})
+        super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver, **more})
 
     def _on_health(self, health: Health) -> None:
         self.health = health

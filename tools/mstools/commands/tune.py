@@ -20,7 +20,7 @@ from modelserver.errors import ModelServerError, RecordingError
 from modelserver.messages import FixType, GpsSample
 from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape, format_count, show_progress, to_json, write_file
+from mstools.terminal.output import check_outputs, escape, format_count, show_progress, to_json, write_file
 from mstools.tuning import (
     EvaluationJob,
     EvaluationResult,
@@ -70,13 +70,16 @@ TUNABLES = (
 """In search order."""
 
 
+ROUNDS = 2
+"""Rounds over all settings, at most: a second one follows what the first one changed."""
+
+
 def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
     plot: Annotated[str, option("--plot HTML", "Write a page with the scores of all settings that were tried.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
-    rounds: Annotated[int, option("--rounds N", "Rounds over all settings, at most.", min=1, max=5)] = 2,
     processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
     as_json: JsonOption = False,
     force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
@@ -95,15 +98,7 @@ def command(
     """
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
-    named = [each for each in (output, plot) if each and each != "-"]
-    if len({os.path.realpath(each) for each in (*named, str(log), str(config))}) < len(named) + 2:
-        raise typer.BadParameter("LOG, --config, --plot and --output must be different files")
-    for target in named:
-        check_writable(target, force)
-    if plot:
-        charts.check_installed()
+    check_outputs((log, config), plot, output, as_json, force)
 
     vehicle = load(config)
     gps_channel(vehicle)
@@ -119,7 +114,7 @@ def command(
     parts: tuple[Part, ...] = ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
-    rounds = 1 if quick else rounds
+    rounds = 1 if quick else ROUNDS
     bound = len(parts) * (1 + rounds * len(chosen) * 2)
     with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(processes, len(parts)) as runs:
         trials = Trials(runs, log, config, parts, show)

@@ -110,6 +110,22 @@ def check_writable(path: str, replace: bool = True) -> None:
         raise ModelServerError(f"{escape(path)} cannot be written: no write permission for folder {escape(folder)}")
 
 
+def check_outputs(inputs: Sequence[Path], plot: str, output: str, as_json: bool, replace: bool) -> None:
+    """Raise typer.BadParameter or ModelServerError for outputs that cannot be written, before long work."""
+    from mstools.report import charts
+
+    if as_json and output == "-":
+        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
+    named = [each for each in (plot, output) if each and each != "-"]
+    files = [*named, *map(str, inputs)]
+    if len(set(map(os.path.realpath, files))) < len(files):
+        raise typer.BadParameter("inputs, --plot and --output must be different files")
+    for target in named:
+        check_writable(target, replace)
+    if plot:
+        charts.check_installed()
+
+
 def write_file(path: str, text: str, replace: bool) -> None:
     """Write a file atomically, see `open_atomic`; - is standard output, an empty path nothing."""
     if path == "-":
