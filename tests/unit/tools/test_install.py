@@ -43,8 +43,8 @@ Output = tuple[int, str, str]
 @pytest.fixture
 def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Output]:
     """Return a function that runs a command on a system below a folder, with a valid installation."""
-    monkeypatch.setattr(install, "check_installation", lambda: None)
-    monkeypatch.setattr(install, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
+    monkeypatch.setattr(install_steps, "check_installation", lambda: None)
+    monkeypatch.setattr(install_steps, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
     # there may be no systemd here; other tests check its commands
     monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/true")
     root = tmp_path / "root"
@@ -278,7 +278,7 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
 def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
     run: Callable[..., Output], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     good = vehicle.read_text()
     vehicle.write_text(good.replace("Raptor:CG", "Raptor:GC"))
     words = ("install", "--vehicle", str(vehicle), "--dry-run", "--drivers", "none,gsp,imu")
@@ -310,7 +310,7 @@ def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
 def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_reported_too(
     run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     vehicle.write_text("[")
     for file in (vehicle, vehicle.parent / "none.yaml"):
         code, _, err = run("install", "--vehicle", str(file), "--dry-run")

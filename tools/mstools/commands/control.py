@@ -234,7 +234,6 @@ def reload(
 
 
 def describe_reload(reply: ReloadReply, dry_run: bool) -> str:
-    """Format the result."""
     if not reply.changes:
         return f"nothing {'would change' if dry_run else 'changed'}: revision {escape(reply.revision)}"
     head = "would be" if dry_run else "is now"
@@ -243,7 +242,6 @@ def describe_reload(reply: ReloadReply, dry_run: bool) -> str:
 
 
 def reload_as_data(reply: ReloadReply, dry_run: bool) -> dict[str, object]:
-    """Return the result as JSON data."""
     return {
         "dry_run": dry_run,
         "revision": reply.revision,
@@ -473,7 +471,6 @@ _VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RE
 
 
 def describe_set_pose(result: SetPoseResult) -> str:
-    """Format the result."""
     pose = result.request.pose
     origin = result.geodesy.origin
     east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))

@@ -158,7 +158,6 @@ def describe(findings: Sequence[Diagnosis]) -> str:
 
 
 def as_data(findings: Sequence[Diagnosis]) -> dict[str, object]:
-    """Return findings as JSON data."""
     return {
         "exit_code": get_exit_code(findings),
         "findings": [dataclasses.asdict(each) | {"level": LEVEL_NAMES[each.level]} for each in findings],
@@ -173,7 +172,6 @@ NO_JOURNAL: Final = "no journal is recorded"
 
 
 def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...]:
-    """Return the findings on a vehicle file on this machine."""
     from modelserver.server.diagnostics.machine import list_interfaces
     from mstools.commands.check import check_vehicle
     from mstools.commands.driver import load_drivers

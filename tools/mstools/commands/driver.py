@@ -138,7 +138,6 @@ def command(
 
 
 def show_ports() -> None:
-    """Print the ports of this machine."""
     from msdrivers.links.can_bus import list_can_interfaces
     from msdrivers.links.serial_port import find_ports
 

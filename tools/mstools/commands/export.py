@@ -72,9 +72,7 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> Non
 
     from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
 
-    if out.exists() and not force:
-        raise ModelServerError(f"{out} exists; give another name, or --force to replace it")
-    check_writable(str(out))
+    check_writable(str(out), force)
     # written beside it first: an export that is interrupted leaves no half file under this name
     part = out.with_name(f".{out.name}.part")
     part.unlink(missing_ok=True)

@@ -113,7 +113,6 @@ class ImportReport:
     seconds: float = 0.0
 
     def to_text(self) -> str:
-        """Format the report."""
         total = sum(each.written for each in self.topics)
         lines = [f"{self.log}: {total} messages, {self.seconds:.1f} s"]
         for each in self.topics:

@@ -435,7 +435,6 @@ class NewVehicle:
 
 
 def make_geometry(vehicle: NewVehicle) -> str:
-    """Return the text of the geometry file."""
     template, body = vehicle.template, vehicle.body
 
     def frame(name: str, place: Place, comment: str, more: str = "") -> str:
@@ -515,7 +514,6 @@ def _frame_of_wheel(name: str) -> str:
 
 
 def make_vehicle(vehicle: NewVehicle) -> str:
-    """Return the text of the vehicle file."""
     template, mounts = vehicle.template, vehicle.mounts
     lines = [
         f"# {vehicle.name}: {template.summary}.",

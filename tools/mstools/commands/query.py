@@ -250,7 +250,12 @@ def command(
         utime = recorded.parse_time(at)
         utime = _parse_time(at) if utime is None else utime
     else:
-        source = open_answer_source(model, settings, url, prefix, timeout)
+        if model is not None:
+            source = FileAnswers(model, settings)
+        else:
+            from modelserver.client.remote import Platform
+
+            source = Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver")
         utime = _parse_time(at)
         # our time in seconds; as microseconds it would be the first three hours of 1970
         if 1_000_000_000 < utime < 10_000_000_000:
@@ -299,7 +304,6 @@ def _parse_time(text: str) -> int:
 
 
 def describe(answer: PoseAnswer) -> str:
-    """Format an answer."""
     transformation = answer.transformation
     x, y, z = transformation.pose.xyz
     roll, pitch, yaw = (math.degrees(angle) + 0.0 for angle in transformation.rpy)
@@ -449,14 +453,3 @@ def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, 
         there = f"{model} has revision {given.revision}, but the poses in {log} have {source.revision}"
         typer.echo(f"modelserver: note: {there}", err=True)
     return source
-
-
-def open_answer_source(
-    model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float
-) -> FrameClient:
-    """Open the source that the options select."""
-    if model is not None:
-        return FileAnswers(model, settings)
-    from modelserver.client.remote import Platform
-
-    return Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver")

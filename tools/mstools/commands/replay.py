@@ -286,7 +286,6 @@ class ReplayCounts:
     rejected: defaultdict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
     def count_pose(self, row: TrackRow) -> None:
-        """Count a pose."""
         self.written += 1
         self.valid += row.valid
         if not row.valid:
@@ -327,7 +326,6 @@ class ReplayCounts:
         }
 
     def to_text(self, run: OfflineRun, wall: float, has_poses: bool) -> str:
-        """Format the counts."""
         data, head = self.as_data(run, wall), ""
         if has_poses:
             head = f"{format_count(self.written, 'pose')} of {run.frame}, {self.valid} valid"

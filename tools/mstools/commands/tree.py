@@ -64,7 +64,7 @@ def command(
         raise typer.BadParameter("give a FILE, or --live for the running daemon", param_hint="FILE")
     if as_json and svg:
         raise typer.BadParameter("excludes --svg", param_hint="--json")
-    check_writable(svg)
+    check_writable(svg, force)
     model = receive_geometry(url, prefix, wait).model if live else load_geometry(file, parse_variables(variables))
     if as_json:
         typer.echo(json.dumps({body.name: [frame.full_name for frame in body.frames] for body in model.bodies}))

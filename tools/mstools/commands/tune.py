@@ -206,7 +206,6 @@ class TuningResult:
 
 
 def format_result(log: str, result: TuningResult) -> list[str]:
-    """Format the report as lines."""
     found = result.found
     text = [
         f"{log}: {format_count(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
