@@ -221,11 +221,6 @@ def guess_sensor(model: Model, words: Iterable[str], base: str) -> Mount | None:
     return Mount(frames[0], f"guessed from its name, {_describe_place(model, frames[0], base)}{others}")
 
 
-def list_wheels(model: Model, base: str) -> tuple[Wheel, ...]:
-    """Return the wheels: bodies so named that turn freely about an axis across the base frame."""
-    return tuple(_iterate_wheels(model, base))
-
-
 def guess_kind(wheels: Sequence[Wheel]) -> str:
     """Return the kind of vehicle, a name in TEMPLATES."""
     if any(wheel.is_steered for wheel in wheels):
@@ -254,7 +249,7 @@ def add_wheel_frames(
     mounts: dict[str, Mount] = {}
     places: list[Vector3] = []
     for name, typical in template.wheels.items():
-        stem = "".join(word.capitalize() for word in name.split("_")) + "Contact"
+        stem = _name_part(name, "Contact")
         if turning := _select_wheels(name, wheels):
             places.append(_find_contact(turning, base))
             mounts[name] = add(
@@ -285,7 +280,8 @@ def note_axes(model: Model, unit: Mount, device: str, base: str) -> Mount:
     return Mount(unit.frame, f"{unit.note}; {note}" if unit.note else note)
 
 
-def _iterate_wheels(model: Model, base: str) -> Iterator[Wheel]:
+def iterate_wheels(model: Model, base: str) -> Iterator[Wheel]:
+    """Yield the wheels: bodies so named that turn freely about an axis across the base frame."""
     assembly = next(each for each in model.assemblies if base.partition(":")[0] in each)
     for name, constraint in model.joints.items():
         for end in (constraint.to, constraint.from_):
@@ -390,16 +386,11 @@ class Device:
 
     @property
     def line_key(self) -> str:
-        return find_line_key(self.kind, self.line)
-
-
-def find_line_key(kind: DeviceKind, line: str) -> str:
-    """Return the key of a line in a driver's section: by its form, where the kind has several."""
-    keys = {SerialSettings: "port", TcpSettings: "address", CanSettings: "can", ModbusSettings: "address"}
-    if SerialSettings in kind.lines and TcpSettings in kind.lines:
-        is_address = "/" not in line and ":" in line
-        return "address" if is_address else "port"
-    return keys[kind.lines[0]]
+        """The key of the line in a driver's section: by its form, where the kind has several."""
+        keys = {SerialSettings: "port", TcpSettings: "address", CanSettings: "can", ModbusSettings: "address"}
+        if SerialSettings in self.kind.lines and TcpSettings in self.kind.lines:
+            return "address" if "/" not in self.line and ":" in self.line else "port"
+        return keys[self.kind.lines[0]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +414,7 @@ class NewVehicle:
         """The frames of the vehicle: those in a geometry that exists, else those of `make_geometry`."""
         if self.given is not None:
             return self.given
-        wheels = {name: Mount(f"{self.body}:{_frame_of_wheel(name)}") for name in self.template.wheels}
+        wheels = {name: Mount(f"{self.body}:{_name_part(name, 'Wheel')}") for name in self.template.wheels}
         base, gps, imu = (Mount(f"{self.body}:{frame}") for frame in ("Base", "Antenna", "ImuUnit"))
         return FrameChoices(base, gps, imu, wheels)
 
@@ -459,7 +450,7 @@ def make_geometry(vehicle: NewVehicle) -> str:
     ]
     if vehicle.wheels is not None:
         for name, place in template.wheels.items():
-            lines.append(frame(_frame_of_wheel(name), place, f"{MARK}: where the wheel touches the ground"))
+            lines.append(frame(_name_part(name, "Wheel"), place, f"{MARK}: where the wheel touches the ground"))
     if vehicle.gps is not None:
         lines.append(frame("Antenna", template.antenna, f"{MARK}: phase center of the antenna"))
     if vehicle.imu is not None:
@@ -509,8 +500,9 @@ def _make_head_joints(body: str) -> Iterator[str]:
         yield f"    joint: {{type: revolute, axis: {axis}, limits_deg: {limits}, sigma_deg: 0.5}}"
 
 
-def _frame_of_wheel(name: str) -> str:
-    return "".join(word.capitalize() for word in name.split("_")) + "Wheel"
+def _name_part(wheel: str, suffix: str) -> str:
+    """Return the name of something of a wheel: rear_left with Wheel is RearLeftWheel."""
+    return "".join(word.capitalize() for word in wheel.split("_")) + suffix
 
 
 def make_vehicle(vehicle: NewVehicle) -> str:
@@ -579,7 +571,7 @@ def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
         for name in vehicle.template.wheels:
             yield f"      {name}:"
             yield f"        count:   # {MARK}: the distance of one count is circumference / counts per turn"
-            yield f"          {{signal: WheelCounts.{_signal_of_wheel(name)}, meters_per_count: 0.001}}"
+            yield f"          {{signal: WheelCounts.{_name_part(name, 'Count')}, meters_per_count: 0.001}}"
 
     if vehicle.head is not None:
         yield f"  head:   # {vehicle.head.kind.description}"
@@ -596,14 +588,10 @@ def _quote(line: str) -> str:
     return f'"{line}"' if ":" in line else line
 
 
-def _signal_of_wheel(name: str) -> str:
-    return "".join(word.capitalize() for word in name.split("_")) + "Count"
-
-
 def make_dbc(vehicle: NewVehicle) -> str:
     """Return the text of an example DBC file: a 16-bit counter for each wheel, up when it rolls forward."""
     signals = "\n".join(
-        f' SG_ {_signal_of_wheel(name)} : {16 * number}|16@1+ (1,0) [0|65535] "" Computer'
+        f' SG_ {_name_part(name, "Count")} : {16 * number}|16@1+ (1,0) [0|65535] "" Computer'
         for number, name in enumerate(vehicle.template.wheels)
     )
     head = f'VERSION "{vehicle.name}"\n\nNS_ :\n\nBS_:\n\nBU_: Controller Computer\n\n'
@@ -680,7 +668,9 @@ def command(
     name = _check_name(ask.text("Name of the vehicle", name, folder.resolve().name or "vehicle"))
     base = None if model is None else Mount(base_frame) if base_frame else guess_base(model)
     turning = (
-        () if model is None or base is None else list_wheels(model, _check_frame(model, base.frame, "--base-frame"))
+        ()
+        if model is None or base is None
+        else tuple(iterate_wheels(model, _check_frame(model, base.frame, "--base-frame")))
     )
     kind = ask.choice(
         "Which kind of vehicle is it?", vehicle, known, guess_kind(turning) if turning else "skid", "--vehicle"
