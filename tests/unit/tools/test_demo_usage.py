@@ -8,8 +8,8 @@ import pytest
 
 from modelserver.messages import ChannelHealth
 from mstools.commands.demo import format_usage
-from mstools.commands.status import as_data, format_report
 from mstools.launch.processes import LaunchError
+from mstools.terminal.health_text import as_data, format_report
 from tests.unit.tools.test_status import WELL
 
 WHEELS = ChannelHealth("sensor:wheels", 1230, 100.0, 0.01, measured=217, used=215)

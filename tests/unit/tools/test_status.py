@@ -28,7 +28,7 @@ from modelserver.messages import (
 )
 from modelserver.wire.codec import encode
 from mstools.commands import status
-from mstools.commands.status import (
+from mstools.terminal.health_text import (
     MAX_ROWS,
     as_data,
     format_clock,

@@ -21,6 +21,7 @@ from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_lev
 from mstools.calibration.imu_recording import ImuRecording
 from mstools.calibration.report import AxisNoise, ImuNoise
 from mstools.calibration.sample_ranges import SampleRange, find_stationary_ranges
+from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_outputs, escape, format_count, write_file
 
@@ -253,6 +254,8 @@ def _check_options(begin: float, end: float, log: Path, plot: str, output: str, 
     if not (math.isfinite(begin) and begin >= 0.0 and end > begin):
         raise typer.BadParameter(f"--from {begin:g} --to {end:g} is no range; expected 0 <= from < to, seconds")
     check_outputs((log,), plot, output, as_json, force)
+    if plot:
+        charts.check_installed()
 
 
 def _print_damage(log: Path, recorded: ImuRecording) -> None:

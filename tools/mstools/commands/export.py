@@ -14,7 +14,6 @@ import typer
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import iter_batches
 from mstools.terminal.options import PrefixOption, UrlOption, option
 from mstools.terminal.output import catch_signals, check_writable, format_count, show_progress
 
@@ -109,6 +108,7 @@ def serve_live(bind: str, port: int, seconds: float, url: str, prefix: str) -> N
     """Serve the running service until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
     import foxglove
 
+    from mstools.recordings.drive import follow_bus
     from mstools.recordings.foxglove_messages import FoxgloveWriter
 
     context = foxglove.Context()
@@ -123,10 +123,7 @@ def serve_live(bind: str, port: int, seconds: float, url: str, prefix: str) -> N
         sys.stdout.flush()
         end = time.monotonic() + seconds
         with catch_signals() as stop:
-            for batch in iter_batches(bus, prefix, lambda: stop.is_set() or time.monotonic() >= end):
-                now = time.time_ns() // 1000
-                for channel, data in batch:
-                    writer.feed(channel, data, now)
+            follow_bus(bus, prefix, writer.feed, lambda: stop.is_set() or time.monotonic() >= end)
     finally:
         server.stop()
 

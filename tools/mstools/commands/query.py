@@ -440,15 +440,12 @@ class FileAnswers(FrameClient):
 
 def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:
     """Open a log as a source of poses, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
-    from modelserver.client.mirror_state import HISTORY_S
-    from modelserver.formats.snapshot import ModelSnapshot
     from mstools.recordings.log_platform import LogPlatform
 
     if model is None:
         return LogPlatform(log, prefix)
     given = load_given_model(model, parse_variables(settings))
-    root = f"{given.root.name}:{given.root.frames[0].name}"
-    source = LogPlatform(log, prefix, ModelSnapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
+    source = LogPlatform(log, prefix, given)
     if source.revision not in ("", given.revision):
         there = f"{model} has revision {given.revision}, but the poses in {log} have {source.revision}"
         typer.echo(f"modelserver: note: {there}", err=True)

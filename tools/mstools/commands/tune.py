@@ -99,6 +99,8 @@ def command(
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
     check_outputs((log, config), plot, output, as_json, force)
+    if plot:
+        charts.check_installed()
 
     vehicle = load(config)
     gps_channel(vehicle)

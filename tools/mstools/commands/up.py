@@ -22,7 +22,7 @@ from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
 from mstools.commands.driver import SCENARIOS, load_driver
 from mstools.commands.run import LEVELS, check_log_options
-from mstools.commands.status import HealthListener, describe_pose
+from mstools.commands.status import HealthListener
 from mstools.commands.view import check_installed
 from mstools.launch.processes import (
     MODELSERVER,
@@ -35,6 +35,7 @@ from mstools.launch.processes import (
     start_devices,
     start_programs,
 )
+from mstools.terminal.health_text import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
 from mstools.terminal.output import catch_signals, escape, print_problems
 

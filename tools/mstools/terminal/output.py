@@ -112,8 +112,6 @@ def check_writable(path: str, replace: bool = True) -> None:
 
 def check_outputs(inputs: Sequence[Path], plot: str, output: str, as_json: bool, replace: bool) -> None:
     """Raise typer.BadParameter or ModelServerError for outputs that cannot be written, before long work."""
-    from mstools.report import charts
-
     if as_json and output == "-":
         raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
     named = [each for each in (plot, output) if each and each != "-"]
@@ -122,8 +120,6 @@ def check_outputs(inputs: Sequence[Path], plot: str, output: str, as_json: bool,
         raise typer.BadParameter("inputs, --plot and --output must be different files")
     for target in named:
         check_writable(target, replace)
-    if plot:
-        charts.check_installed()
 
 
 def write_file(path: str, text: str, replace: bool) -> None:
