@@ -35,7 +35,7 @@ from modelserver.transforms.so3 import Quaternion
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import DaemonListener
+from mstools.commands.status import DaemonListener
 from mstools.terminal.options import (
     JsonOption,
     KeyOption,
