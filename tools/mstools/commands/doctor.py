@@ -371,7 +371,7 @@ def diagnose_connections(
     drivers: Iterable[DriverSettings], networks: Iterable[NetworkInterface]
 ) -> Iterator[Diagnosis]:
     """Yield the findings on the drivers' connections; `networks` are the network interfaces of this machine."""
-    from msdrivers.line_settings import CanSettings, SerialSettings
+    from msdrivers.registry import CanSettings, SerialSettings
 
     are_up = {each.name: each.up for each in networks}
     for driver in drivers:

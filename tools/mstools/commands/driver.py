@@ -52,8 +52,7 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
-    from msdrivers.settings import SourceMap, read_drivers
+    from msdrivers.settings import SourceMap, find_shared_lines, find_unbuildable_drivers, read_drivers
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
     drivers = found.values()
@@ -65,7 +64,7 @@ def find_misnamed(
     vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
+    from msdrivers.settings import find_backward_counters, find_unknown_joint, find_unknown_wheels
 
     wheels = vehicle.sensors.wheels
     for driver in drivers:
@@ -242,9 +241,9 @@ def _make_link(
     stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
 ) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
-    from msdrivers.factory import make_codec, make_link
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
     from msdrivers.runner import SystemTimeSource
+    from msdrivers.settings import make_codec, make_link
 
     codec = make_codec(settings)
     if play is not None:
@@ -267,9 +266,8 @@ def run(
 ) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.wire.provider import open_lcm, resolve_url
-    from msdrivers.factory import make_driver
-    from msdrivers.health import DriverPublisher
-    from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.settings import make_driver
 
     kind = settings.kind
     with start.wait_on_error():
@@ -324,7 +322,7 @@ def subscribe_commands(
     from modelserver.wire.channels import DRIVE_SIGNED, to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.provider import handle_message
-    from msdrivers.signed_commands import COMMAND_TYPE, CommandDeniedError, DriveVerifier
+    from msdrivers.runner import COMMAND_TYPE, CommandDeniedError, DriveVerifier
 
     prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
     plain = f"{prefix}{channel}"
@@ -575,7 +573,7 @@ def emulate(
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
       modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
     """
-    from msdrivers.emulate.faults import parse_fault
+    from msdrivers.emulate import parse_fault
 
     choose_name(scenario, SCENARIOS, "scenario", "--scenario")
     if (pty, tcp is not None, bool(can)).count(True) != 1:
@@ -596,8 +594,8 @@ def emulate(
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
-    from msdrivers.factory import make_emulator
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.settings import make_emulator
 
     station = make_emulator(settings, config.parent, samples, wanted)
     options = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen_timeout=math.inf)
@@ -612,9 +610,9 @@ def emulate(
 
 def _make_device_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str) -> Link[Any]:
     """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
-    from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
-    from msdrivers.links.pty import PtyLink
-    from msdrivers.links.tcp import TcpServerLink
+    from msdrivers.links import TcpServerLink
+    from msdrivers.links.serial_port import PtyLink
+    from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings
 
     kinds = settings.kind.lines
     if can:

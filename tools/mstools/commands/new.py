@@ -27,8 +27,7 @@ from modelserver.messages import GpsSample, ImuSample
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
-from msdrivers.registry import KINDS, DeviceKind
+from msdrivers.registry import KINDS, CanSettings, DeviceKind, ModbusSettings, SerialSettings, TcpSettings
 from mstools.commands.check import check_vehicle
 from mstools.terminal.options import choose_name, option
 from mstools.terminal.output import escape, print_problems, write_file
