@@ -7,7 +7,7 @@ batch. A batch is accepted as a whole or not at all; `read_segment` resynchroniz
 
     segment = head, files, state, (batch, seal) ..., end
 
-`encode_*` and `read_segment` are pure functions between records and bytes. `server.journal.segments` links segments.
+`encode_*` and `read_segment` are pure functions between records and bytes. `server.journal.writer` links segments.
 """
 
 from __future__ import annotations

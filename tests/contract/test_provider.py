@@ -20,7 +20,7 @@ from modelserver.errors import BusError
 from modelserver.server.bus import LcmBus
 from modelserver.wire.provider import SELECT_LIMIT, handle_message, open_lcm
 from modelserver.wire.urls import find_url_problem
-from mstools.commands.listener import DaemonListener
+from mstools.commands.status import DaemonListener
 
 WAIT_MS = 1000
 

@@ -1,4 +1,4 @@
-"""`modelserver bridge foxglove` as a process, and a client of its protocol (Foxglove WebSocket, foxglove.sdk.v1)."""
+"""`modelserver export --live` as a process, and a client of its protocol (Foxglove WebSocket, foxglove.sdk.v1)."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_given_a_running_service_then_a_client_of_the_protocol_receives_frames_p
 ) -> None:
     log = record_drive(tmp_path, 8.0)
     process = subprocess.Popen(
-        [*MODELSERVER, "bridge", "foxglove", "--port", "0", "--url", lcm_url], stdout=subprocess.PIPE, text=True
+        [*MODELSERVER, "export", "--live", "--port", "0", "--url", lcm_url], stdout=subprocess.PIPE, text=True
     )
     stop = threading.Event()
 
@@ -108,7 +108,7 @@ def test_given_a_port_in_use_then_the_error_names_the_option(lcm_url: str) -> No
         used.bind(("127.0.0.1", 0))
         used.listen()
         ended = subprocess.run(
-            [*MODELSERVER, "bridge", "foxglove", "--port", str(used.getsockname()[1]), "--url", lcm_url],
+            [*MODELSERVER, "export", "--live", "--port", str(used.getsockname()[1]), "--url", lcm_url],
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,

@@ -16,8 +16,8 @@ from support_drive import RAPTOR, SimulatedDrive
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import DriverHealth, DriverPhase
 from modelserver.wire.codec import decode
-from mstools.launch.connections import make_connections
 from mstools.launch.drive import make_simulation
+from mstools.launch.processes import make_connections
 
 CHANNELS = {"gps": "GPS", "imu": "IMU", "wheels": "WHEELS", "raptor": "VEHICLE_STATUS", "front_axis": "JOINTS"}
 LOCALIZING = ("gps", "imu", "wheels")

@@ -30,7 +30,6 @@ TOOLS = {
     "calibration": {"terminal", "report"},
     "tuning": {"terminal", "report"},
     "launch": {"terminal"},
-    "scaffold": {"terminal"},
     "deployment": {"terminal"},
     "view": {"terminal", "edit", "recordings"},
 }

@@ -11,45 +11,67 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
-from mstools.terminal.output import escape, print_problems
-from mstools.terminal.problems import suggest_path
+from mstools.terminal.output import escape, print_problems, suggest_path
 
-COMMANDS = {
-    "demo": "Run the whole service on simulated sensors and show its answers.",
-    "new": "Write the files of a new vehicle, from a few questions.",
-    "up": "Run the service and all drivers of a vehicle, or emulate them.",
-    "run": "Run the service for a vehicle file.",
-    "check": "Report every problem of a geometry or vehicle file.",
-    "convert": "Convert a geometry file to another format.",
-    "query": "Where is one frame in another?",
-    "dynamics": "Mass, center of mass, equations of motion, tip-over margin and wheel loads.",
-    "tree": "Draw the kinematic tree: constraints, joints, loops, orphans.",
-    "reload": "Reload the geometry file of the running daemon.",
-    "set-pose": "Set the pose of the vehicle in the running daemon.",
-    "key": "Create a key to sign commands with.",
-    "replay": "Replay a log on the bus, or offline through the localization.",
-    "mode": "Switch the localization mode of the running daemon.",
-    "tune": "Tune the filter's noise settings on a log, with withheld fixes.",
-    "calibrate": "Calibrate an IMU's noise, or its magnetometer, from a log.",
-    "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
-    "export": "Convert an LCM log to an MCAP file for Foxglove.",
-    "bridge": "Serve the running service to Foxglove.",
-    "driver": "Run the driver of a device: read it and publish its samples.",
-    "emulate": "Emulate a device for its driver.",
-    "view": "Show a geometry file, a log, or the running service in the browser.",
-    "status": "Show the health of the running daemon.",
-    "spy": "Show all channels decoded, in lcm-spy.",
-    "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
-    "install": "Install the service and its drivers under systemd, or remove them.",
+GROUPS = {
+    "Start": {
+        "demo": "Run the whole service on simulated sensors and show its answers.",
+        "new": "Write the files of a new vehicle, from a few questions.",
+        "up": "Run the service and all drivers of a vehicle, or emulate them.",
+        "run": "Run the service for a vehicle file.",
+    },
+    "Geometry": {
+        "check": "Report every problem of a geometry or vehicle file.",
+        "convert": "Convert a geometry file to another format.",
+        "query": "Where is one frame in another?",
+        "dynamics": "Mass, center of mass, equations of motion, tip-over margin and wheel loads.",
+        "tree": "Draw the kinematic tree: constraints, joints, loops, orphans.",
+        "view": "Show a geometry file, a log, or the running service in the browser.",
+    },
+    "Service": {
+        "status": "Show the health of the running daemon, or all channels in lcm-spy.",
+        "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
+        "mode": "Switch the localization mode of the running daemon.",
+        "reload": "Reload the geometry file of the running daemon.",
+        "set-pose": "Set the pose of the vehicle in the running daemon.",
+        "key": "Create a key to sign commands with.",
+    },
+    "Recordings": {
+        "replay": "Replay a log on the bus, or offline through the localization.",
+        "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
+        "export": "Convert an LCM log to an MCAP file for Foxglove, or serve the running service to it.",
+    },
+    "Tuning": {
+        "tune": "Tune the filter's noise settings on a log, with withheld fixes.",
+        "calibrate": "Calibrate an IMU's noise, or its magnetometer, from a log.",
+    },
+    "Deployment": {
+        "driver": "Run the driver of a device: read it and publish its samples.",
+        "emulate": "Emulate a device for its driver.",
+        "install": "Install the service and its drivers under systemd, or remove them.",
+    },
 }
-"""Subcommands with their summary. `import-bag` is function `command` of module `mstools.commands.import_bag`; a command
-with subcommands of its own has a Typer application there instead."""
+"""Subcommands with their summary, in the groups of `modelserver --help`."""
+
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+
+_MODULES = {
+    "convert": "check",
+    "emulate": "driver",
+    "key": "control",
+    "mode": "control",
+    "reload": "control",
+    "set-pose": "control",
+}
+"""Modules that hold more commands than that of their own name, each as a function of its name. Else a command is
+`command` in the module of its name. One with subcommands of its own is a Typer application there."""
 
 COMPLETION_VARIABLE = "_MODELSERVER_COMPLETE"
 """Environment variable with which a shell asks for completions."""
@@ -61,12 +83,11 @@ _ALIASES = {
     "check": "validate lint",
     "replay": "play verify journal",
     "import-bag": "import",
-    "export": "mcap foxglove",
+    "export": "mcap foxglove bridge",
     "mode": "switch",
     "set-pose": "set initialpose localize",
-    "status": "watch health top",
+    "status": "watch health top spy listen echo",
     "doctor": "diagnose probe",
-    "spy": "listen echo",
     "tree": "graph draw bodies frames",
     "reload": "hup",
     "install": "setup uninstall remove",
@@ -125,9 +146,19 @@ def _open_closed_streams() -> None:
             setattr(sys, name, open(opened, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
+class GroupedHelp(TyperGroup):
+    """Application whose help lists the commands in their groups."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        for title, commands in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl(list(commands.items()))
+
+
 def build_app(arguments: Sequence[str]) -> typer.Typer:
     """Return the application. Only the subcommand in `arguments` is imported, the others are stubs, for speed."""
     app = typer.Typer(
+        cls=GroupedHelp,
         help="Where is A relative to B, now or at time t, and with which uncertainty?",
         epilog="Start with: modelserver demo, then modelserver new",
         add_completion=True,
@@ -152,8 +183,9 @@ def _import_command(name: str) -> Callable[..., None] | typer.Typer:
     """Import a subcommand with the garbage collector off, which saves a sixth of the time."""
     gc.disable()
     try:
-        command: Callable[..., None] | typer.Typer
-        command = importlib.import_module(f"mstools.commands.{name.replace('-', '_')}").command
+        own = name.replace("-", "_")
+        module = importlib.import_module(f"mstools.commands.{_MODULES.get(name, own)}")
+        command: Callable[..., None] | typer.Typer = getattr(module, own if name in _MODULES else "command")
         return command
     finally:
         gc.freeze()

@@ -31,7 +31,7 @@ from modelserver.wire.urls import UdpAddress
 from msdrivers.settings import read_drivers
 from mstools.cli import main
 from mstools.commands import doctor
-from mstools.deployment.diagnosis import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
+from mstools.commands.doctor import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
 
 LO = NetworkInterface("lo", loopback=True)
 WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)

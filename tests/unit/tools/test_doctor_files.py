@@ -15,8 +15,8 @@ from support_signing import ALLOWED, write_test_key
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.server.diagnostics import Diagnosis, DiagnosisLevel
 from modelserver.signing.key_files import read_keys
-from mstools.deployment import diagnosis
-from mstools.deployment.diagnosis import diagnose_files, diagnose_keys, diagnose_state, diagnose_storage
+from mstools.commands import doctor as diagnosis
+from mstools.commands.doctor import diagnose_files, diagnose_keys, diagnose_state, diagnose_storage
 
 
 class Usage(NamedTuple):

@@ -18,8 +18,7 @@ from modelserver.errors import ModelServerError
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.driver import load_driver, warn_of_names
-from mstools.commands.emulate import DriveOptions, log_end, samples_of
+from mstools.commands.driver import DriveOptions, load_driver, log_end, samples_of, warn_of_names
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 
@@ -163,8 +162,7 @@ def test_given_a_log_without_the_channel_or_of_long_ago_then_it_is_an_error_at_o
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:
-    from mstools.commands.driver import constraints_of
-    from mstools.deployment.diagnosis import find_driver_problems
+    from mstools.commands.driver import constraints_of, find_driver_problems
 
     path = RAPTOR / "vehicle.yaml"
     config = load_config(path)

@@ -10,8 +10,7 @@ import pytest
 
 from modelserver.errors import GeometryError
 from modelserver.formats import load_model
-from mstools.edit.document import GeometryItem, ItemKind
-from mstools.edit.session import EditedFile, EditSession
+from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"

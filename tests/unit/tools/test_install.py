@@ -13,12 +13,14 @@ import pytest
 
 from modelserver.errors import ConfigError, ModelServerError, Severity
 from modelserver.signing.key_files import generate_key, write_key
+from mstools import deployment as install_steps
 from mstools.cli import main
 from mstools.commands import install
 from mstools.commands.check import check_vehicle
-from mstools.deployment import steps as install_steps
-from mstools.deployment.files import (
+from mstools.deployment import (
+    SYSCTL,
     SerialDriver,
+    SystemFacts,
     check_drivers,
     check_visible,
     find_hiding_setting,
@@ -29,7 +31,6 @@ from mstools.deployment.files import (
     render_udev_rules,
     render_units,
 )
-from mstools.deployment.plan import SYSCTL, SystemFacts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 OWN_KEY = "commands.key"
@@ -42,8 +43,8 @@ Output = tuple[int, str, str]
 @pytest.fixture
 def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Output]:
     """Return a function that runs a command on a system below a folder, with a valid installation."""
-    monkeypatch.setattr(install, "check_installation", lambda: None)
-    monkeypatch.setattr(install, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
+    monkeypatch.setattr(install_steps, "check_installation", lambda: None)
+    monkeypatch.setattr(install_steps, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
     # there may be no systemd here; other tests check its commands
     monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/true")
     root = tmp_path / "root"
@@ -263,7 +264,7 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
     python.parent.chmod(0o700)
     monkeypatch.setattr(install_steps.sys, "executable", str(python))
     monkeypatch.setattr(install_steps.sys, "base_prefix", "/home/me/python")
-    monkeypatch.setattr(install_steps.install_files, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
+    monkeypatch.setattr(install_steps, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
     monkeypatch.setattr(install_steps, "files", lambda name: tmp_path)
     with pytest.raises(ConfigError) as caught:
         install_steps.check_installation()
@@ -277,7 +278,7 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
 def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
     run: Callable[..., Output], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     good = vehicle.read_text()
     vehicle.write_text(good.replace("Raptor:CG", "Raptor:GC"))
     words = ("install", "--vehicle", str(vehicle), "--dry-run", "--drivers", "none,gsp,imu")
@@ -309,7 +310,7 @@ def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
 def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_reported_too(
     run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     vehicle.write_text("[")
     for file in (vehicle, vehicle.parent / "none.yaml"):
         code, _, err = run("install", "--vehicle", str(file), "--dry-run")

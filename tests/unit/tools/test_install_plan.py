@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import ModelServerError
-from mstools.deployment.plan import (
+from mstools.deployment import (
     CONFIGURATION,
     MANIFEST,
     RULES,

@@ -10,7 +10,7 @@ from modelserver.config.vehicle_file import load_config
 from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_drivers
-from mstools.launch import connections
+from mstools.launch import processes as connections
 from mstools.launch.processes import LaunchError
 
 

@@ -30,7 +30,7 @@ from modelserver.signing.signatures import has_valid_signature
 from modelserver.transforms import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
-from mstools.commands.mode import MODES, parse_mode
+from mstools.commands.control import MODES, parse_mode
 
 LISTENS = VEHICLE + "commands: {key_file: commands.key}\nlocalization: {mode_channel: console/mode}\n"
 Run = Callable[..., tuple[int, str, str]]
@@ -126,7 +126,7 @@ def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_r
     with reserved_url() as url:
         with Answering(url, decides=True):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
-        monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 1.0)
+        monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 1.0)
         with Answering(url):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
         with Answering(url, mode=Mode.RAW):
@@ -136,7 +136,7 @@ def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_r
 def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.5)
+    monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 0.5)
     with reserved_url() as url, Answering(url, applies=False):
         code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
     assert (code, out) == (1, "")
@@ -146,7 +146,7 @@ def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
 def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.1)
+    monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 0.1)
     with reserved_url() as url:
         config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{url: '{url}'}}\n")
         listener = Listener(url, "MODELSERVER_SIGNED")
@@ -159,7 +159,7 @@ def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(
 def test_given_a_state_that_is_never_published_then_it_reports_that_nothing_confirms(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.5)
+    monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 0.5)
     config = write_vehicle(tmp_path, f"{LISTENS}publish: {{state_hz: 0}}\n")
     with reserved_url() as url, Answering(url, mode=Mode.RAW, applies=False):
         code, out, _ = run("no_gps", "-c", config, "--url", url)

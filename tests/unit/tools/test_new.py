@@ -18,8 +18,8 @@ from modelserver.messages import GpsSample, ImuSample, WheelsSample
 from msdrivers.registry import KINDS, SerialSettings
 from mstools import cli
 from mstools.commands.check import check_vehicle
+from mstools.commands.new import TEMPLATES
 from mstools.launch.drive import make_simulation
-from mstools.scaffold.templates import TEMPLATES
 
 Run = Callable[..., tuple[int, str, str]]
 

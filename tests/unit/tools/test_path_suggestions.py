@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mstools.cli import main
-from mstools.terminal.problems import find_nearest_path, suggest_path
+from mstools.terminal.output import find_nearest_path, suggest_path
 
 
 @pytest.fixture

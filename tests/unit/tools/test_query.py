@@ -117,11 +117,9 @@ def test_given_the_reports_own_file_then_the_answer_is_the_same(run: Command, da
     assert math.degrees(found["rpy"][1]) == pytest.approx(-19.25, abs=0.01)
 
 
-def test_given_inverse_then_it_is_the_reverse_relation(run: Command, annex: Path) -> None:
+def test_given_the_frames_in_reverse_then_it_is_the_inverse_relation(run: Command, annex: Path) -> None:
     there = json.loads(run("query", *PAIR, "--model", annex, "--json")[1])
-    back = json.loads(run("query", *PAIR, "--model", annex, "--json", "--inverse")[1])
-    turned = json.loads(run("query", *reversed(PAIR), "--model", annex, "--json")[1])
-    assert back == turned
+    back = json.loads(run("query", *reversed(PAIR), "--model", annex, "--json")[1])
     assert (back["frame_of_interest"], back["frame_of_reference"]) == (PAIR[1], PAIR[0])
     assert np.allclose(np.array(there["matrix"]) @ np.array(back["matrix"]), np.eye(4), atol=1e-12)
 
@@ -142,9 +140,8 @@ def test_given_json_then_every_field_is_there_and_what_is_not_known_is_null(run:
     assert len(found["model_revision"]) == 16
 
 
-def test_given_matrix_then_its_four_rows_follow(run: Command, annex: Path) -> None:
-    plain, matrix = (run("query", *PAIR, "--model", annex, *more)[1].splitlines() for more in ((), ("--matrix",)))
-    rows = [[float(value) for value in line.split()] for line in matrix if line not in plain and "." in line]
+def test_given_json_then_its_matrix_has_four_rows(run: Command, annex: Path) -> None:
+    rows = json.loads(run("query", *PAIR, "--model", annex, "--json")[1])["matrix"]
     assert np.allclose(
         rows, [[0.9441, 0, -0.3297, 0.299], [0, 1, 0, -0.056], [0.3297, 0, 0.9441, 0.433], [0, 0, 0, 1]], atol=1e-4
     )

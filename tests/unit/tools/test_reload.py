@@ -12,7 +12,7 @@ from modelserver.errors import NoServerError
 from modelserver.messages import ReloadReply, ReplyHeader
 from modelserver.transforms import Pose, Transformation
 from mstools.cli import main
-from mstools.commands.reload import as_data, describe
+from mstools.commands.control import describe_reload, reload_as_data
 
 SAME = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "aaaa")
 OTHER = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "bbbb", ("body Lamp is gone", "evil\x1b[2J"))
@@ -28,13 +28,13 @@ OTHER = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "bbbb", ("body Lam
     ],
 )
 def test_given_a_reply_then_people_see_what_changes(reply: ReloadReply, dry_run: bool, words: list[str]) -> None:
-    text = describe(reply, dry_run)
+    text = describe_reload(reply, dry_run)
     assert text.splitlines()[: len(words)] == words
     assert all(line.isprintable() for line in text.splitlines())
 
 
 def test_given_a_reply_then_scripts_see_both_revisions() -> None:
-    assert json.loads(json.dumps(as_data(OTHER, True))) == {
+    assert json.loads(json.dumps(reload_as_data(OTHER, True))) == {
         "dry_run": True,
         "revision": "bbbb",
         "revision_in_force": "aaaa",

@@ -16,7 +16,7 @@ from modelserver.signing.key_files import generate_key, write_key
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import JournalRecord, encode_batch, read_segment
 from mstools import cli
-from mstools.commands.replay_verify import find_differences
+from mstools.commands.replay import find_differences
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -12,7 +12,7 @@ from support_samples import VEHICLE, write_vehicle
 from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
 from modelserver.server.supervision import FileWatcher, Notifier
 from mstools.cli import main
-from mstools.deployment.service_start import ServiceStart, format_status
+from mstools.commands.run import ServiceStart, format_status
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")

@@ -17,12 +17,12 @@ from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.set_pose import (
+from mstools.commands.control import (
     PoseTarget,
     SetPoseListener,
     SetPoseResult,
-    as_data,
-    describe,
+    describe_set_pose,
+    set_pose_as_data,
     to_covariance,
     to_pose,
 )
@@ -169,7 +169,7 @@ def result(decision: Decision | None, has_decisions: bool = True, reasons: int =
     ],
 )
 def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: SetPoseResult, line: str) -> None:
-    lines = describe(shown).splitlines()
+    lines = describe_set_pose(shown).splitlines()
     assert lines[0].startswith("Cart:Base in World:UTM: position (30.000, 40.000, 2.000) m")
     assert f"easting {UTM[0]:.3f} m, northing {UTM[1]:.3f} m, height {UTM[2]:.3f} m, zone 12 north" in lines[1]
     assert lines[2] == "  sigma 1 m, 5 deg"
@@ -178,10 +178,10 @@ def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: SetP
 
 
 def test_given_a_result_then_scripts_get_si_units_and_null_for_what_is_not_known() -> None:
-    found = json.loads(json.dumps(as_data(result(USED, reasons=1)), allow_nan=False))
+    found = json.loads(json.dumps(set_pose_as_data(result(USED, reasons=1)), allow_nan=False))
     assert found["state_vector"] == [30.0, 40.0, 2.0, 1.0, 0.0, 0.0, 0.0]
     assert found["sigma"] == pytest.approx([1.0] * 3 + [math.radians(5.0)] * 3)
     assert found["decision"] == {"utime": 5, "verdict": "used", "reason": "", "statistic": 3.25, "limit": 22.5}
     assert found["pose_after"]["valid"] is False
-    found = json.loads(json.dumps(as_data(result(None)), allow_nan=False))
+    found = json.loads(json.dumps(set_pose_as_data(result(None)), allow_nan=False))
     assert found["decision"] is None

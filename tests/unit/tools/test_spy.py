@@ -1,4 +1,4 @@
-"""`modelserver spy`: the jar is built once and whole; what is missing is named with what to do."""
+"""`modelserver status --spy`: the jar is built once and whole; what is missing is named with what to do."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import shutil
 import stat
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from support_lcm import MODELSERVER
 
 from modelserver.wire.channels import DEFAULT_URL
 from mstools.cli import main
-from mstools.commands import spy
+from mstools.commands import status
 from mstools.lcm_wheel import MissingToolError, find_type_files
+
+BUILD = "from mstools.commands.status import get_types_jar; print(get_types_jar())"
 
 needs_javac = pytest.mark.skipif(shutil.which("javac") is None, reason="no Java compiler (default-jdk-headless)")
 
@@ -43,17 +46,17 @@ def _program(path: Path, text: str = "exit 0") -> None:
 
 def _failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     with pytest.raises(SystemExit) as ended:
-        main(["spy", *arguments])
+        main(["status", "--spy", *arguments])
     assert ended.value.code == 1
     return capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
 def built_jar(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Build the jar by the command, once for all tests; return the empty cache that it began with and its output."""
+    """Build the jar in a process of its own, once; return the empty cache that it began with and its output."""
     folder = tmp_path_factory.mktemp("cache")
     done = subprocess.run(
-        [*MODELSERVER, "spy", "--build-only"],
+        [sys.executable, "-c", BUILD],
         capture_output=True,
         text=True,
         timeout=120,
@@ -77,36 +80,26 @@ def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_re
     assert classes == {f"mslcm/{path.stem}.class" for path in find_type_files()}
     assert [path.name for path in jar.parent.iterdir()] == ["mslcm.jar"]
     built = jar.stat().st_mtime_ns
-    assert spy.get_types_jar() == jar
+    assert status.get_types_jar() == jar
     assert jar.stat().st_mtime_ns == built
 
 
-@pytest.mark.slow
-@needs_javac
-def test_given_build_only_when_run_as_a_command_then_the_path_alone_is_printed(built_jar: tuple[Path, str]) -> None:
-    cache, out = built_jar
-    (line,) = out.splitlines()
-    assert Path(line).is_file()
-    assert Path(line).is_relative_to(cache)
-
-
 def test_given_a_retained_jar_when_there_is_no_compiler_then_it_is_used(cache: Path, only: Path) -> None:
-    jar = cache / spy.hash_contract(find_type_files()) / "mslcm.jar"
+    jar = cache / status.hash_contract(find_type_files()) / "mslcm.jar"
     jar.parent.mkdir(parents=True)
     jar.write_bytes(b"")
-    assert spy.get_types_jar() == jar
+    assert status.get_types_jar() == jar
 
 
-def test_given_no_compiler_when_built_then_it_reports_what_to_install(
-    cache: Path, only: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "sudo apt install default-jdk-headless" in _failure(capsys, "--build-only")
+def test_given_no_compiler_when_built_then_it_reports_what_to_install(cache: Path, only: Path) -> None:
+    with pytest.raises(MissingToolError, match="sudo apt install default-jdk-headless"):
+        status.get_types_jar()
 
 
 def test_given_a_compiler_that_fails_when_built_then_it_reports_it_and_leaves_nothing(cache: Path, only: Path) -> None:
     _program(only / "javac", "echo 'error: out of luck' >&2; exit 1")
     with pytest.raises(MissingToolError, match="javac failed: error: out of luck"):
-        spy.get_types_jar()
+        status.get_types_jar()
     assert [path for path in cache.rglob("*") if path.is_file()] == []
 
 
@@ -152,7 +145,7 @@ def test_given_all_it_needs_when_run_then_lcm_spy_takes_its_place_with_jar_and_u
     default: str,
     expected: str,
 ) -> None:
-    jar = cache / spy.hash_contract(find_type_files()) / "mslcm.jar"
+    jar = cache / status.hash_contract(find_type_files()) / "mslcm.jar"
     jar.parent.mkdir(parents=True)
     jar.write_bytes(b"")
     # stands for java: what lcm-spy, which is a shell script, starts in the end
@@ -162,6 +155,6 @@ def test_given_all_it_needs_when_run_then_lcm_spy_takes_its_place_with_jar_and_u
     monkeypatch.setenv("DISPLAY", ":1")
     monkeypatch.setenv("CLASSPATH", "/mine.jar")
     monkeypatch.setenv("LCM_DEFAULT_URL", default)
-    done = subprocess.run([*MODELSERVER, "spy", *arguments], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([*MODELSERVER, "status", "--spy", *arguments], capture_output=True, text=True, timeout=60)
     assert done.returncode == 7, done.stderr
     assert done.stdout.splitlines() == [f"{jar}{os.pathsep}/mine.jar", f"--lcm-url={expected}"]

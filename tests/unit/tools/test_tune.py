@@ -27,8 +27,7 @@ from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, Timing, WheelsModel
 from mstools import cli
 from mstools.commands.tune import TUNABLES, choose_parameters
-from mstools.tuning.evaluation import EvaluationJob, evaluate, mixture_log_density
-from mstools.tuning.search import Parameter, Score, search
+from mstools.tuning import EvaluationJob, Parameter, Score, evaluate, mixture_log_density, search
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -262,8 +261,7 @@ import time
 from pathlib import Path
 from mstools import cli
 from mstools.commands import tune
-from mstools.tuning import evaluation
-from mstools.tuning.evaluation import EvaluationJob
+from mstools.tuning import EvaluationJob
 
 def read_pipe(job: EvaluationJob) -> None:
     job.config.read_bytes()
@@ -273,7 +271,7 @@ def command(log: Path, config: Path) -> None:
         runs([EvaluationJob(log, config, "half", ())] * 2)
 
 # in the workers too: each imports this file
-evaluation.evaluate = read_pipe
+tune.evaluate = read_pipe
 tune.command = command
 if __name__ == "__main__":
     cli.main(["tune", *sys.argv[1:]])

@@ -22,8 +22,7 @@ from modelserver.messages import FixType
 from modelserver.transforms.so3 import Array, Vector3
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
-from mstools.terminal.output import format_count
-from mstools.terminal.progress import show_progress
+from mstools.terminal.output import format_count, show_progress
 
 
 class CalibrationError(ModelServerError, ValueError):

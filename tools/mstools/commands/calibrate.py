@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +27,7 @@ from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_lev
 from mstools.calibration.report import AxisNoise, ImuNoise, MountCheck, axis_name, check_mount
 from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape, format_count, write_file
+from mstools.terminal.output import check_outputs, escape, format_count, write_file
 
 MIN_STATIONARY_S = 60.0
 """Shortest stationary range with a proposal, seconds: noise at 1 s averaging is then known to 10 %."""
@@ -258,15 +257,9 @@ def _parse_place(text: str) -> Vector3 | None:
 def _check_options(begin: float, end: float, log: Path, plot: str, output: str, as_json: bool, force: bool) -> None:
     if not (math.isfinite(begin) and begin >= 0.0 and end > begin):
         raise typer.BadParameter(f"--from {begin:g} --to {end:g} is no range; expected 0 <= from < to, seconds")
-    named = [each for each in (plot, output) if each and each != "-"]
-    if len({os.path.realpath(each) for each in (*named, str(log))}) <= len(named):
-        raise typer.BadParameter("LOG, --plot and --output must be different files")
-    for target in named:
-        check_writable(target, force)
+    check_outputs((log,), plot, output, as_json, force)
     if plot:
         charts.check_installed()
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
 
 
 def _print_damage(log: Path, recorded: ImuRecording) -> None:

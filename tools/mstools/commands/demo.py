@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -15,16 +15,17 @@ from modelserver.errors import NoServerError, QueryError
 from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import DaemonListener
-from mstools.deployment.steps import get_examples_folder
-from mstools.launch.connections import (
+from mstools.commands.status import HealthListener
+from mstools.deployment import get_examples_folder
+from mstools.launch.processes import (
+    ChildProcesses,
     EmulatedConnections,
+    LaunchError,
     get_start_utime,
     make_connections,
     start_devices,
     start_programs,
 )
-from mstools.launch.processes import ChildProcesses, LaunchError
 from mstools.terminal.options import option
 from mstools.terminal.output import escape
 
@@ -139,7 +140,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
             )
         for text in (
             f"{received} poses in {max(seconds, since):.0f} s, {len(valid)} of them valid",
-            *format_usage(listener.service),
+            *format_usage(listener.health),
         ):
             typer.echo(f"   {text}")
 
@@ -177,27 +178,14 @@ def format_usage(service: Health | None) -> list[str]:
     return [f"{name}: {each.used} of {each.measured} measurements used" for name, each in used.items()] + warnings
 
 
-class PoseListener(DaemonListener):
+class PoseListener(HealthListener):
     """Receive the poses, and the last health reports of the server and, by name, of the drivers."""
 
     def __init__(self, url: str, prefix: str):
         self.poses: list[PoseAnswer] = []
-        self.drivers: dict[str, DriverHealth] = {}
-        self.service: Health | None = None
-        handlers: dict[str, Callable[[Any], object]] = {
-            "POSE": self.poses.append,
-            "DRIVER_HEALTH": self._on_driver,
-            "MODELSERVER_HEALTH": self._on_health,
-        }
-        super().__init__(open_lcm(resolve_url(url)), prefix, handlers)
+        super().__init__(open_lcm(resolve_url(url)), prefix, {"POSE": self.poses.append})
         for each in self.subscriptions:
             each.set_queue_capacity(0)
-
-    def _on_driver(self, health: DriverHealth) -> None:
-        self.drivers[health.source] = health
-
-    def _on_health(self, health: Health) -> None:
-        self.service = health
 
 
 def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> list[str]:

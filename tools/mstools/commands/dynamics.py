@@ -93,44 +93,8 @@ def command(
                     "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
                     param_hint=name,
                 )
-        from modelserver.client.remote import Platform
-
-        with Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver") as platform:
-            found = platform.get_dynamics(frame, equations=equations or npy is not None, floating=floating)
-        D = np.array(found.mass_matrix).reshape((len(found.coordinates),) * 2)
-        covariance = None if found.center_covariance is None else np.array(found.center_covariance).reshape(3, 3)
-        inertia = np.array(found.inertia).reshape(6, 6)
-        data = _describe_mass(found.mass, found.frame, np.array(found.center), covariance, inertia)
-        data["utime"], data["invalid_reasons"] = found.utime, found.invalid_reasons.explain()
-        if equations:
-            data |= _describe_equations(found.coordinates, found.position, found.gravity, D) | {"bias": found.bias}
-    else:
-        data, D = _compute(
-            model, config, settings, frame, joints, payload, masses, contacts, tilt, acceleration,
-            floating, equations, allow_massless, cut_loops,
-        )  # fmt: skip
-    if npy is not None:
-        np.save(npy, D)
-    typer.echo(json.dumps(to_json(data), indent=2) if as_json else format_dynamics(data))
-
-
-def _compute(
-    model: Path | None,
-    config: Path | None,
-    settings: list[str] | None,
-    frame: str,
-    joints: Sequence[str] | None,
-    payload: Sequence[str] | None,
-    masses: Sequence[str] | None,
-    contacts: Sequence[str] | None,
-    tilt: tuple[float, float],
-    acceleration: tuple[float, float, float],
-    floating: bool,
-    equations: bool,
-    allow_massless: bool,
-    cut_loops: bool,
-) -> tuple[dict[str, Any], Any]:
-    """Return what the files state, and the mass matrix."""
+        _show(*_query_daemon(frame, floating, equations, npy is not None, url, prefix, timeout), npy, as_json)
+        return
     from modelserver.dynamics import MassUncertainty, assess_stability
     from modelserver.dynamics.settings import DynamicsSettings
     from modelserver.transforms import so3
@@ -189,7 +153,31 @@ def _compute(
         at = [q.get(name, value) for name, value in dynamics.by_name(dynamics.default_position).items()]
         gravity = dynamics.gravity(q).tolist()
         data |= _describe_equations(dynamics.coordinates[shown], at[shown], gravity[shown], D)
+    _show(data, D, npy, as_json)
+
+
+def _query_daemon(
+    frame: str, floating: bool, equations: bool, has_matrix: bool, url: str, prefix: str, timeout: float
+) -> tuple[dict[str, Any], Any]:
+    """Return the running daemon's answer, and the mass matrix."""
+    from modelserver.client.remote import Platform
+
+    with Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver") as platform:
+        found = platform.get_dynamics(frame, equations=equations or has_matrix, floating=floating)
+    D = np.array(found.mass_matrix).reshape((len(found.coordinates),) * 2)
+    covariance = None if found.center_covariance is None else np.array(found.center_covariance).reshape(3, 3)
+    inertia = np.array(found.inertia).reshape(6, 6)
+    data = _describe_mass(found.mass, found.frame, np.array(found.center), covariance, inertia)
+    data["utime"], data["invalid_reasons"] = found.utime, found.invalid_reasons.explain()
+    if equations:
+        data |= _describe_equations(found.coordinates, found.position, found.gravity, D) | {"bias": found.bias}
     return data, D
+
+
+def _show(data: dict[str, Any], D: Any, npy: Path | None, as_json: bool) -> None:
+    if npy is not None:
+        np.save(npy, D)
+    typer.echo(json.dumps(to_json(data), indent=2) if as_json else format_dynamics(data))
 
 
 def _match_frames(model: Model, patterns: Sequence[str]) -> list[str]:
@@ -242,7 +230,6 @@ def _describe_stability(found: Stability) -> dict[str, Any]:
 
 
 def format_dynamics(data: Mapping[str, Any]) -> str:
-    """Format the data of a vehicle's dynamics as text."""
     x, y, z = data["center"]
     lines = [
         f"mass            {data['mass']:.3f} kg",

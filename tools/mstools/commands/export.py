@@ -1,8 +1,11 @@
-"""`modelserver export`: an LCM log as an MCAP file for Foxglove and other tools."""
+"""`modelserver export`: an LCM log as an MCAP file for Foxglove and other tools, or the running service live."""
 
 from __future__ import annotations
 
 import importlib.util
+import math
+import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -10,36 +13,65 @@ import typer
 
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.wire.eventlog import LogFile
-from mstools.terminal.options import PrefixOption, argument, option
-from mstools.terminal.output import check_writable, format_count
-from mstools.terminal.progress import show_progress
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.terminal.options import PrefixOption, UrlOption, option
+from mstools.terminal.output import catch_signals, check_writable, format_count, show_progress
 
 PROGRESS_EVENTS = 5_000
 
+DEFAULT_PORT = 8765
+"""Port of Foxglove's websocket by its documentation."""
+
 
 def command(
-    log: Annotated[Path, argument("LOG", "LCM log of the service.")],
-    out: Annotated[Path, argument("OUT", "MCAP file to write.")],
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="LCM log of the service.")] = None,
+    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="MCAP file to write.")] = None,
+    live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
     raw: Annotated[bool, typer.Option("--raw/--no-raw", help="Include the LCM messages as they are.")] = True,
-    prefix: PrefixOption = "",
     force: Annotated[bool, option("--force", "Replace OUT if it exists.")] = False,
+    bind: Annotated[str, option("--bind ADDRESS", "With --live: serve at this address.")] = "127.0.0.1",
+    port: Annotated[int, option("--port N", "With --live: port; 0 is any free one.", min=0, max=65535)] = DEFAULT_PORT,
+    seconds: Annotated[
+        float, option("--seconds N", "With --live: stop after this time. Default: never.", min=0.1)
+    ] = math.inf,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
 ) -> None:
-    """Export an LCM log of the service to an MCAP file, which Foxglove opens.
+    """Export an LCM log of the service to an MCAP file, which Foxglove opens, or serve the running service to it.
 
     It has the frames (/tf), the pose (/pose, /pose/fix), fixes (/fix/SOURCE), the shapes of the bodies (/model), health
     (/diagnostics) and events (/events) in Foxglove's schemas, and the LCM messages as they are (/lcm/CHANNEL). It needs
     the extra foxglove: pip install 'modelserver[foxglove]'. import-bag makes the log of it again.
 
-    Example: modelserver export drive.lcm drive.mcap
+    With --live the topics are the same, without /lcm. Foxglove: Open connection, Foxglove WebSocket,
+    ws://127.0.0.1:8765. Everyone who reaches the port can read what the service publishes, and change nothing.
+
+    \b
+    Examples:
+      modelserver export drive.lcm drive.mcap
+      modelserver export --live
     """
+    if live:
+        if log is not None or force or not raw:
+            raise typer.BadParameter("excludes LOG, OUT, --force and --no-raw", param_hint="--live")
+        check_foxglove()
+        serve_live(bind, port, seconds, url, prefix)
+        return
+    if log is None or out is None:
+        raise typer.BadParameter("give LOG and OUT, or --live for the running service", param_hint="LOG")
+    if bind != "127.0.0.1" or port != DEFAULT_PORT or math.isfinite(seconds) or url:
+        raise typer.BadParameter("goes with --live", param_hint="--bind, --port, --seconds, --url")
     check_foxglove()
+    write_mcap(log, out, raw, prefix, force)
+
+
+def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> None:
+    """Write the MCAP file of a log, whole or not at all. Raises ModelServerError, RecordingError, OSError."""
     import foxglove
 
     from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
 
-    if out.exists() and not force:
-        raise ModelServerError(f"{out} exists; give another name, or --force to replace it")
-    check_writable(str(out))
+    check_writable(str(out), force)
     # written beside it first: an export that is interrupted leaves no half file under this name
     part = out.with_name(f".{out.name}.part")
     part.unlink(missing_ok=True)
@@ -70,6 +102,30 @@ def command(
         typer.echo(f"modelserver: note: {log}: {damage}", err=True)
     if writer.skipped:
         typer.echo(f"modelserver: note: {format_count(writer.skipped, 'message')} could not be read", err=True)
+
+
+def serve_live(bind: str, port: int, seconds: float, url: str, prefix: str) -> None:
+    """Serve the running service until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
+    import foxglove
+
+    from mstools.recordings.drive import follow_bus
+    from mstools.recordings.foxglove_messages import FoxgloveWriter
+
+    context = foxglove.Context()
+    bus = open_lcm(resolve_url(url))
+    try:
+        server = foxglove.start_server(name="modelserver", host=bind, port=port, context=context)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ModelServerError(f"cannot serve at {bind} port {port}: {error}; choose another with --port N") from None
+    try:
+        writer = FoxgloveWriter(context, prefix)
+        typer.echo(f"ws://{bind}:{server.port} (Ctrl-C ends it)")
+        sys.stdout.flush()
+        end = time.monotonic() + seconds
+        with catch_signals() as stop:
+            follow_bus(bus, prefix, writer.feed, lambda: stop.is_set() or time.monotonic() >= end)
+    finally:
+        server.stop()
 
 
 def check_foxglove() -> None:

@@ -36,8 +36,7 @@ from mstools.recordings.bags import (
     open_mcap,
 )
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape
-from mstools.terminal.progress import show_progress
+from mstools.terminal.output import check_writable, escape, show_progress
 
 
 def command(
@@ -117,7 +116,6 @@ class ImportReport:
     seconds: float = 0.0
 
     def to_text(self) -> str:
-        """Format the report."""
         total = sum(each.written for each in self.topics)
         lines = [f"{self.log}: {total} messages, {self.seconds:.1f} s"]
         for each in self.topics:

@@ -14,20 +14,9 @@ import typer
 from modelserver.errors import ConfigError, Severity, quote
 from modelserver.files.regular import read_regular
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
-from mstools.deployment import files as install_files
-from mstools.deployment import plan as planning
-from mstools.deployment.plan import Plan, WriteFile, path_in_root
-from mstools.deployment.steps import (
-    check_installation,
-    check_root_user,
-    execute_plan,
-    get_command_path,
-    get_examples_folder,
-    read_facts,
-    read_manifest,
-)
+from mstools import deployment
 from mstools.terminal.options import option
-from mstools.terminal.problems import ProblemCollector
+from mstools.terminal.output import ProblemCollector
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -70,15 +59,17 @@ def command(
     root = root.resolve()
     if not dry_run:
         words = f"--remove{' --purge' if purge else ''}" if remove else "..."
-        check_root_user(root, f"{get_command_path()} install {words}")
+        deployment.check_root_user(root, f"{deployment.get_command_path()} install {words}")
     if remove:
-        plan = planning.plan_removal(read_facts((), root), purge=purge)
+        plan = deployment.plan_removal(deployment.read_facts((), root), purge=purge)
     else:
         plan = make_plan(vehicle, drivers, parse_serial(serial), start, root)
-    execute_plan(plan, root, dry_run)
+    deployment.execute_plan(plan, root, dry_run)
 
 
-def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:
+def make_plan(
+    vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path
+) -> deployment.Plan:
     """Return the plan of an installation.
 
     Raises ConfigError with all problems; ModelServerError, OSError.
@@ -88,19 +79,19 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
 
     gathered = ProblemCollector()
     with gathered.collect("this installation"):
-        check_installation()
-    found = path_in_root(root, planning.VEHICLE)
+        deployment.check_installation()
+    found = deployment.path_in_root(root, deployment.VEHICLE)
     is_installed = found.is_file()
     if vehicle is None and not is_installed:
-        there = path_in_root(root, planning.CONFIGURATION)
+        there = deployment.path_in_root(root, deployment.CONFIGURATION)
         why = f"there is no vehicle file in {there} yet, and none is given"
-        gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {get_examples_folder()}")
+        gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {deployment.get_examples_folder()}")
     made: CheckedVehicle | None = None
-    copied: list[WriteFile] = []
+    copied: list[deployment.WriteFile] = []
     if vehicle is not None:
         with gathered.collect(str(vehicle)):
             made = CheckedVehicle.load(vehicle)
-            copied = install_files.list_configuration(made.read_files(), {made.key_file})
+            copied = deployment.list_configuration(made.read_files(), {made.key_file})
     # the vehicle file in force: an edited one is not replaced
     if is_installed and (vehicle is None or (made is not None and not _is_unmodified(found, vehicle, root))):
         made = None
@@ -108,8 +99,8 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
             made = CheckedVehicle.load(found)
             geometry = Path(made.config.geometry).resolve()
             inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
-            fix = f"copy it to {planning.CONFIGURATION}"
-            install_files.check_visible([(str(inside), "the geometry")], fix, str(found))
+            fix = f"copy it to {deployment.CONFIGURATION}"
+            deployment.check_visible([(str(inside), "the geometry")], fix, str(found))
     known: Iterable[str] | None = None
     if made is not None:
         known = made.config.drivers
@@ -121,49 +112,49 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
     names = tuple(known or ())
     if known is not None:
         with gathered.collect("--drivers"):
-            names = install_files.check_drivers(drivers, known)
+            names = deployment.check_drivers(drivers, known)
     if made is not None:
         with gathered.collect("commands.key_file"):
-            install_files.render_credential_drop_in(made.installed_key)
+            deployment.render_credential_drop_in(made.installed_key)
         if made.config.commands.drive != "unsigned" and (text := find_unsigned_drive(made.config)):
             gathered.add("commands.drive", text, f"{KEY_HINT}; or write drive: unsigned to accept it")
         with gathered.collect("--serial"):
-            install_files.check_serial(serial, made.serial_of(names))
+            deployment.check_serial(serial, made.serial_of(names))
     gathered.raise_any()
     assert made is not None
     return _build_plan(copied, made, names, serial, start, root)
 
 
 def _build_plan(
-    copied: list[WriteFile],
+    copied: list[deployment.WriteFile],
     made: CheckedVehicle,
     names: tuple[str, ...],
     serial: Mapping[str, str],
     start: bool,
     root: Path,
-) -> Plan:
+) -> deployment.Plan:
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
     templates = read_templates()
-    units = (f"{planning.UNITS}/{name}" for name in templates)
-    drop_ins = (install_files.REALTIME, install_files.CREDENTIAL)
-    paths = [*(each.path for each in copied), planning.RULES, planning.SYSCTL, *units, *drop_ins]
-    facts = read_facts(paths, root)
+    units = (f"{deployment.UNITS}/{name}" for name in templates)
+    drop_ins = (deployment.REALTIME, deployment.CREDENTIAL)
+    paths = [*(each.path for each in copied), deployment.RULES, deployment.SYSCTL, *units, *drop_ins]
+    facts = deployment.read_facts(paths, root)
     url = made.config.lcm.url or DEFAULT_URL
     ip = facts.programs.get("ip", "/usr/sbin/ip")
-    rules, notes = install_files.render_udev_rules(made.serial_of(names), serial, facts)
+    rules, notes = deployment.render_udev_rules(made.serial_of(names), serial, facts)
     writes = [
         *copied,
-        *install_files.render_units(templates, get_command_path(), url, ip, bool(names), made.hosts_of(names)),
-        *install_files.render_realtime_drop_in(facts),
-        *install_files.render_credential_drop_in(made.installed_key),
+        *deployment.render_units(templates, deployment.get_command_path(), url, ip, bool(names), made.hosts_of(names)),
+        *deployment.render_realtime_drop_in(facts),
+        *deployment.render_credential_drop_in(made.installed_key),
         *rules,
-        *install_files.render_sysctl(RECEIVE_BUFFER_BYTES, facts),
+        *deployment.render_sysctl(RECEIVE_BUFFER_BYTES, facts),
     ]
-    started = [planning.LOOPBACK] if install_files.loopback_group(url) else []
-    started += [planning.SERVICE, *(f"modelserver-driver@{name}.service" for name in names)]
-    if set(install_files.NETWORK) & set(install_files.bus_addresses(url)):
+    started = [deployment.LOOPBACK] if deployment.loopback_group(url) else []
+    started += [deployment.SERVICE, *(f"modelserver-driver@{name}.service" for name in names)]
+    if set(deployment.NETWORK) & set(deployment.bus_addresses(url)):
         notes.append(
             "the units may use this machine's and private addresses only (IPAddressAllow); if the vehicle's network "
             "is another one: sudo systemctl edit modelserver, and there [Service] IPAddressAllow=NETWORK"
@@ -173,13 +164,13 @@ def _build_plan(
     if made.config.journal.directory:
         notes.append(
             "the vehicle file sets journal.directory, which the unit can write only inside "
-            f"{planning.STATE[0]}; without it (megabytes only) the journal is written there"
+            f"{deployment.STATE[0]}; without it (megabytes only) the journal is written there"
         )
     if facts.is_live and os.geteuid() != 0:
         notes.append("run as root, this also checks for real-time scheduling and adds the drop-in for it")
     if not facts.is_live and facts.root == "/":
         notes.append("systemd does not run this system: the units are enabled, and nothing is started")
-    return planning.plan_install(writes, started, facts, start=start, notes=notes)
+    return deployment.plan_install(writes, started, facts, start=start, notes=notes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +203,7 @@ class CheckedVehicle:
     @property
     def installed_key(self) -> str:
         """The path of the installed key file; empty for none."""
-        return os.path.normpath(os.path.join(planning.CONFIGURATION, self.key_file)) if self.key_file else ""
+        return os.path.normpath(os.path.join(deployment.CONFIGURATION, self.key_file)) if self.key_file else ""
 
     def hosts_of(self, names: Iterable[str]) -> list[str]:
         """Return the hosts of the named drivers' network devices."""
@@ -227,9 +218,9 @@ class CheckedVehicle:
                 found.append(split_group(getattr(line, "channel", ""))[0])
         return found
 
-    def serial_of(self, names: Iterable[str]) -> list[install_files.SerialDriver]:
+    def serial_of(self, names: Iterable[str]) -> list[deployment.SerialDriver]:
         ports = ((name, getattr(self.drivers[name].line, "port", "")) for name in names)
-        return [install_files.SerialDriver(name, port) for name, port in ports if port]
+        return [deployment.SerialDriver(name, port) for name, port in ports if port]
 
     def read_files(self) -> dict[str, bytes]:
         """Return the vehicle's files by path relative to the vehicle file, which itself is vehicle.yaml.
@@ -248,7 +239,7 @@ class CheckedVehicle:
             relative = os.path.relpath(whole, folder)
             if Path(name).is_absolute():
                 with gathered.collect(subject):
-                    install_files.check_visible([(name, "a file that it names")], fix, subject)
+                    deployment.check_visible([(name, "a file that it names")], fix, subject)
             elif folder not in whole.parents:
                 gathered.add(subject, f"it names {quote(name)}, outside its folder", fix)
             elif relative in found or relative == "installed.json":
@@ -273,11 +264,14 @@ def parse_serial(given: Iterable[str] | None) -> dict[str, str]:
 
 def read_templates() -> dict[str, str]:
     """Return the unit templates of the package or the source tree."""
-    folder = get_examples_folder() / "systemd"
+    folder = deployment.get_examples_folder() / "systemd"
     return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.service"))}
 
 
 def _is_unmodified(found: Path, vehicle: Path, root: Path) -> bool:
     """Return whether the installed vehicle file equals an earlier installation's, or the given one."""
-    there = planning.digest(found.read_bytes())
-    return there in (*read_manifest(root).files.get(planning.VEHICLE, ()), planning.digest(vehicle.read_bytes()))
+    there = deployment.digest(found.read_bytes())
+    return there in (
+        *deployment.read_manifest(root).files.get(deployment.VEHICLE, ()),
+        deployment.digest(vehicle.read_bytes()),
+    )

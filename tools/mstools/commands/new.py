@@ -1,50 +1,614 @@
-"""`modelserver new`: the files of a new vehicle, from a few questions or options."""
+"""`modelserver new`: the files of a new vehicle, from a few questions; kinds of vehicles, guessed frames, and texts.
+
+Every length is a typical one; what must be measured is marked MEASURE. The base frame is the point that moves straight
+ahead in a turn, on the ground: the middle of the rear axle with steered front wheels, else the middle of all wheels. In
+a geometry that somebody else wrote, the sensors are guessed from names, joints and shapes; a guess carries a note for
+the line that it fills: what it was guessed from, and where it is.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Final
+from types import MappingProxyType
+from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 import typer
 
-from modelserver.errors import ModelServerError, find_nearest_names, quote
+from modelserver.errors import ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.formats import check_file, save_model
-from modelserver.geometry import Model
+from modelserver.geometry import Body, JointType, Model, ModelBuilder, ShapeKind
 from modelserver.messages import GpsSample, ImuSample
-from msdrivers.registry import KINDS, DeviceKind, SerialSettings
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Vector3
+from msdrivers.registry import KINDS, CanSettings, DeviceKind, ModbusSettings, SerialSettings, TcpSettings
 from mstools.commands.check import check_vehicle
-from mstools.scaffold.files import (
-    DBC_FILE,
-    GEOMETRY_FILE,
-    MARK,
-    VEHICLE_FILE,
-    Device,
-    NewVehicle,
-    list_kinds,
-    list_marks,
-    make_dbc,
-    make_geometry,
-    make_vehicle,
-)
-from mstools.scaffold.guesses import (
-    GPS_WORDS,
-    IMU_WORDS,
-    FrameChoices,
-    Mount,
-    Wheel,
-    add_wheel_frames,
-    guess_base,
-    guess_kind,
-    guess_sensor,
-    list_wheels,
-    note_axes,
-)
-from mstools.scaffold.templates import TEMPLATES
 from mstools.terminal.options import choose_name, option
 from mstools.terminal.output import escape, print_problems, write_file
+
+Place: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTemplate:
+    """A kind of vehicle. Lengths in meters; x forward, y left, z up from the base frame.
+
+    `wheels` are the contact points of the wheels with encoders; `settings` are filter settings that the kind needs, and
+    `note` is a comment for its vehicle file.
+    """
+
+    summary: str
+    base: str
+    kinematics: Literal["skid_steer", "differential", "ackermann"]
+    wheels: Mapping[str, Place]
+    antenna: Place
+    imu: Place
+    camera: Place
+    max_speed: float
+    settings: Mapping[str, float] = field(default_factory=dict)
+    note: str = ""
+
+
+def _make_four(length: float, width: float) -> dict[str, Place]:
+    return {
+        f"{end}_{side}": (x, y, 0.0)
+        for end, x in (("front", length / 2), ("rear", -length / 2))
+        for side, y in (("left", width / 2), ("right", -width / 2))
+    }
+
+
+def _make_two(prefix: str, width: float) -> dict[str, Place]:
+    return {f"{prefix}left": (0.0, width / 2, 0.0), f"{prefix}right": (0.0, -width / 2, 0.0)}
+
+
+MIDDLE: Final = "on the ground in the middle of the wheels"
+REAR_AXLE: Final = "on the ground below the middle of the rear axle"
+
+TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
+    "skid": VehicleTemplate(
+        "four wheels that do not steer; it turns by skidding",
+        MIDDLE,
+        "skid_steer",
+        _make_four(0.5, 0.6),
+        (-0.15, 0.0, 0.6),
+        (0.0, 0.0, 0.25),
+        (0.3, 0.0, 0.45),
+        3.0,
+    ),
+    "differential": VehicleTemplate(
+        "two driven wheels and a caster",
+        "on the ground in the middle of the two driven wheels",
+        "differential",
+        _make_two("", 0.5),
+        (-0.1, 0.0, 0.5),
+        (0.0, 0.0, 0.2),
+        (0.2, 0.0, 0.35),
+        3.0,
+    ),
+    "ackermann": VehicleTemplate(
+        "a small vehicle with steered front wheels, encoders on the rear ones",
+        REAR_AXLE,
+        "ackermann",
+        _make_two("rear_", 0.6),
+        (0.2, 0.0, 0.9),
+        (0.2, 0.0, 0.4),
+        (0.8, 0.0, 0.7),
+        8.0,
+    ),
+    "tracked": VehicleTemplate(
+        "two tracks",
+        "on the ground in the middle of the tracks",
+        "skid_steer",
+        _make_two("", 0.8),
+        (-0.3, 0.0, 0.9),
+        (0.0, 0.0, 0.4),
+        (0.5, 0.0, 0.6),
+        3.0,
+    ),
+    "mecanum": VehicleTemplate(
+        "four mecanum wheels, which also move it sideways",
+        MIDDLE,
+        "skid_steer",
+        _make_four(0.4, 0.4),
+        (-0.1, 0.0, 0.5),
+        (0.0, 0.0, 0.15),
+        (0.2, 0.0, 0.3),
+        2.0,
+        {"side_sigma": 1.0},
+        "The mean speed of mecanum wheels is the speed ahead; nothing measures the one sideways (side_sigma). The\n"
+        "heading is found from the way driven: drive straight ahead until the pose is valid.",
+    ),
+    "car": VehicleTemplate(
+        "a road vehicle, wheel speeds of the rear axle",
+        REAR_AXLE,
+        "ackermann",
+        _make_two("rear_", 1.55),
+        (0.3, 0.0, 1.6),
+        (0.5, 0.0, 0.6),
+        (1.6, 0.0, 1.3),
+        60.0,
+    ),
+}
+"""Kinds of vehicles by the name that `--vehicle` takes."""
+
+
+BASE_WORDS: Final = ("base_footprint", "base_link", "base")
+GPS_WORDS: Final = ("gnss", "gps", "navsat", "antenna")
+IMU_WORDS: Final = ("imu", "ahrs")
+WHEEL_WORDS: Final = ("wheel", "tire", "tyre")
+NO_WHEEL_WORDS: Final = ("caster", "castor", "steering")
+
+HOLDER_WORDS: Final = ("mount", "bracket", "plate", "base", "wifi", "radio")
+"""Words of parts that carry a sensor, or only sound like it: taken where no other part has the name."""
+
+UPRIGHT: Final = 0.7
+"""An axis with a component above this one, 45 deg, is along that direction."""
+
+OFF_MIDDLE: Final = 0.03
+"""A base frame this far from the middle of the wheels, m, is another point: twice what a drawing is rounded to."""
+
+
+class Mount(NamedTuple):
+    """The frame of something on the vehicle; `note`: what it was guessed from, empty if it was given."""
+
+    frame: str
+    note: str = ""
+
+
+class FrameChoices(NamedTuple):
+    """The frames of a new vehicle. `rolling` is the frame that moves straight ahead, where it is not `base`."""
+
+    base: Mount
+    gps: Mount | None = None
+    imu: Mount | None = None
+    wheels: Mapping[str, Mount] = MappingProxyType({})
+    rolling: Mount | None = None
+
+
+class Wheel(NamedTuple):
+    """A body that turns about an axle: its center in the base frame and its radius, m, nan where it has no shape."""
+
+    body: str
+    center: Vector3
+    radius: float
+    is_steered: bool
+
+
+def guess_base(model: Model) -> Mount:
+    """Return the frame of the pose: the body, or else the frame, that is named so; else the root's first frame."""
+    bodies = {body.name.lower(): body.name for body in model.bodies}
+    for word in BASE_WORDS:
+        if word in bodies:
+            return Mount(_get_main_frame(model, bodies[word]), f"guessed from the name {bodies[word]}")
+        for frame in model.root:
+            if frame.name.lower() == word:
+                return Mount(frame.full_name, "guessed from its name")
+    return Mount(next(iter(model.root)).full_name, "guessed: the first frame of the root")
+
+
+def list_sensor_frames(model: Model, words: Iterable[str]) -> list[str]:
+    """Return the frames that may be those of a sensor with one of some names, the likeliest first.
+
+    A part of that name, by its origin, is before a frame of that name on another part; a frame at which a further part
+    is fixed stands for that part.
+    """
+    wanted = tuple(words)
+    found: list[tuple[bool, bool, int, str]] = []
+    for body in model.bodies:
+        if body is not model.root and (rank := _rank_name(body.name, wanted)) is not None:
+            found.append((rank[0], False, rank[1], _get_main_frame(model, body.name)))
+        for frame in body:
+            if (rank := _rank_name(frame.name, wanted)) is not None:
+                beyond = [each.to for each in model.constraints_of(frame) if each.from_ == frame.full_name]
+                found.append((rank[0], True, rank[1], beyond[0] if len(beyond) == 1 else frame.full_name))
+    # sorted is stable: of equals the first in the file
+    return list(dict.fromkeys(each[-1] for each in sorted(found, key=lambda each: each[:-1])))
+
+
+def guess_sensor(model: Model, words: Iterable[str], base: str) -> Mount | None:
+    """Return the likeliest frame of a sensor, None if no name fits; the note has its place and the other candidates."""
+    frames = list_sensor_frames(model, words)
+    if not frames:
+        return None
+    others = f"; also possible: {', '.join(frames[1:4])}" if len(frames) > 1 else ""
+    return Mount(frames[0], f"guessed from its name, {_describe_place(model, frames[0], base)}{others}")
+
+
+def guess_kind(wheels: Sequence[Wheel]) -> str:
+    """Return the kind of vehicle, a name in TEMPLATES."""
+    if any(wheel.is_steered for wheel in wheels):
+        return "ackermann"
+    return "differential" if len(wheels) == 2 else "skid"
+
+
+def add_wheel_frames(
+    model: Model, base: str, template: VehicleTemplate, wheels: Sequence[Wheel]
+) -> tuple[Model, dict[str, Mount], Mount | None]:
+    """Return the model with a frame where each wheel of a template meets the ground, these frames, and the rolling one.
+
+    The frames are on the base frame's body: a wheel's own frame turns with it. A wheel that the geometry does not have
+    is at the template's typical place. The rolling frame is added where the base frame is not in the middle of the
+    wheels, else None. Raises GeometryError.
+    """
+    builder = ModelBuilder.from_model(model)
+    body = next(each for each in builder.bodies if each.name == base.partition(":")[0])
+
+    def add(stem: str, place: Vector3, note: str) -> Mount:
+        taken = {frame.name for frame, _ in body.frames}
+        name = next(each for each in (stem, *(f"{stem}{k}" for k in range(2, len(taken) + 3))) if each not in taken)
+        body.add_frame(name, model.frame(base).pose @ Pose(place))
+        return Mount(f"{body.name}:{name}", note)
+
+    mounts: dict[str, Mount] = {}
+    places: list[Vector3] = []
+    for name, typical in template.wheels.items():
+        stem = _name_part(name, "Contact")
+        if turning := _select_wheels(name, wheels):
+            places.append(_find_contact(turning, base))
+            mounts[name] = add(
+                stem,
+                places[-1],
+                f"guessed: where {', '.join(each.body for each in turning)} "
+                f"{'meet' if len(turning) > 1 else 'meets'} the ground, {_format_place(places[-1])} from {base}",
+            )
+        else:
+            mounts[name] = add(stem, typical, "a typical place: the geometry has no such wheel")
+    if len(places) < len(mounts):
+        return builder.build(), mounts, None
+    x, y, z = (sum(each[k] for each in places) / len(places) for k in range(3))
+    if math.hypot(x, y) <= OFF_MIDDLE:
+        return builder.build(), mounts, None
+    rolling = add(
+        "RollingCenter", (x, y, z), f"guessed: the middle of these wheels, {_format_place((x, y, z))} from {base}"
+    )
+    return builder.build(), mounts, rolling
+
+
+def note_axes(model: Model, unit: Mount, device: str, base: str) -> Mount:
+    """Return the frame of an inertial unit whose own z axis is down, noted where the z axis of the frame is up."""
+    up = so3.rotate(model.get_transformation(unit.frame, base).pose.wxyz, (0.0, 0.0, 1.0))[2]
+    if up < UPRIGHT:
+        return unit
+    note = f"z of {device} itself is down when it stands upright, that of this frame is up: which way is it mounted?"
+    return Mount(unit.frame, f"{unit.note}; {note}" if unit.note else note)
+
+
+def iterate_wheels(model: Model, base: str) -> Iterator[Wheel]:
+    """Yield the wheels: bodies so named that turn freely about an axis across the base frame."""
+    assembly = next(each for each in model.assemblies if base.partition(":")[0] in each)
+    for name, constraint in model.joints.items():
+        for end in (constraint.to, constraint.from_):
+            body = model.body(end.partition(":")[0])
+            words = f"{body.name} {name}"
+            if body.name not in assembly or not _fits(body.name, WHEEL_WORDS) or _fits(words, NO_WHEEL_WORDS):
+                continue
+            if abs(_find_axis(model, name, base)[1]) > UPRIGHT:
+                others = [each.name for each in model.get_kinematic_path(end, base).joints if each.name != name]
+                steered = any(abs(_find_axis(model, each, base)[2]) > UPRIGHT for each in others)
+                yield Wheel(body.name, model.get_transformation(end, base).pose.xyz, _find_radius(body), steered)
+                break
+
+
+def _find_axis(model: Model, joint: str, base: str) -> Vector3:
+    """Return the axis about which a joint turns, in the base frame; 0 for a joint that does not turn about one."""
+    constraint = model.joints[joint]
+    if constraint.joint.type is not JointType.REVOLUTE:
+        return (0.0, 0.0, 0.0)
+    # turning about the axis does not move it, so that the frame behind the joint has it too
+    return so3.rotate(model.get_transformation(constraint.to, base).pose.wxyz, constraint.joint.axis)
+
+
+def _find_radius(body: Body) -> float:
+    """Return the radius of a wheel from its shapes, m; nan where it has none but meshes."""
+    shapes = (each for each in (*body.collisions, *body.visuals) if each.kind in (ShapeKind.CYLINDER, ShapeKind.SPHERE))
+    return max((each.size[0] for each in shapes), default=math.nan)
+
+
+def _select_wheels(name: str, wheels: Sequence[Wheel]) -> list[Wheel]:
+    """Return the wheels that a template's name means, e.g. rear_left: those of a side, of it those of an end."""
+    words = name.split("_")
+    sign = 1.0 if "left" in words else -1.0
+    side = [wheel for wheel in wheels if sign * wheel.center[1] > OFF_MIDDLE]
+    if words[0] not in ("front", "rear") or not side:
+        return side
+    along = [wheel.center[0] for wheel in side]
+    middle = (min(along) + max(along)) / 2.0
+    if max(along) - middle <= OFF_MIDDLE:
+        # one axle: it is the rear one where only that one has encoders
+        return side if words[0] == "rear" else []
+    return [wheel for wheel in side if (wheel.center[0] > middle) == (words[0] == "front")]
+
+
+def _find_contact(wheels: Sequence[Wheel], base: str) -> Vector3:
+    """Return where some wheels meet level ground in the middle; at the height of the axle where nothing has a radius.
+
+    A base frame that is called a footprint is on the ground (REP 120).
+    """
+    x, y, z = (sum(each.center[k] for each in wheels) / len(wheels) for k in range(3))
+    radius = sum(each.radius for each in wheels) / len(wheels)
+    if "footprint" in base.lower():
+        return (x, y, 0.0)
+    return (x, y, z - radius if math.isfinite(radius) else z)
+
+
+def _split_words(name: str) -> list[str]:
+    """Return the words of a name in lower case: `IMULink_2` has imu, link."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+
+
+def _fits(name: str, wanted: Iterable[str]) -> bool:
+    words = _split_words(name)
+    return any(word.startswith(each) or word.endswith(each) for each in wanted for word in words)
+
+
+def _rank_name(name: str, wanted: Sequence[str]) -> tuple[bool, int] | None:
+    """Return the rank of a name by the words that it has, smaller is likelier; None where it has none of them."""
+    found = [number for number, word in enumerate(wanted) if _fits(name, [word])]
+    return (_fits(name, HOLDER_WORDS), found[0]) if found else None
+
+
+def _get_main_frame(model: Model, body: str) -> str:
+    """Return the frame of a body that stands for it: its origin, else its first frame."""
+    there = model.body(body)
+    return there.frame("Origin").full_name if there.has_frame("Origin") else next(iter(there)).full_name
+
+
+def _describe_place(model: Model, frame: str, base: str) -> str:
+    try:
+        return f"{_format_place(model.get_transformation(frame, base).pose.xyz)} from {base}"
+    except QueryError:
+        return f"not joined to {base}"
+
+
+def _format_place(place: Vector3) -> str:
+    return f"({', '.join(f'{round(each, 3) + 0.0:g}' for each in place)}) m"
+
+
+MARK: Final = "MEASURE"
+"""Word in the comment of each line that must be adapted to the vehicle."""
+
+GEOMETRY_FILE, VEHICLE_FILE, DBC_FILE = "geometry.yaml", "vehicle.yaml", "wheels.dbc"
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A device of the new vehicle and its line: the path of a port, a CAN channel, or HOST:PORT."""
+
+    kind: DeviceKind
+    line: str
+
+    @property
+    def line_key(self) -> str:
+        """The key of the line in a driver's section: by its form, where the kind has several."""
+        keys = {SerialSettings: "port", TcpSettings: "address", CanSettings: "can", ModbusSettings: "address"}
+        if SerialSettings in self.kind.lines and TcpSettings in self.kind.lines:
+            return "address" if "/" not in self.line and ":" in self.line else "port"
+        return keys[self.kind.lines[0]]
+
+
+@dataclass(frozen=True, slots=True)
+class NewVehicle:
+    """What is on a new vehicle.
+
+    `head` is the pan-tilt head below the camera; `given` are the frames in a geometry that exists.
+    """
+
+    name: str
+    template: VehicleTemplate
+    gps: Device | None = None
+    imu: Device | None = None
+    wheels: Device | None = None
+    has_camera: bool = False
+    head: Device | None = None
+    given: FrameChoices | None = None
+
+    @property
+    def mounts(self) -> FrameChoices:
+        """The frames of the vehicle: those in a geometry that exists, else those of `make_geometry`."""
+        if self.given is not None:
+            return self.given
+        wheels = {name: Mount(f"{self.body}:{_name_part(name, 'Wheel')}") for name in self.template.wheels}
+        base, gps, imu = (Mount(f"{self.body}:{frame}") for frame in ("Base", "Antenna", "ImuUnit"))
+        return FrameChoices(base, gps, imu, wheels)
+
+    @property
+    def body(self) -> str:
+        words = "".join(character if character.isalnum() else " " for character in self.name).split()
+        name = "".join(word[:1].upper() + word[1:] for word in words) or "Vehicle"
+        return f"{name}Vehicle" if name in ("Camera", "Head") else name
+
+
+def make_geometry(vehicle: NewVehicle) -> str:
+    template, body = vehicle.template, vehicle.body
+
+    def frame(name: str, place: Place, comment: str, more: str = "") -> str:
+        x, y, z = place
+        return f"      {name}: {{xyz: [{x:g}, {y:g}, {z:g}]{more}}}   # {comment}"
+
+    lines = [
+        "modelserver: geometry/1",
+        f"name: {vehicle.name}",
+        "",
+        "# Axes: x forward, y left, z up. Meters and degrees. A frame is given in the coordinates of its body; the",
+        f"# origin of {body} is the frame Base, {template.base}.",
+        f"# A line with {MARK} has a typical length: measure it on your vehicle, and remove the word.",
+        "",
+        "defaults:",
+        f"  sigma: {{xyz: 0.02, rpy_deg: 1}}   # {MARK}: how well you measured, one standard deviation",
+        "",
+        "bodies:",
+        f"  {body}:",
+        "    frames:",
+        f"      Base: {{}}   # {template.base}",
+    ]
+    if vehicle.wheels is not None:
+        for name, place in template.wheels.items():
+            lines.append(frame(_name_part(name, "Wheel"), place, f"{MARK}: where the wheel touches the ground"))
+    if vehicle.gps is not None:
+        lines.append(frame("Antenna", template.antenna, f"{MARK}: phase center of the antenna"))
+    if vehicle.imu is not None:
+        comment = f"{MARK}: the unit and its own axes; here x forward, y left, z up"
+        more = ", rpy_deg: [0, 0, 0]"
+        if vehicle.imu.kind.has_z_down:
+            more, comment = ", rpy_deg: [180, 0, 0]", f"{MARK}: the unit and its own axes; here x forward, z down"
+        lines.append(frame("ImuUnit", template.imu, comment, more))
+    if vehicle.has_camera:
+        lines += [
+            frame("CameraMount", template.camera, f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"),
+            *(_HEAD_BODY if vehicle.head else ()),
+            "  Camera:",
+            "    frames:",
+            "      Mount: {}",
+            "      # the optical frame: z ahead out of the lens, x right, y down in the image",
+            f"      Lens: {{xyz: [0.03, 0, 0.02], rpy_deg: [-90, 0, -90]}}   # {MARK}: the entrance pupil",
+            "",
+            "constraints:",
+            *(_make_head_joints(body) if vehicle.head else _fix_camera(body)),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+_HEAD_BODY: Final = (
+    "  Head:   # the part between the two axes of the pan-tilt head",
+    "    frames:",
+    "      Base: {}",
+    f"      TiltAxis: {{xyz: [0, 0, 0.05]}}   # {MARK}: height of the tilt axis above the mount",
+)
+
+
+def _fix_camera(body: str) -> Iterator[str]:
+    yield "  CameraFixed:"
+    yield f'    {{from: "{body}:CameraMount", to: "Camera:Mount", rpy_deg: [0, 0, 0]}}   # {MARK}: its tilt'
+
+
+def _make_head_joints(body: str) -> Iterator[str]:
+    yield "  # positions come from the driver head; positive turns about the axis: to the left, and up"
+    for name, base, moved, axis, limits in (
+        ("Pan", f"{body}:CameraMount", "Head:Base", "[0, 0, 1]", "[-170, 170]"),
+        ("Tilt", "Head:TiltAxis", "Camera:Mount", "[0, -1, 0]", "[-60, 60]"),
+    ):
+        yield f"  {name}:   # {MARK}: sense of its axis, limits, accuracy"
+        yield f'    from: "{base}"'
+        yield f'    to: "{moved}"'
+        yield f"    joint: {{type: revolute, axis: {axis}, limits_deg: {limits}, sigma_deg: 0.5}}"
+
+
+def _name_part(wheel: str, suffix: str) -> str:
+    """Return the name of something of a wheel: rear_left with Wheel is RearLeftWheel."""
+    return "".join(word.capitalize() for word in wheel.split("_")) + suffix
+
+
+def make_vehicle(vehicle: NewVehicle) -> str:
+    template, mounts = vehicle.template, vehicle.mounts
+    lines = [
+        f"# {vehicle.name}: {template.summary}.",
+        "# Check with: modelserver check vehicle.yaml. All keys: docs/vehicle-file.md.",
+        *(f"# {line}" for line in template.note.splitlines()),
+        f"vehicle: {vehicle.name}",
+        f"geometry: {GEOMETRY_FILE}",
+        f'base_frame: "{mounts.base.frame}"{_mark(mounts.base) or "   # POSE describes this frame"}',
+        *(f'rolling_frame: "{each.frame}"{_mark(each)}' for each in (mounts.rolling,) if each is not None),
+        "state_directory: state   # the origin, and the state for the next start",
+        "journal: {directory: journal, megabytes: 256}   # all inputs and outputs, to replay; the oldest are deleted",
+    ]
+    if sensors := list(_list_sensors(vehicle, mounts)):
+        lines += ["", "sensors:", *sensors]
+    if template.settings:
+        lines += [
+            "",
+            "localization:",
+            "  filter:",
+            *(f"    {key}: {value:g}" for key, value in template.settings.items()),
+        ]
+    if drivers := list(_list_drivers(vehicle)):
+        lines += [
+            "",
+            "# modelserver up runs the service and all of these; modelserver driver --list shows the ports.",
+            "drivers:",
+        ]
+        lines += drivers
+    return "\n".join(lines) + "\n"
+
+
+def _list_sensors(vehicle: NewVehicle, mounts: FrameChoices) -> Iterator[str]:
+    for name, device, mount in (("gps", vehicle.gps, mounts.gps), ("imu", vehicle.imu, mounts.imu)):
+        if device is not None and mount is not None:
+            yield f'  {name}: {{channel: {name.upper()}, frame: "{mount.frame}"}}{_mark(mount)}'
+    if vehicle.wheels is not None:
+        yield "  wheels:"
+        yield "    channel: WHEELS"
+        yield f"    kinematics: {vehicle.template.kinematics}"
+        yield "    frames:"
+        yield from (f'      {name}: "{mount.frame}"{_mark(mount)}' for name, mount in mounts.wheels.items())
+
+
+def _mark(mount: Mount) -> str:
+    return f"   # {MARK}: {mount.note}" if mount.note else ""
+
+
+def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
+    for name, device in (("gps", vehicle.gps), ("imu", vehicle.imu)):
+        if device is not None:
+            yield f"  {name}:   # {device.kind.description}"
+            yield f"    device: {device.kind.name}"
+            yield f"    {device.line_key}: {_quote(device.line)}   # {MARK}: its line on this machine"
+            yield from (f"    {line}" for line in device.kind.example)
+    if vehicle.wheels is not None:
+        yield f"  wheels:   # {vehicle.wheels.kind.description}"
+        yield f"    device: {vehicle.wheels.kind.name}"
+        channel = vehicle.wheels.line
+        yield f"    can: {_quote(channel)}   # {MARK}: sudo ip link set {channel} up type can bitrate 500000"
+        yield f"    dbc: {DBC_FILE}   # {MARK}: the frames that your controller sends; this one is an example"
+        yield f"    max_speed: {vehicle.template.max_speed:g}   # m/s: a higher one is damage"
+        yield "    wheels:"
+        for name in vehicle.template.wheels:
+            yield f"      {name}:"
+            yield f"        count:   # {MARK}: the distance of one count is circumference / counts per turn"
+            yield f"          {{signal: WheelCounts.{_name_part(name, 'Count')}, meters_per_count: 0.001}}"
+
+    if vehicle.head is not None:
+        yield f"  head:   # {vehicle.head.kind.description}"
+        yield f"    device: {vehicle.head.kind.name}"
+        yield f"    {vehicle.head.line_key}: {_quote(vehicle.head.line)}   # {MARK}: its line on this machine"
+        yield f"    baud: 57600   # {MARK}: its rate"
+        yield "    columns: 2"
+        yield f"    joints:   # {MARK}: the columns of its lines, here degrees such as 12.5,-3.25"
+        yield "      Pan: {column: 0, scale: 0.0174533}"
+        yield "      Tilt: {column: 1, scale: 0.0174533}"
+
+
+def _quote(line: str) -> str:
+    return f'"{line}"' if ":" in line else line
+
+
+def make_dbc(vehicle: NewVehicle) -> str:
+    """Return the text of an example DBC file: a 16-bit counter for each wheel, up when it rolls forward."""
+    signals = "\n".join(
+        f' SG_ {_name_part(name, "Count")} : {16 * number}|16@1+ (1,0) [0|65535] "" Computer'
+        for number, name in enumerate(vehicle.template.wheels)
+    )
+    head = f'VERSION "{vehicle.name}"\n\nNS_ :\n\nBS_:\n\nBU_: Controller Computer\n\n'
+    return f"{head}BO_ 256 WheelCounts: {2 * len(vehicle.template.wheels)} Controller\n{signals}\n"
+
+
+def list_marks(folder: Path, files: Iterator[str] | tuple[str, ...]) -> Iterator[str]:
+    """Yield `file:line: what` for each line of some files that must be adapted."""
+    for name in files:
+        for number, line in enumerate((folder / name).read_text(encoding="utf-8").splitlines(), 1):
+            head, mark, what = line.partition(f"# {MARK}: ")
+            if mark:
+                yield f"{name}:{number}: {head.split(':')[0].strip(' {')}: {what}"
+
+
+def list_kinds(kinds: Mapping[str, DeviceKind], sample: type[GpsSample] | type[ImuSample]) -> dict[str, DeviceKind]:
+    return {name: kind for name, kind in kinds.items() if kind.sample is sample}
+
 
 NONE: Final = "none"
 """Answer for a device that is not there."""
@@ -103,7 +667,9 @@ def command(
     name = _check_name(ask.text("Name of the vehicle", name, folder.resolve().name or "vehicle"))
     base = None if model is None else Mount(base_frame) if base_frame else guess_base(model)
     turning = (
-        () if model is None or base is None else list_wheels(model, _check_frame(model, base.frame, "--base-frame"))
+        ()
+        if model is None or base is None
+        else tuple(iterate_wheels(model, _check_frame(model, base.frame, "--base-frame")))
     )
     kind = ask.choice(
         "Which kind of vehicle is it?", vehicle, known, guess_kind(turning) if turning else "skid", "--vehicle"

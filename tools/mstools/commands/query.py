@@ -7,25 +7,31 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
-from modelserver.client.interface import FrameClient
+from modelserver.client.interface import NO_DEMAND, FrameClient, R
+from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest_names, quote
+from modelserver.geometry import names
 from modelserver.messages import (
+    NO_FLAGS,
     EdgeReport,
     Explanation,
+    ExplanationReply,
+    GetExplanation,
+    GetMotion,
     Invalid,
     MotionAnswer,
     Policy,
     PoseAnswer,
+    PoseDemand,
     Quality,
     Unmet,
 )
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from mstools.commands.pose_source import open_answer_source, open_log_answers
 from mstools.terminal.options import (
     JsonOption,
     ModelOption,
@@ -36,8 +42,12 @@ from mstools.terminal.options import (
     argument,
     choose_name,
     option,
+    parse_variables,
 )
-from mstools.terminal.output import escape, format_table, replace_unencodable, to_json
+from mstools.terminal.output import escape, format_table, load_given_model, replace_unencodable, to_json
+
+if TYPE_CHECKING:
+    from mstools.recordings.log_platform import LogPlatform
 
 _EDGE_HEADER = ("kind", "name", "passed", "provenance", "age", "source", "coordinates", "position", "rotation")
 
@@ -196,8 +206,6 @@ def command(
         str, option("--policy", f"What is accepted at that time: {', '.join(POLICIES)}.")
     ] = "interpolated",
     wait_ms: Annotated[int, option("--wait-ms", "Let the daemon wait for data that cover it.", min=0, max=60_000)] = 0,
-    inverse: Annotated[bool, option("--inverse", "Exchange the two frames.")] = False,
-    matrix: Annotated[bool, option("--matrix", "Print the 4x4 transform too.")] = False,
     explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
     motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
     expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
@@ -236,15 +244,18 @@ def command(
     is_demanding = any((max_horizontal, max_heading, max_age, min_integrity))
     if is_demanding and (explain or motion):
         raise typer.BadParameter("--explain and --motion go without a demand; run one after the other")
-    if inverse:
-        frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
     source: FrameClient
     if log is not None:
         recorded = source = open_log_answers(log, model, settings, prefix)
         utime = recorded.parse_time(at)
         utime = _parse_time(at) if utime is None else utime
     else:
-        source = open_answer_source(model, settings, url, prefix, timeout)
+        if model is not None:
+            source = FileAnswers(model, settings)
+        else:
+            from modelserver.client.remote import Platform
+
+            source = Platform(url, channel_prefix=prefix, timeout=timeout, name="modelserver")
         utime = _parse_time(at)
         # our time in seconds; as microseconds it would be the first three hours of 1970
         if 1_000_000_000 < utime < 10_000_000_000:
@@ -271,7 +282,7 @@ def command(
             min_integrity=min_integrity,
         )
     met = "\n  demand          met" if is_demanding and not answer.unmet else ""
-    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix) + met)
+    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer) + met)
     if answer.unmet:
         raise typer.Exit(EXIT_UNMET)
 
@@ -292,8 +303,7 @@ def _parse_time(text: str) -> int:
         ) from None
 
 
-def describe(answer: PoseAnswer, matrix: bool = False) -> str:
-    """Format an answer."""
+def describe(answer: PoseAnswer) -> str:
     transformation = answer.transformation
     x, y, z = transformation.pose.xyz
     roll, pitch, yaw = (math.degrees(angle) + 0.0 for angle in transformation.rpy)
@@ -309,8 +319,6 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
         meters = "  ".join(f"{math.sqrt(value):.4f}" for value in variances[:3])
         degrees = "  ".join(f"{math.degrees(math.sqrt(value)):.3f}" for value in variances[3:])
         lines.append(f"  sigma           {meters}  m,  {degrees}  deg")
-    if matrix:
-        lines += ["  transform", *("    " + "  ".join(f"{v: .6f}" for v in row) for row in transformation.matrix)]
     if transformation.utime:
         when = datetime.fromtimestamp(transformation.utime * 1e-6, UTC)
         lines.append(f"  at              {when.isoformat()}  ({transformation.utime})")
@@ -379,3 +387,66 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "unmet_reason": answer.unmet_reason,
         "model_revision": transformation.model_revision,
     }
+
+
+class FileAnswers(FrameClient):
+    """Poses of a geometry file, with joints at their defaults; times are ignored. Raises GeometryError, OSError."""
+
+    def __init__(self, path: Path, settings: list[str] | None):
+        self._model = load_given_model(path, parse_variables(settings))
+
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
+    ) -> PoseAnswer:
+        known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
+        reserved = [each for each in (interest, reference) if each.partition(":")[0] in names.RESERVED_BODIES]
+        for frame in reserved:
+            if frame not in known:
+                text = f"{quote(frame, 80)} is an unknown frame; known: {', '.join(known)}"
+                raise UnknownFrameError(text, find_nearest_names(frame, known, 1))
+        if reserved:
+            raise ModelServerError("a geometry file has no pose of the vehicle in the world; query the daemon")
+        rests = bool(self._model.get_kinematic_path(interest, reference).joints)
+        answer = PoseAnswer(
+            self._model.get_transformation(interest, reference), quality=Quality.JOINT_DEFAULT if rests else NO_FLAGS
+        )
+        if not any(demand):
+            return answer
+        from modelserver.query.demand import find_unmet
+
+        unmet, reason = find_unmet(answer, demand, age=math.inf if rests else 0.0)
+        return answer._replace(unmet=unmet, unmet_reason=reason)
+
+    def _query(self, request: Any, reply_type: type[R]) -> R:
+        from modelserver.estimation.history import History
+        from modelserver.query import PlatformView
+        from modelserver.query.answers import compute_answer
+
+        if isinstance(request, GetMotion):
+            raise ModelServerError("a geometry file has no motion; query the daemon")
+        answer = (
+            self._query_pose(*request[1:3], 0, Policy.INTERPOLATED, 0) if isinstance(request, GetExplanation) else None
+        )
+        root = self._model.root
+        view = PlatformView(self._model, names.join(root.name, root.frames[0].name), None, History(0.0))
+        (reply,) = compute_answer(view, request, 0)
+        if isinstance(reply, ExplanationReply) and reply.answer is not None and answer is not None:
+            # a joint at its default does not invalidate the geometry of a file
+            answer = answer._replace(quality=reply.answer.answer.quality)
+            reply = ExplanationReply(reply.header, reply.answer._replace(answer=answer))
+        assert isinstance(reply, reply_type)
+        return reply
+
+
+def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:
+    """Open a log as a source of poses, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
+    from mstools.recordings.log_platform import LogPlatform
+
+    if model is None:
+        return LogPlatform(log, prefix)
+    given = load_given_model(model, parse_variables(settings))
+    source = LogPlatform(log, prefix, given)
+    if source.revision not in ("", given.revision):
+        there = f"{model} has revision {given.revision}, but the poses in {log} have {source.revision}"
+        typer.echo(f"modelserver: note: {there}", err=True)
+    return source

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import shutil
+import subprocess
 import sys
+import tempfile
 import time
+import weakref
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
-from modelserver.errors import NoServerError, find_nearest_names, quote
+from modelserver.errors import NoServerError, WireError, find_nearest_names, quote
 from modelserver.messages import DriverHealth, Health
-from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import DaemonListener, handle_until
+from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_pattern
+from modelserver.wire.codec import decode
+from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
 from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
-from mstools.terminal.output import replace_unencodable
-from mstools.terminal.progress import catch_signals, open_screen
+from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
 
 if TYPE_CHECKING:
     import lcm
@@ -47,6 +60,7 @@ HEALTH = "MODELSERVER_HEALTH"
 def command(
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, for its bus and prefix.")] = None,
     watch: Annotated[bool, option("--watch -w", "Show each report, until Ctrl-C.")] = False,
+    spy: Annotated[bool, option("--spy", "Show all channels decoded, in lcm-spy.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
@@ -59,9 +73,16 @@ def command(
     Waits for its next health report, which is published once a second. With --watch each report replaces the last one;
     if the output is no terminal, each is one line.
 
+    --spy starts lcm-spy with this project's types instead; double-click a channel to see its fields. It needs a display
+    and Java (default-jre), and at the first run a Java compiler (default-jdk-headless): the types are compiled once for
+    each version of the wire contract, and stored in the user's cache.
+
     Exit code: 0 the daemon runs with a valid pose, 3 it runs without one, 1 no report was received, 2 wrong usage.
 
-    Example: modelserver status --watch
+    \b
+    Examples:
+      modelserver status --watch
+      modelserver status --spy
     """
     drivers: tuple[str, ...] = ()
     if config is not None:
@@ -70,6 +91,8 @@ def command(
         vehicle = load_config(config)
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         drivers = tuple(vehicle.drivers)
+    if spy:
+        run_spy(url)
     provider = resolve_url(url)
     listener = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
@@ -89,14 +112,60 @@ def command(
         raise typer.Exit(EXIT_UNHEALTHY)
 
 
-class HealthListener(DaemonListener):
-    """Receive the health reports of one daemon and its drivers; `reports` counts the daemon's."""
+POLL_S: Final = 0.2
+"""Period of checks of the condition without a message, seconds: a signal may have changed it."""
 
-    def __init__(self, bus: lcm.LCM, prefix: str):
+
+class DaemonListener:
+    """Receive channels of a daemon, whose handlers get the decoded messages. `has_received`: any message.
+
+    Messages of another type or version are ignored: the next one may be valid.
+    """
+
+    def __init__(self, bus: lcm.LCM, prefix: str, handlers: Mapping[str, Callable[[Any], object]]):
+        self.has_received = False
+        self._bus = bus
+        self._handlers = dict(handlers)
+        # a weak reference, so that the bus is left with this object
+        receive = partial(_receive, weakref.ref(self))
+        self.subscriptions = [
+            bus.subscribe(to_subscription_pattern(f"{prefix}{name}"), partial(receive, name)) for name in handlers
+        ]
+
+    def _receive(self, name: str, data: bytes) -> None:
+        self.has_received = True
+        with suppress(WireError):
+            self._handlers[name](decode(BY_NAME[name].type_name, data))
+
+    def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
+        """Listen for up to `seconds` until a condition holds; return whether it does."""
+        return handle_until(self._bus, seconds, until)
+
+
+def _receive(listener: weakref.ref[DaemonListener], name: str, _: str, data: bytes) -> None:
+    if (found := listener()) is not None:
+        found._receive(name, data)
+
+
+def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> bool:
+    """Handle messages of the bus for up to `seconds` until `is_done`; return whether it is."""
+    deadline = time.monotonic() + seconds
+    while not is_done():
+        left = deadline - time.monotonic()
+        if left <= 0.0:
+            return False
+        handle_message(bus, int(min(left, POLL_S) * 1e3) + 1)
+    return True
+
+
+class HealthListener(DaemonListener):
+    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's."""
+
+    def __init__(self, bus: lcm.LCM, prefix: str, more: Mapping[str, Callable[[Any], object]] = MappingProxyType({})):
         self.health: Health | None = None
         self.reports = 0
         self.drivers: dict[str, DriverHealth] = {}
-        super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver})
+        super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver, **more})
 
     def _on_health(self, health: Health) -> None:
         self.health = health
@@ -188,3 +257,91 @@ def _print_lines(listener: HealthListener, as_json: bool) -> None:
             began = time.monotonic()
             while not listener.wait_for_report(SILENT_S, stop) and not stop.is_set():
                 typer.echo(f"no report for {time.monotonic() - began:.0f} s", err=True)
+
+
+# --- lcm-spy
+
+
+def run_spy(url: str) -> NoReturn:
+    """Become lcm-spy, so that signals reach it and its exit code is ours. Raises MissingToolError, OSError."""
+    check_java()
+    jar = get_types_jar()
+    spy = find_binary("lcm-spy")
+    environment = dict(os.environ)
+    environment["CLASSPATH"] = os.pathsep.join(filter(None, (str(jar), environment.get("CLASSPATH", ""))))
+    provider = url or environment.get("LCM_DEFAULT_URL", "") or DEFAULT_URL
+    sys.stdout.flush()
+    os.execve(spy, [str(spy), f"--lcm-url={provider}"], environment)
+
+
+def check_java() -> None:
+    """Raise MissingToolError if lcm-spy cannot open its window."""
+    java = shutil.which("java")
+    libraries = Path(java or "").resolve().parent.parent / "lib"
+    wrong = ""
+    if java is None:
+        wrong = "needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
+    elif (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
+        wrong = "opens a window, but this Java is headless: sudo apt install default-jre"
+    elif not os.environ.get("DISPLAY"):
+        ways = "Over ssh use ssh -X, or modelserver status --watch"
+        wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
+    if wrong:
+        raise MissingToolError(f"lcm-spy {wrong}")
+
+
+def get_types_jar() -> Path:
+    """Return the jar of the wire types, compiled once for each version of them."""
+    files = find_type_files()
+    folder = get_cache_folder() / hash_contract(files)
+    jar = folder / "mslcm.jar"
+    if not jar.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        _build_jar(files, jar)
+    return jar
+
+
+def get_cache_folder() -> Path:
+    """Return this program's folder in the user's cache."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not cache.is_absolute():
+        try:
+            cache = Path.home() / ".cache"
+        except RuntimeError:
+            raise MissingToolError("no home directory for the compiled types; set XDG_CACHE_HOME") from None
+    return cache / "modelserver"
+
+
+def hash_contract(files: Sequence[Path]) -> str:
+    """Return a hash of these types and of the version of lcm."""
+    digest = hashlib.sha256(version("lcm").encode())
+    for path in files:
+        digest.update(b"\0%b\0%b" % (path.name.encode(), path.read_bytes()))
+    return digest.hexdigest()[:16]
+
+
+def _build_jar(files: Sequence[Path], jar: Path) -> None:
+    compiler = shutil.which("javac")
+    if compiler is None:
+        raise MissingToolError(
+            "the types are not compiled yet, and the Java compiler is missing: sudo apt install default-jdk-headless"
+        )
+    typer.echo(f"compiling the types into {jar}", err=True)
+    with tempfile.TemporaryDirectory(dir=jar.parent) as scratch:
+        work = Path(scratch)
+        _run([find_binary("lcm-gen"), "--java", "--jpath", work / "src", *files])
+        sources = sorted((work / "src").rglob("*.java"))
+        _run([compiler, "-nowarn", "-cp", find_java_library(), "-d", work / "classes", *sources])
+        finished = work / jar.name
+        with zipfile.ZipFile(finished, "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in sorted((work / "classes").rglob("*.class")):
+                archive.write(path, path.relative_to(work / "classes"))
+        # atomic, also for two builds at once or an interrupted one
+        finished.replace(jar)
+
+
+def _run(arguments: Sequence[str | Path]) -> None:
+    done = subprocess.run(arguments, capture_output=True, text=True)
+    if done.returncode:
+        output = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
+        raise MissingToolError(f"{Path(arguments[0]).name} failed: {output[0]}")

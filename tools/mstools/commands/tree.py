@@ -8,7 +8,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -30,9 +30,6 @@ from mstools.terminal.output import (
     replace_unencodable,
     write_file,
 )
-
-if TYPE_CHECKING:
-    from modelserver.formats.snapshot import ModelSnapshot
 
 TIMEOUT_S = 11.0
 """Timeout for MODEL_SNAPSHOT, seconds; it is published every 5 s by default."""
@@ -64,8 +61,8 @@ def command(
         raise typer.BadParameter("give a FILE, or --live for the running daemon", param_hint="FILE")
     if as_json and svg:
         raise typer.BadParameter("excludes --svg", param_hint="--json")
-    check_writable(svg)
-    model = receive_geometry(url, prefix, wait).model if live else load_geometry(file, parse_variables(variables))
+    check_writable(svg, force)
+    model = receive_geometry(url, prefix, wait) if live else load_geometry(file, parse_variables(variables))
     if as_json:
         typer.echo(json.dumps({body.name: [frame.full_name for frame in body.frames] for body in model.bodies}))
         return
@@ -92,29 +89,20 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
     return load_given_model(file, variables)
 
 
-def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
+def receive_geometry(url: str, prefix: str, seconds: float) -> Model:
     """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
-    from modelserver.formats.snapshot import decode_snapshot
-    from modelserver.wire.provider import open_lcm, resolve_url
-    from modelserver.wire.snapshot import SnapshotAssembler
-    from mstools.commands.listener import DaemonListener
+    from modelserver.client.mirror import PlatformMirror
 
-    provider = resolve_url(url)
-    assembler, whole = SnapshotAssembler(), []
-
-    def add(chunk: Any) -> None:
-        if (content := assembler.add(chunk)) is not None:
-            whole.append(decode_snapshot(content))
-
-    listener = DaemonListener(open_lcm(provider), prefix, {"MODEL_SNAPSHOT": add})
-    listener.subscriptions[0].set_queue_capacity(0)
-    if not listener.listen(seconds, lambda: bool(whole)):
+    with PlatformMirror(url, channel_prefix=prefix) as mirror:
+        if mirror.wait_for(lambda: mirror.read_state()[0].snapshot is not None, seconds):
+            snapshot = mirror.read_state()[0].snapshot
+            assert snapshot is not None
+            return snapshot.model
         raise NoServerError(
-            f"no geometry received on {prefix}MODEL_SNAPSHOT at {provider} within {seconds:g} s. Is the daemon running "
-            "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its period is "
-            "publish.snapshot_s in the vehicle file: use a longer --wait"
+            f"no geometry received on {prefix}MODEL_SNAPSHOT at {mirror.url} within {seconds:g} s. Is the daemon "
+            "running (modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its "
+            "period is publish.snapshot_s in the vehicle file: use a longer --wait"
         )
-    return whole[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -20,14 +20,26 @@ from modelserver.errors import ModelServerError, RecordingError
 from modelserver.messages import FixType, GpsSample
 from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
-from mstools.terminal.progress import show_progress
-from mstools.tuning import report as tuning_report
-from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
+from mstools.terminal.output import check_outputs, escape, format_count, show_progress, to_json, write_file
+from mstools.tuning import (
+    EvaluationJob,
+    EvaluationResult,
+    Parameter,
+    Part,
+    Score,
+    SearchResult,
+    SearchStep,
+    Settings,
+    evaluate,
+    gps_channel,
+    load,
+    read_fixes,
+    search,
+    stated_sigma,
+)
 
 if TYPE_CHECKING:
     from modelserver.server.vehicle import Vehicle
-    from mstools.tuning.evaluation import EvaluationJob, EvaluationResult, Part
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +70,16 @@ TUNABLES = (
 """In search order."""
 
 
+ROUNDS = 2
+"""Rounds over all settings, at most: a second one follows what the first one changed."""
+
+
 def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
     plot: Annotated[str, option("--plot HTML", "Write a page with the scores of all settings that were tried.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
-    rounds: Annotated[int, option("--rounds N", "Rounds over all settings, at most.", min=1, max=5)] = 2,
     processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
     as_json: JsonOption = False,
     force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
@@ -83,24 +98,17 @@ def command(
     """
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
-    named = [each for each in (output, plot) if each and each != "-"]
-    if len({os.path.realpath(each) for each in (*named, str(log), str(config))}) < len(named) + 2:
-        raise typer.BadParameter("LOG, --config, --plot and --output must be different files")
-    for target in named:
-        check_writable(target, force)
+    check_outputs((log, config), plot, output, as_json, force)
     if plot:
         charts.check_installed()
-    from mstools.tuning import evaluation as tune_runs
 
-    vehicle = tune_runs.load(config)
-    tune_runs.gps_channel(vehicle)
-    fixes = tune_runs.read_fixes(log, config)
+    vehicle = load(config)
+    gps_channel(vehicle)
+    fixes = read_fixes(log, config)
     if vehicle.config.localization.mode == "raw":
         raise RecordingError(f"{escape(str(config))}: localization.mode is raw, without a filter to tune")
     chosen = choose_parameters(vehicle, fixes.samples, quick=quick)
-    sigmas = sorted(tune_runs.stated_sigma(each, vehicle) for each in fixes.samples)
+    sigmas = sorted(stated_sigma(each, vehicle) for each in fixes.samples)
     for number, each in enumerate(chosen):
         # a floor below the receiver's sigma has no effect: steps upward start there
         if each.name == "gps_sigma_floor":
@@ -108,7 +116,7 @@ def command(
     parts: tuple[Part, ...] = ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
-    rounds = 1 if quick else rounds
+    rounds = 1 if quick else ROUNDS
     bound = len(parts) * (1 + rounds * len(chosen) * 2)
     with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(processes, len(parts)) as runs:
         trials = Trials(runs, log, config, parts, show)
@@ -129,9 +137,7 @@ def command(
         typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
     if plot:
         lines = format_result(escape(str(log)), result)
-        write_file(
-            plot, tuning_report.render_page(escape(str(log)), lines, begin, attempts, found.settings), replace=force
-        )
+        write_file(plot, render_page(escape(str(log)), lines, begin, attempts, found.settings), replace=force)
     write_file(output, format_proposal(str(log), result), replace=force)
 
 
@@ -160,7 +166,6 @@ class Trials:
 
     def __call__(self, trials: Sequence[Settings]) -> list[Score | None]:
         """Return the scores of settings; None for those out of range."""
-        from mstools.tuning.evaluation import EvaluationJob
 
         keys = [tuple(sorted(each.items())) for each in trials]
         new = [key for key in dict.fromkeys(keys) if key not in self.results]
@@ -174,9 +179,9 @@ class Trials:
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
         return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
 
-    def list_attempts(self) -> list[tuning_report.Attempt]:
+    def list_attempts(self) -> list[Attempt]:
         """Return all settings that were tried, in order, with their scores."""
-        return [tuning_report.Attempt(dict(key), self._score(found)) for key, found in self.results.items()]
+        return [Attempt(dict(key), self._score(found)) for key, found in self.results.items()]
 
     def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]
@@ -203,7 +208,6 @@ class TuningResult:
 
 
 def format_result(log: str, result: TuningResult) -> list[str]:
-    """Format the report as lines."""
     found = result.found
     text = [
         f"{log}: {format_count(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
@@ -307,10 +311,9 @@ def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Fu
 
 def _run(job: EvaluationJob) -> EvaluationResult | None:
     """Return the result of a job; None for settings that the filter rejects."""
-    from mstools.tuning import evaluation as tune_runs
 
     try:
-        return tune_runs.evaluate(job)
+        return evaluate(job)
     except ModelServerError:
         raise
     except ValueError:
@@ -335,3 +338,54 @@ def _print_step(step: SearchStep) -> None:
         f"RMSE {step.score.rmse:.3f} m",
         err=True,
     )
+
+
+class Attempt(NamedTuple):
+    """Settings that were tried, and their score; None where the filter rejects them."""
+
+    settings: Settings
+    score: Score | None
+
+
+def render_page(log: str, lines: Sequence[str], begin: Settings, attempts: Sequence[Attempt], best: Settings) -> str:
+    """Return an HTML page: `lines` of the result, and the scores of all attempts.
+
+    `begin` are the settings of the vehicle file, `best` those that are proposed. Raises as `charts.render_page`.
+    """
+    scored = [(number, each.settings, each.score) for number, each in enumerate(attempts) if each.score is not None]
+    texts = [_describe(begin, settings) for _, settings, _ in scored]
+    at = [float(number) for number, _, _ in scored]
+    x = charts.Axis("settings in the order in which they were tried", -0.5, max(len(attempts) - 0.5, 0.5))
+    proposed = next((number for number, settings, _ in scored if dict(settings) == dict(best)), 0)
+    panels = []
+    for title, unit, name, height in (
+        ("Log-likelihood of a withheld fix", "", "likelihood", 200.0),
+        ("RMSE at withheld fixes", "m", "rmse", 120.0),
+        ("Mean error at the ends of gaps", "m", "gaps", 120.0),
+        ("Mean NEES at the ends of gaps", "", "nees", 120.0),
+    ):
+        values = [float(getattr(score, name)) for _, _, score in scored]
+        if not any(map(math.isfinite, values)):
+            continue
+        # settings that are far off would hide the differences between the others
+        axis = charts.Axis(unit, *charts.value_range(values, 0.9))
+        chosen = [n for n, number in enumerate(at) if number == proposed]
+        drawn = [
+            charts.Series("tried", at, values, charts.BLUE, 5.0, "dots", texts=texts),
+            charts.Series(
+                "proposed",
+                [at[n] for n in chosen],
+                [values[n] for n in chosen],
+                charts.ORANGE,
+                9.0,
+                "dots",
+                texts=[texts[n] for n in chosen],
+            ),
+        ]
+        panels.append(charts.Panel(title, axis, drawn, height))
+    return charts.render_text_page(f"Tuning: {log}", lines, [charts.render_panels("Scores", x, panels)])
+
+
+def _describe(begin: Settings, settings: Settings) -> str:
+    changed = [f"{name} {begin[name]:g} -> {value:g}" for name, value in settings.items() if value != begin[name]]
+    return ", ".join(changed) or "the vehicle file's"

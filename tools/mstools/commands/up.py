@@ -20,25 +20,24 @@ from modelserver.files.regular import check_links
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
-from mstools.commands.driver import load_driver
-from mstools.commands.emulate import SCENARIOS
+from mstools.commands.driver import SCENARIOS, load_driver
 from mstools.commands.run import LEVELS, check_log_options
 from mstools.commands.status import HealthListener
 from mstools.commands.view import check_installed
-from mstools.launch.connections import (
+from mstools.launch.processes import (
+    MODELSERVER,
     SERVICE,
     STATE_FOLDER,
+    ChildProcesses,
     EmulatedConnections,
     get_start_utime,
     make_connections,
     start_devices,
     start_programs,
 )
-from mstools.launch.processes import MODELSERVER, ChildProcesses
 from mstools.terminal.health_text import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
-from mstools.terminal.output import escape, print_problems
-from mstools.terminal.progress import catch_signals
+from mstools.terminal.output import catch_signals, escape, print_problems
 
 DEFAULT_FILE: Final = Path("vehicle.yaml")
 

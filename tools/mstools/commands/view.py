@@ -25,8 +25,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import check_writable, escape
-from mstools.terminal.progress import catch_signals, show_progress
+from mstools.terminal.output import catch_signals, check_writable, escape, show_progress
 
 if TYPE_CHECKING:
     from mstools.view.editor import Editing
@@ -126,7 +125,7 @@ def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, 
 
     Bus and prefix of the service are those given, else of the vehicle file.
     """
-    from mstools.edit.session import EditedFile, EditSession
+    from mstools.edit.document import EditedFile, EditSession
     from mstools.view.editor import Editing
 
     if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:

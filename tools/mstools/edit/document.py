@@ -6,13 +6,20 @@ with `in_template` the template is changed, and with it all bodies that use it.
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Final, NamedTuple
 
-from modelserver.errors import quote
+from modelserver.config.vehicle_file import VehicleConfig, load_config
+from modelserver.errors import ModelServerError, Problem, has_error, quote
+from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
+from modelserver.files.regular import read_start
+from modelserver.formats import parse_content, read_content
 from modelserver.formats.reading import parse_number
 from modelserver.formats.writing import format_number
 from modelserver.formats.yaml_elements import POSE_KEYS, read_pose
@@ -21,9 +28,11 @@ from modelserver.formats.yaml_writer import format_joint_fields, format_scalar_o
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint
+from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit.yaml_text import EditError, Path, YamlText
+from mstools.edit.yaml_text import EditError, KeyPath, YamlText
+from mstools.terminal.output import open_atomic
 
 DECIMALS: Final = 9
 """Of meters and degrees that are written."""
@@ -89,7 +98,7 @@ class GeometryDocument:
         for at, body in self._yaml.list_lines(("bodies",)):
             yield at, GeometryItem(ItemKind.BODY, body)
             template = self._get_template(body)
-            paths: list[Path] = [("bodies", body, "frames")]
+            paths: list[KeyPath] = [("bodies", body, "frames")]
             if template and template not in seen:
                 seen.add(template)
                 paths.append(("templates", template, "frames"))
@@ -121,12 +130,12 @@ class GeometryDocument:
         shared = self._yaml.keys(("templates", self._get_template(body), "frames"))
         return list(dict.fromkeys([*shared, *own]))
 
-    def _find_path(self, item: GeometryItem) -> Path:
+    def _find_path(self, item: GeometryItem) -> KeyPath:
         """Return where an item is written. Raises EditError if it is not there."""
         if item.kind is ItemKind.FRAME:
             body, frame = names.split(item.name)
             template = self.find_template(item)
-            path: Path = ("templates", template) if template else ("bodies", body)
+            path: KeyPath = ("templates", template) if template else ("bodies", body)
             path = (*path, "frames", frame)
         else:
             path = ("bodies" if item.kind is ItemKind.BODY else "constraints", item.name)
@@ -293,7 +302,7 @@ class GeometryDocument:
 
     # --- inside
 
-    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[YamlText, Path]:
+    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[YamlText, KeyPath]:
         """Return the text, in which a frame of a template has an entry on its body if that alone is changed."""
         path = self._find_path(item)
         if path[0] != "templates" or in_template:
@@ -335,7 +344,7 @@ def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
     return text
 
 
-def _read_pose(text: YamlText, path: Path) -> Pose:
+def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
     builder = ModelBuilder()
     root = parse_yaml(text.get_entry(path).encode(), builder, "")
@@ -344,7 +353,7 @@ def _read_pose(text: YamlText, path: Path) -> Pose:
     return read_pose(YamlMapping(builder, "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
 
 
-def _set(text: YamlText, path: Path, key: str, value: str) -> YamlText:
+def _set(text: YamlText, path: KeyPath, key: str, value: str) -> YamlText:
     """Set a key of an entry; a new one stands after those that usually precede it."""
     if text.has((*path, key)):
         return text.set((*path, key), value)
@@ -355,7 +364,7 @@ def _set(text: YamlText, path: Path, key: str, value: str) -> YamlText:
     return text.insert_first(path, f"{key}: {value}")
 
 
-def _set_numbers(text: YamlText, path: Path, key: str, values: Sequence[float]) -> YamlText:
+def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float]) -> YamlText:
     """Set a list of numbers; those that are the same stay as they are written."""
     written = text.get_list((*path, key)) or []
     old = [_parse(each) for each in written] if len(written) == len(values) else [math.nan] * len(values)
@@ -402,3 +411,184 @@ def _format_full_name(name: str) -> str:
 def _normalize(name: str) -> str:
     """Return the full name of a frame without spaces around its parts."""
     return ":".join(part.strip() for part in name.split(":"))
+
+
+MAX_STEPS = 500
+"""Changes that can be undone."""
+
+_BOM = "\ufeff"
+
+
+class Step(NamedTuple):
+    """A document with the name of the change that led to it."""
+
+    document: GeometryDocument
+    change: str
+
+
+class CheckedText(NamedTuple):
+    """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
+
+    model: Model | None
+    drawn: Model | None
+    problems: tuple[Problem, ...]
+
+
+@dataclass(frozen=True)
+class EditedFile:
+    """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it."""
+
+    path: Path
+    vehicle: Path | None = None
+    config: VehicleConfig | None = None
+
+    @classmethod
+    def open(cls, path: Path) -> EditedFile:
+        """Return the geometry file at a path, or that of a vehicle file. Raises ConfigError, OSError."""
+        if detect_file_kind(read_start(path, EXAMINED_BYTES)) is not FileKind.VEHICLE:
+            return cls(path)
+        config = load_config(path)
+        return cls(Path(config.geometry), path, config)
+
+    def read(self) -> str:
+        """Return the text of the file. Raises OSError, GeometryError, EditError for one that is not YAML."""
+        content = read_content(self.path)
+        if content.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
+            raise EditError(f"{self.path} is XML; only YAML is edited: modelserver convert {self.path} geometry.yaml")
+        try:
+            return content.decode()
+        except UnicodeDecodeError:
+            raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
+
+    def check(self, text: str, variables: Mapping[str, str]) -> CheckedText:
+        """Return what a text has, with all problems, also of frames in the vehicle file."""
+        builder = parse_content(text.encode(), str(self.path), variables)
+        model, problems = builder.check()
+        partial = model or builder.build_bodies()
+        if self.config is not None and partial is not None:
+            from modelserver.server.vehicle import find_frame_problems
+
+            problems += tuple(find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
+        return CheckedText(model, partial, problems)
+
+
+class EditSession:
+    """Edit a file. Raises EditError for a file that cannot be edited, OSError."""
+
+    def __init__(self, file: EditedFile, variables: Mapping[str, str] | None = None):
+        self.file = file
+        self._variables = variables or {}
+        self.read()
+
+    def read(self) -> None:
+        """Read the file again; all changes are dropped. Raises as `EditSession`, with all as before."""
+        saved = self.file.read()
+        document = GeometryDocument(saved.removeprefix(_BOM))
+        if not document.list_items():
+            path = self.file.path
+            raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
+        drawn = self.file.check(document.text, self._variables).drawn
+        if drawn is None:
+            raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
+        self._saved = saved
+        self._steps = [Step(document, "")]
+        self._undone: list[Step] = []
+        self.drawn: Model = drawn
+        """The last model without an error; before there is one, the bodies of the file alone."""
+        self.model: Model | None = None
+        """The last model without an error."""
+        self._loaded: GeometryDocument | None = None
+        self._check()
+
+    def _check(self) -> None:
+        found = self.file.check(self.document.text, self._variables)
+        self.problems = found.problems
+        if found.model is not None:
+            self.model = self.drawn = found.model
+            self._loaded = self.document
+        elif self.model is None and found.drawn is not None:
+            self.drawn = found.drawn
+
+    @property
+    def document(self) -> GeometryDocument:
+        return self._steps[-1].document
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether there is something to save."""
+        return self.document.text != self._saved.removeprefix(_BOM)
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether a problem forbids to save."""
+        return has_error(self.problems)
+
+    @property
+    def undo_name(self) -> str:
+        """The change that `undo` undoes, empty for none."""
+        return self._steps[-1].change if len(self._steps) > 1 else ""
+
+    @property
+    def redo_name(self) -> str:
+        """The change that `redo` makes again, empty for none."""
+        return self._undone[-1].change if self._undone else ""
+
+    def change(self, name: str, change: Callable[[GeometryDocument], GeometryDocument]) -> bool:
+        """Make a change; return whether it changed anything. Raises EditError, with all as before."""
+        document = change(self.document)
+        if document.text == self.document.text:
+            return False
+        self._steps.append(Step(document, name))
+        del self._steps[1:-MAX_STEPS]
+        self._undone.clear()
+        self._check()
+        return True
+
+    def undo(self) -> None:
+        if len(self._steps) > 1:
+            self._undone.append(self._steps.pop())
+            self._check()
+
+    def redo(self) -> None:
+        """Make the last undone change again."""
+        if self._undone:
+            self._steps.append(self._undone.pop())
+            self._check()
+
+    def is_as_loaded(self, item: GeometryItem) -> bool:
+        """Return whether the entry of an item is written as in the document of `model`."""
+        try:
+            return self._loaded is not None and self._loaded.get_yaml(item) == self.document.get_yaml(item)
+        except EditError:
+            return False
+
+    def has_changed_on_disk(self) -> bool:
+        """Return whether the file is no longer what was read or saved."""
+        try:
+            return self.file.read() != self._saved
+        except (ModelServerError, OSError):
+            return True
+
+    def find_culprit(self, problem: Problem) -> GeometryItem | None:
+        return self.document.find_item(problem.line) if problem.file == str(self.file.path) else None
+
+    def make_diff(self) -> str:
+        """Return what saving changes, as a unified diff."""
+        old, new = (text.splitlines() for text in (self._saved.removeprefix(_BOM), self.document.text))
+        name = self.file.path.name
+        return "\n".join(difflib.unified_diff(old, new, name, f"{name} (edited)", lineterm=""))
+
+    def save(self) -> None:
+        """Write the file whole. Raises EditError if it has an error or changed since it was read, OSError."""
+        if self.has_errors:
+            raise EditError("the geometry has errors; nothing is saved until they are fixed")
+        try:
+            current = self.file.read()
+        except FileNotFoundError:
+            raise EditError(f"{self.file.path} was removed meanwhile; nothing is saved") from None
+        if current != self._saved:
+            raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Read it again first")
+        text = (_BOM if self._saved.startswith(_BOM) else "") + self.document.text
+        with open_atomic(str(self.file.path), replace=True) as stream:
+            stream.write(text)
+        self._saved = text

@@ -19,7 +19,7 @@ from modelserver.errors import ModelServerError, quote
 from modelserver.formats.yaml_nodes import parse_yaml
 from modelserver.geometry.builder import ModelBuilder
 
-Path = Sequence[str]
+KeyPath = Sequence[str]
 MAX_SPACES = 1000
 """Spaces before a colon that are looked through."""
 
@@ -70,44 +70,44 @@ class YamlText:
 
     # --- reading
 
-    def entries(self, path: Path = ()) -> list[TextEntry]:
+    def entries(self, path: KeyPath = ()) -> list[TextEntry]:
         """Return the entries of a mapping, in order; none if it is absent or no mapping."""
         node: Any = self._root if not path else self._get(path)
         return [] if node is None else list(self._list_entries(node))
 
-    def keys(self, path: Path = ()) -> list[str]:
+    def keys(self, path: KeyPath = ()) -> list[str]:
         return [each.name for each in self.entries(path)]
 
-    def has(self, path: Path) -> bool:
+    def has(self, path: KeyPath) -> bool:
         """Return whether a key is there."""
         return self._find(path) is not None
 
-    def get_text(self, path: Path) -> str:
+    def get_text(self, path: KeyPath) -> str:
         """Return the text of a scalar, empty if it is absent or none."""
         node = self._get(path)
         return str(node.value).strip() if isinstance(node, yaml.ScalarNode) else ""
 
-    def get_list(self, path: Path) -> list[str] | None:
+    def get_list(self, path: KeyPath) -> list[str] | None:
         """Return the texts of a list of scalars, None if it is none."""
         node = self._get(path)
         if not isinstance(node, yaml.SequenceNode) or any(not isinstance(each, yaml.ScalarNode) for each in node.value):
             return None
         return [str(each.value) for each in node.value]
 
-    def get_entry(self, path: Path) -> str:
+    def get_entry(self, path: KeyPath) -> str:
         """Return a key and its value as they are written, without indentation. Raises EditError if it is absent."""
         found = self._require(path)
         begin = found.key.start_mark.index
         text = self.text[begin : found.end].replace("\r\n", "\n")
         return text if found.is_flow else textwrap.dedent(" " * found.key.start_mark.column + text)
 
-    def list_lines(self, path: Path) -> list[tuple[int, str]]:
+    def list_lines(self, path: KeyPath) -> list[tuple[int, str]]:
         """Return the keys of a mapping with their lines, counted from 1."""
         return [(each.key.start_mark.line + 1, each.name) for each in self.entries(path)]
 
     # --- changes
 
-    def set(self, path: Path, value: str) -> YamlText:
+    def set(self, path: KeyPath, value: str) -> YamlText:
         """Set the value of a key to a value on one line; the key is added last if it is absent."""
         found = self._find(path)
         if found is None:
@@ -119,7 +119,7 @@ class YamlText:
             return self._set_value(found, f" {value}")
         return self._replace(begin, found.end, value)
 
-    def add(self, path: Path, entry: str, after: str = "", *, in_block: bool = False) -> YamlText:
+    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> YamlText:
         """Add an entry `key: value`, of one or more lines without indentation, to a mapping.
 
         It stands after the key `after`, else last. An empty mapping gets braces, or with `in_block` lines of its own;
@@ -143,7 +143,7 @@ class YamlText:
         gap = self._newline if self._has_gaps(entries) else ""
         return self._replace(end, end, self._newline + gap + self._indent(entry, indent))
 
-    def _fill(self, path: Path, entry: str, in_block: bool) -> YamlText:
+    def _fill(self, path: KeyPath, entry: str, in_block: bool) -> YamlText:
         """Add the first entry of a mapping that is empty or has no value."""
         found = self._require(path)
         if in_block and not found.is_flow:
@@ -157,7 +157,7 @@ class YamlText:
             return self._replace(entry.colon, entry.end, value)
         return self._replace(entry.end, entry.end, f":{value}")
 
-    def insert_first(self, path: Path, entry: str) -> YamlText:
+    def insert_first(self, path: KeyPath, entry: str) -> YamlText:
         """Add an entry on one line before the others of a mapping."""
         entries = self.entries(path)
         if not entries:
@@ -169,7 +169,7 @@ class YamlText:
             return self._replace(at, at, f"{entry}, ")
         return self._replace(at, at, entry + self._newline + " " * first.key.start_mark.column)
 
-    def remove(self, path: Path) -> YamlText:
+    def remove(self, path: KeyPath) -> YamlText:
         """Remove a key with its value, and the comment on the lines directly before it."""
         found = self._require(path)
         self._check_own(path)
@@ -190,19 +190,19 @@ class YamlText:
             begin = max(begin - len(self._newline), 0)
         return self._replace(begin, end, "")
 
-    def _empty(self, path: Path, last: TextEntry) -> YamlText:
+    def _empty(self, path: KeyPath, last: TextEntry) -> YamlText:
         """Remove the only entry of a mapping."""
         if last.is_flow:
             return self._replace(last.key.start_mark.index, last.end, "")
         return self._set_value(self._require(path), " {}")
 
-    def rename(self, path: Path, key: str) -> YamlText:
+    def rename(self, path: KeyPath, key: str) -> YamlText:
         """Write another key, as YAML, in the place of one."""
         found = self._require(path)
         self._check_own(path[:-1], is_whole=False)
         return self._replace(found.key.start_mark.index, found.key.end_mark.index, key)
 
-    def replace_entry(self, path: Path, entry: str) -> YamlText:
+    def replace_entry(self, path: KeyPath, entry: str) -> YamlText:
         """Write another entry, `key: value` of one or more lines without indentation, in the place of one."""
         found = self._require(path)
         self._check_own(path)
@@ -216,11 +216,11 @@ class YamlText:
     def _replace(self, begin: int, end: int, text: str) -> YamlText:
         return YamlText(self.text[:begin] + text + self.text[end:])
 
-    def _get(self, path: Path) -> Any:
+    def _get(self, path: KeyPath) -> Any:
         found = self._find(path)
         return None if found is None else found.value
 
-    def _find(self, path: Path) -> TextEntry | None:
+    def _find(self, path: KeyPath) -> TextEntry | None:
         node: Any = self._root
         found: TextEntry | None = None
         for key in path:
@@ -232,13 +232,13 @@ class YamlText:
             node = found.value
         return found
 
-    def _require(self, path: Path) -> TextEntry:
+    def _require(self, path: KeyPath) -> TextEntry:
         found = self._find(path)
         if found is None:
             raise EditError(f"there is no {' '.join(path)} in the file")
         return found
 
-    def _check_own(self, path: Path, is_whole: bool = True) -> None:
+    def _check_own(self, path: KeyPath, is_whole: bool = True) -> None:
         """Raise EditError if what a path leads to, or with `is_whole` a part of it, is shared by an alias."""
         for length in range(1, len(path) + 1):
             found = self._find(path[:length])

@@ -1,4 +1,4 @@
-"""Output of commands: text and tables for the terminal, and atomically written files."""
+"""Output of commands: text, tables, problems of the input, atomically written files, progress, and live displays."""
 
 from __future__ import annotations
 
@@ -6,18 +6,32 @@ import contextlib
 import dataclasses
 import math
 import os
+import signal
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, TextIO
+from threading import Event
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from modelserver.errors import ModelServerError, Problem
+from modelserver.errors import (
+    ConfigError,
+    GeometryError,
+    Location,
+    ModelServerError,
+    Problem,
+    Severity,
+    find_nearest_names,
+)
 from modelserver.files.regular import check_links
 from modelserver.geometry.model import Model
+
+if TYPE_CHECKING:
+    from rich.live import Live
 
 
 def escape(text: str) -> str:
@@ -94,6 +108,18 @@ def check_writable(path: str, replace: bool = True) -> None:
         raise ModelServerError(f"{escape(path)} cannot be written: folder {escape(folder)} is missing; create it first")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ModelServerError(f"{escape(path)} cannot be written: no write permission for folder {escape(folder)}")
+
+
+def check_outputs(inputs: Sequence[Path], plot: str, output: str, as_json: bool, replace: bool) -> None:
+    """Raise typer.BadParameter or ModelServerError for outputs that cannot be written, before long work."""
+    if as_json and output == "-":
+        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
+    named = [each for each in (plot, output) if each and each != "-"]
+    files = [*named, *map(str, inputs)]
+    if len(set(map(os.path.realpath, files))) < len(files):
+        raise typer.BadParameter("inputs, --plot and --output must be different files")
+    for target in named:
+        check_writable(target, replace)
 
 
 def write_file(path: str, text: str, replace: bool) -> None:
@@ -186,3 +212,93 @@ def replace_unencodable(text: str, encoding: str | None = None) -> str:
     except (UnicodeEncodeError, LookupError):
         return text.translate(_ASCII).encode("ascii", "replace").decode()
     return text
+
+
+class ProblemCollector:
+    """Collect errors, and raise them together."""
+
+    def __init__(self) -> None:
+        self._errors: list[Problem] = []
+
+    def add(self, what: str, why: str, fix: str = "") -> None:
+        """Add an error of a file or an option."""
+        self._errors.append(Problem(Severity.ERROR, why, Location(what), fix))
+
+    @contextmanager
+    def collect(self, what: str) -> Iterator[None]:
+        """Collect the errors that the block raises; those without a location are errors of `what`."""
+        try:
+            yield
+        except (ConfigError, GeometryError) as error:
+            self._errors += [each for each in error.problems if each.severity is Severity.ERROR]
+        except ModelServerError as error:
+            self.add(what, str(error))
+        except OSError as error:
+            self.add(str(error.filename or what), f"cannot be read: {error.strerror or error}")
+
+    def raise_any(self) -> None:
+        """Raise ConfigError with the errors, without duplicates, if there are any."""
+        if self._errors:
+            raise ConfigError(dict.fromkeys(self._errors))
+
+
+def make_error(why: str, place: str | Location, fix: str) -> ConfigError:
+    """Return the error of a file or an option with one problem."""
+    return ConfigError([Problem(Severity.ERROR, why, place if isinstance(place, Location) else Location(place), fix)])
+
+
+def find_nearest_path(path: str | Path) -> str:
+    """Return the existing path in the same folder with the most similar name; empty if there is none."""
+    path = Path(path)
+    with suppress(OSError):
+        near = find_nearest_names(path.name, os.listdir(path.parent), 1)
+        if near:
+            return str(path.parent / near[0])
+    return ""
+
+
+def suggest_path(error: OSError) -> str:
+    """Return `; did you mean PATH?` for a FileNotFoundError with a similar file, else an empty text."""
+    near = find_nearest_path(error.filename) if isinstance(error, FileNotFoundError) and error.filename else ""
+    return f"; did you mean {near}?" if near else ""
+
+
+@contextmanager
+def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar while the block runs; the block calls the given function with the part of `total` done.
+
+    Nothing is shown where stderr is no terminal.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(label, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def open_screen() -> Live:
+    """Return a display of the whole terminal, for a `with` block."""
+    from rich.console import Console
+    from rich.live import Live
+
+    return Live(console=Console(highlight=False), screen=True, auto_refresh=False)
+
+
+@contextmanager
+def catch_signals() -> Iterator[Event]:
+    """Within the block, SIGINT, SIGTERM and SIGHUP set the event and do nothing else.
+
+    KeyboardInterrupt is no alternative: LCM's binding raises it, and Python raises it again for the same signal; and
+    SIGTERM would not restore the terminal.
+    """
+    stop = Event()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    previous = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,30 +1,254 @@
-"""`modelserver set-pose`: sets the pose of the vehicle in the running daemon, and reports the decision on it."""
+"""Signed commands to the running daemon: `modelserver mode`, `reload`, `set-pose`; and `key`, to sign with."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 
-from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError
+from modelserver.errors import ForbiddenError, Location, ModelServerError, NoServerError, RejectedError
 from modelserver.geometry import names
-from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
+from modelserver.messages import (
+    Decision,
+    Health,
+    Invalid,
+    Mode,
+    NavigationState,
+    PoseAnswer,
+    PublishDecisions,
+    ReloadReply,
+    SensorHeader,
+    SwitchMode,
+    Verdict,
+)
+from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion
 from modelserver.transforms.transformation import Transformation
+from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import DaemonListener
-from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption, option
-from mstools.terminal.output import escape, to_json
+from mstools.commands.status import DaemonListener
+from mstools.terminal.options import (
+    JsonOption,
+    KeyOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    argument,
+    choose_name,
+    option,
+)
+from mstools.terminal.output import escape, make_error, to_json
 
 if TYPE_CHECKING:
     import lcm
 
     from modelserver.earth.geodesy import Geodesy
+
+MODES = tuple(mode.name.lower() for mode in Mode)
+
+TIMEOUT_S = 2.0
+"""Timeout for the daemon, seconds."""
+
+
+def mode(
+    mode: Annotated[str, argument("MODE", f"One of {', '.join(MODES)}.")],
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
+    url: UrlOption = "",
+    key: KeyOption = None,
+) -> None:
+    """Switch which sources the localization of the running daemon uses, and report the mode in force.
+
+    The command is sent once, signed, for the channel in the vehicle file (localization.mode_channel), with which the
+    daemon must have been started. The key is that of --key, else of $MODELSERVER_KEY_FILE, else of the vehicle file
+    (commands.key_file). LOCALIZATION_STATE and LOCALIZATION_DECISIONS confirm the mode within two seconds. Exit code 1
+    if no daemon answers, or the mode does not change.
+
+    Example: modelserver mode no_gps -c config/husky/vehicle.yaml
+    """
+    wanted = parse_mode(mode)
+    from modelserver.client.remote import load_signer
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.wire.codec import encode
+
+    vehicle = load_config(config)
+    if not vehicle.localization.mode_channel:
+        why = "no channel for mode commands is configured, so the daemon receives none"
+        fix = "write mode_channel: LOCALIZATION_MODE under localization, and restart the daemon"
+        raise make_error(why, Location(str(config), element="localization.mode_channel"), fix)
+    prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
+    channel = f"{prefix}{vehicle.localization.mode_channel}"
+    given = str(key or "") or os.environ.get(KEY_FILE_VARIABLE, "") or vehicle.commands.key_file
+    signing = load_signer(given, prefix, "modelserver")
+    if signing is None:
+        raise ModelServerError(f"the command must be signed; give the daemon's key with --key or ${KEY_FILE_VARIABLE}")
+    provider = resolve_url(url or vehicle.lcm.url)
+    bus = open_lcm(provider)
+    listener = ModeListener(bus, prefix, vehicle.localization.mode_channel)
+    if state_hz:
+        listener.listen(min(TIMEOUT_S, 2.5 / state_hz), lambda: listener.mode is not None)
+    was = listener.mode
+    utime = time.time_ns() // 1000
+    listener.reset(utime)
+    content = encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted))
+    bus.publish(signing.channel, signing.seal(vehicle.localization.mode_channel, content))
+    sent = f"sent {channel}: {wanted.name.lower()}"
+    confirmed = listener.listen(TIMEOUT_S, lambda: wanted in (listener.mode, listener.decided_mode))
+    if not listener.has_received:
+        raise NoServerError(
+            f"{sent}, but no message was received on {provider}: is the daemon running, on this bus and with this "
+            "vehicle file? (modelserver run -c FILE, --url)"
+        )
+    now = listener.mode
+    if not confirmed and now is not None and not (wanted is Mode.RAW and listener.is_silent(state_hz)):
+        why = f" ({listener.rejection})" if listener.rejection else "; was it started with this vehicle file?"
+        raise ModelServerError(f"{sent}, but the daemon stays in mode {now.name.lower()}{why}")
+    if confirmed or (wanted is Mode.RAW and was is not None):
+        before = f" (was {was.name.lower()})" if was is not None else ""
+        typer.echo(f"now {wanted.name.lower()}{before}")
+    elif not state_hz:
+        typer.echo(f"{sent}; it cannot be confirmed: the vehicle file has publish.state_hz: 0")
+    else:
+        typer.echo(f"{sent}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
+
+
+class ModeListener(DaemonListener):
+    """Receive the mode of a daemon: `mode` from its state, `decided_mode` from its decisions since `since`.
+
+    `rejection`: why a command was rejected, from the health report.
+    """
+
+    def __init__(self, bus: lcm.LCM, prefix: str, mode_channel: str):
+        self.mode: Mode | None = None
+        self.decided_mode: Mode | None = None
+        self.rejection = ""
+        self.since = 0
+        # rejected commands that the daemon had counted before
+        self._sources = (f"{prefix}{mode_channel}", f"{prefix}{SIGNED}")
+        self._counts: dict[tuple[str, str], int] = {}
+        self._state_time = 0.0
+        handlers: dict[str, Callable[[Any], object]] = {
+            "LOCALIZATION_STATE": self._on_state,
+            "LOCALIZATION_DECISIONS": self._on_decisions,
+            "MODELSERVER_HEALTH": self._on_health,
+            "POSE": lambda _: None,
+        }
+        super().__init__(bus, prefix, handlers)
+
+    def reset(self, since: int) -> None:
+        """Drop what was received; decisions count from `since` on."""
+        self.mode = self.decided_mode = None
+        self.has_received, self.since = False, since
+
+    def is_silent(self, state_hz: float) -> bool:
+        """Return whether the last three states are missing: raw mode publishes none."""
+        return time.monotonic() - self._state_time > min(3.0 / state_hz, 0.5 * TIMEOUT_S)
+
+    def _on_state(self, state: NavigationState) -> None:
+        self.mode, self._state_time = state.mode, time.monotonic()
+
+    def _on_decisions(self, published: PublishDecisions) -> None:
+        for each in published.decisions:
+            name = each.reason.removeprefix("mode ").upper()
+            if each.kind == "mode" and published.utime >= self.since > 0 and name in Mode.__members__:
+                self.decided_mode = Mode[name]
+
+    def _on_health(self, health: Health) -> None:
+        before = self._counts
+        self._counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
+        for source, why, _ in health.rejected:
+            if source == f"command:{OPERATOR}":
+                self.rejection = why
+                break
+        if self.since:
+            # without an earlier report, earlier rejections count too: they are the likeliest cause
+            for (name, why), count in self._counts.items():
+                if count > before.get((name, why), 0):
+                    self.rejection = f"{why}: {_REASONS.get(why, 'see its log')}"
+            ahead = (health.utime - time.time_ns() // 1000) * 1e-6
+            if self.rejection.startswith("stale") and abs(ahead) > 1.0:
+                side = "ahead of" if ahead > 0 else "behind"
+                self.rejection += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
+
+
+_REASONS = {
+    "unknown_key": "the daemon has no key of that name: it was started with another key file",
+    "bad_signature": "the daemon has another key of that name, or another channel prefix",
+    "stale": "too old or in the future by the daemon's clock, or the daemon has just started",
+    "replayed": "the daemon has accepted a newer one of this sender; was a clock set back?",
+}
+"""Descriptions of the daemon's reasons to reject a signed message."""
+
+
+def parse_mode(text: str) -> Mode:
+    """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest name."""
+    name = text.strip().replace("-", "_").lower()
+    return Mode[(name if name in MODES else choose_name(text, MODES, "mode", "MODE")).upper()]
+
+
+PERMISSION_HINT = (
+    "or on its machine send SIGHUP to the daemon (kill -HUP PID), which needs no permission; the result is in its log"
+)
+
+
+def reload(
+    dry_run: Annotated[bool, option("--dry-run", "Only print what would change.")] = False,
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
+    timeout: TimeoutOption = 2.0,
+    key: KeyOption = None,
+) -> None:
+    """Reload the geometry file of the running daemon, and print the changes.
+
+    Either the whole file fits the vehicle and is used from now on, or nothing changes and all problems are printed.
+    The vehicle file itself is not reloaded: restart the daemon for that. The daemon applies the request if its vehicle
+    file has commands: {reload: true, key_file: ...} and the request is signed with that key (--key); kill -HUP on its
+    machine needs no permission. Exit code 1 if the geometry is rejected.
+
+    Example: modelserver reload --dry-run
+    """
+    from modelserver.client.remote import Platform
+
+    with Platform(
+        url, channel_prefix=prefix, timeout=timeout, retries=0, name="modelserver", key_file=key or ""
+    ) as platform:
+        try:
+            reply = platform.reload_model(dry_run=dry_run)
+        except ForbiddenError as error:
+            raise ModelServerError(f"reload denied: {error}; {PERMISSION_HINT}") from None
+        except RejectedError as error:
+            for line in str(error).splitlines():
+                typer.echo(escape(line), err=True)
+            stays = "the geometry in force stays" if not dry_run else "the daemon would reject it"
+            raise ModelServerError(f"{stays}; run modelserver check for details with line numbers") from None
+    typer.echo(json.dumps(reload_as_data(reply, dry_run), indent=2) if as_json else describe_reload(reply, dry_run))
+
+
+def describe_reload(reply: ReloadReply, dry_run: bool) -> str:
+    if not reply.changes:
+        return f"nothing {'would change' if dry_run else 'changed'}: revision {escape(reply.revision)}"
+    head = "would be" if dry_run else "is now"
+    lines = [f"the geometry in force {head} revision {escape(reply.revision)}; changes:"]
+    return "\n".join(lines + [f"  {escape(change)}" for change in reply.changes])
+
+
+def reload_as_data(reply: ReloadReply, dry_run: bool) -> dict[str, object]:
+    return {
+        "dry_run": dry_run,
+        "revision": reply.revision,
+        "revision_in_force": reply.header.model_revision,
+        "changes": list(reply.changes),
+    }
+
 
 CONFIRM_S = 4.0
 """How long to wait for the decision, seconds: it is final one filter horizon, about a second, after the request."""
@@ -33,7 +257,7 @@ MAX_DISTANCE_M = 200_000.0
 """A position farther from the origin than this, meters, is an input error: another UTM zone, or exchanged numbers."""
 
 OPERATOR = "operator"
-"""The source under which the ledger lists a pose that was set."""
+"""Source of mode commands, and under which the ledger lists a pose that was set."""
 
 PROGRAM = "modelserver"
 
@@ -57,7 +281,7 @@ class PoseTarget(NamedTuple):
     quaternion: Quaternion | None = None
 
 
-def command(
+def set_pose(
     utm: Annotated[
         Triple | None, option("--utm E N H", "Position: grid easting, northing, ellipsoidal height, meters.")
     ] = None,
@@ -138,7 +362,7 @@ def command(
     listener.pose = None
     listener.listen(timeout, lambda: listener.pose is not None)
     result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
-    typer.echo(json.dumps(as_data(result), indent=2) if as_json else describe(result))
+    typer.echo(json.dumps(set_pose_as_data(result), indent=2) if as_json else describe_set_pose(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
             f"localization rejected the pose: {escape(decision.reason or 'it contradicts the estimate')}; if the "
@@ -246,8 +470,7 @@ class SetPoseListener(DaemonListener):
 _VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RESET: "set"}
 
 
-def describe(result: SetPoseResult) -> str:
-    """Format the result."""
+def describe_set_pose(result: SetPoseResult) -> str:
     pose = result.request.pose
     origin = result.geodesy.origin
     east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))
@@ -275,7 +498,7 @@ def describe(result: SetPoseResult) -> str:
     return "\n".join(lines)
 
 
-def as_data(result: SetPoseResult) -> dict[str, Any]:
+def set_pose_as_data(result: SetPoseResult) -> dict[str, Any]:
     """Return the result as JSON data; angles in radians, a pose as its 7-vector."""
     origin, decision, after = result.geodesy.origin, result.decision, result.after
     sigma, sigma_deg = result.sigmas
@@ -302,3 +525,34 @@ def as_data(result: SetPoseResult) -> dict[str, Any]:
             "valid": after.transformation.is_valid,
         },
     }
+
+
+key = typer.Typer(
+    help="""Create the key to sign commands to a vehicle with.
+
+    The vehicle file names the key file (commands: {key_file: ...}); the commanding program gets it by --key FILE or
+    $MODELSERVER_KEY_FILE. docs/network.md explains how to distribute and change keys.
+
+    Example: modelserver key new /etc/modelserver/commands.key
+    """,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@key.callback()
+def _group() -> None:
+    """Keep `new` a subcommand."""
+
+
+@key.command("new")
+def create(
+    file: Annotated[Path, argument("FILE", "The file to create; it must not exist.")],
+    name: Annotated[str, option("--name TEXT", "Name of the key.")] = "",
+) -> None:
+    """Write a new key to a file that only its owner can read."""
+    from modelserver.signing.key_files import generate_key, write_key
+
+    new = generate_key(name)
+    write_key(file, new)
+    typer.echo(f"{escape(str(file))}: key {new.name}, readable by its owner only")

@@ -1,0 +1,775 @@
+"""Installation under systemd: its files, a plan of steps before anything is executed, and their execution.
+
+The state of the system comes in as `SystemFacts`, the steps go out as a `Plan`; plan and file contents are pure.
+A file is replaced or removed only if its hash is one that `install` wrote (manifest); edited files are kept. The
+manifest is written first, so that an interrupted installation can be undone. Read top-down: plan, contents, execution.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Container, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+from urllib.parse import parse_qs, urlsplit
+
+import typer
+
+from modelserver.errors import ModelServerError, find_nearest_names, quote
+from modelserver.wire.urls import group_of
+from mstools.terminal.output import ProblemCollector, escape, make_error
+
+CONFIGURATION: Final = "/etc/modelserver"
+VEHICLE: Final = f"{CONFIGURATION}/vehicle.yaml"
+MANIFEST: Final = f"{CONFIGURATION}/installed.json"
+UNITS: Final = "/etc/systemd/system"
+RULES: Final = "/etc/udev/rules.d/90-modelserver.rules"
+SYSCTL: Final = "/etc/sysctl.d/60-modelserver.conf"
+STATE: Final = ("/var/lib/modelserver", "/var/lib/private/modelserver")
+"""State directory of a service with a dynamic user: a link, and the folder that it leads to."""
+
+SERVICE: Final = "modelserver.service"
+LOOPBACK: Final = "modelserver-loopback.service"
+DRIVER: Final = "modelserver-driver@.service"
+
+MANIFEST_VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class WriteFile:
+    """Write a file atomically; `description` and `summary` of its content are for the user."""
+
+    path: str
+    content: bytes
+    description: str
+    summary: str = ""
+    mode: int = 0o644
+
+    def __str__(self) -> str:
+        text = f"write   {self.path}  ({len(self.content)} bytes, {self.mode:04o}): {self.description}"
+        return text + "".join(f"\n            {line}" for line in self.summary.splitlines())
+
+
+@dataclass(frozen=True, slots=True)
+class KeepFile:
+    """Leave a file as it is, for a reason."""
+
+    path: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"leave   {self.path}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class RemovePath:
+    """Remove a file, or a folder: recursively where `is_recursive`, else only an empty one."""
+
+    path: str
+    description: str
+    is_recursive: bool = False
+
+    def __str__(self) -> str:
+        return f"remove  {self.path}: {self.description}"
+
+
+@dataclass(frozen=True, slots=True)
+class RunProgram:
+    """Run a program. Where it `may_fail`, the following steps are executed all the same."""
+
+    arguments: tuple[str, ...]
+    description: str
+    may_fail: bool = False
+
+    def __str__(self) -> str:
+        return f"run     {' '.join(self.arguments)}: {self.description}"
+
+
+Step: TypeAlias = WriteFile | KeepFile | RemovePath | RunProgram
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Steps in their order, with notes for the user."""
+
+    steps: tuple[Step, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """Record of an earlier `install`: for each file the hashes that it wrote, units it enabled, folders it made."""
+
+    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
+
+    def encode(self) -> bytes:
+        files = dict(sorted(self.files.items()))
+        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units, "folders": self.folders}
+        return (json.dumps(content, indent=1) + "\n").encode()
+
+    @classmethod
+    def decode(cls, raw: bytes, file: str = MANIFEST) -> Manifest:
+        """Return the manifest in a `file`. Raises ModelServerError for a damaged one."""
+        try:
+            content = json.loads(raw)
+            if content["version"] != MANIFEST_VERSION:
+                raise ValueError(f"its version is {content['version']!r}, not {MANIFEST_VERSION}")
+            return cls(
+                {
+                    _parse("file", path): tuple(_parse("hash", each) for each in hashes)
+                    for path, hashes in content["files"].items()
+                },
+                tuple(_parse("unit", each) for each in content["units"]),
+                tuple(_parse("folder", each) for each in content["folders"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ModelServerError(
+                f"{file}: the record of the installation is damaged ({error}); remove it: the installed files then "
+                "count as edited"
+            ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class SystemFacts:
+    """State of the system to install to.
+
+    Attributes
+    ----------
+    files : hash of each existing file of those that may be written
+    absent : missing folders around them
+    by_id : device of each name below /dev/serial/by-id
+    rules : content of the installed udev rules
+    rmem_max : the kernel's limit of receive buffers, bytes, 0 if unknown
+    programs : paths of the available programs
+    realtime : whether the service may be scheduled in real time
+    is_live : whether it is the running system, with systemd
+    root : root folder for systemctl
+    """
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    absent: frozenset[str] = frozenset()
+    manifest: Manifest = field(default_factory=Manifest)
+    by_id: Mapping[str, str] = field(default_factory=dict)
+    rules: str = ""
+    rmem_max: int = 0
+    programs: Mapping[str, str] = field(default_factory=dict)
+    realtime: bool = False
+    is_live: bool = True
+    root: str = "/"
+
+
+def path_in_root(root: str | Path, path: str) -> Path:
+    """Return the location of an absolute path of a system with the given root."""
+    return Path(root, path.lstrip("/"))
+
+
+def digest(content: bytes) -> str:
+    """Return the hash of a file's content."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def plan_install(
+    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, *, start: bool, notes: Iterable[str]
+) -> Plan:
+    """Return the steps that write `writes` and start `units`. Edited files are kept.
+
+    A file is written where there is none, or where the existing one is what an earlier `install` wrote. What an earlier
+    one wrote and this one does not is removed, except for the configuration, which is not always given again.
+    """
+    writes = tuple(writes)
+    steps: list[Step] = []
+    owned = dict(facts.manifest.files)
+    changed = set()
+    for write in writes:
+        there, new = facts.files.get(write.path), digest(write.content)
+        if there == new:
+            # a file that was there before is not owned: a removal leaves it
+            if write.path in owned:
+                owned[write.path] = (new,)
+            steps.append(KeepFile(write.path, f"unchanged ({write.description})"))
+        elif there is None or there in owned.get(write.path, ()):
+            owned[write.path] = (new,) if there is None else (new, there)
+            changed.add(write.path)
+            steps.append(write)
+        else:
+            why = f"edited, or not installed by modelserver; not written: {write.description}"
+            steps.append(KeepFile(write.path, why))
+    for path in sorted(set(owned) - {write.path for write in writes}):
+        there = facts.files.get(path)
+        if path.startswith(f"{CONFIGURATION}/") or (there is not None and there not in owned[path]):
+            continue
+        del owned[path]
+        if there is not None:
+            changed.add(path)
+            steps.append(RemovePath(path, "installed earlier, no longer needed"))
+    units = tuple(units)
+    obsolete = [unit for unit in facts.manifest.units if unit not in units]
+    made = {folder for path in (*changed, MANIFEST) for folder in parent_folders(path)} & facts.absent
+    manifest = Manifest(owned, units, tuple(sorted({*facts.manifest.folders, *made})))
+    # first, so that an interrupted installation can be undone
+    steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver install --remove`"))
+    steps += _plan_reloads(facts, changed)
+    if obsolete:
+        steps.append(_systemctl(facts, "units that are no longer needed", "disable", *obsolete))
+    steps.append(_systemctl(facts, "start at boot", "enable", *units))
+    if start and facts.is_live:
+        steps.append(_systemctl(facts, "start now, with the new files", "restart", *units))
+    return Plan(tuple(steps), tuple(notes))
+
+
+def plan_removal(facts: SystemFacts, *, purge: bool) -> Plan:
+    """Return the steps that undo an installation; with `purge` also edited files and the state.
+
+    Raises ModelServerError where nothing was installed.
+    """
+    manifest = facts.manifest
+    if not manifest.files:
+        raise ModelServerError(f"nothing to remove: {path_in_root(facts.root, MANIFEST)} has no installation")
+    steps: list[Step] = []
+    if manifest.units:
+        stop = _systemctl(facts, "stop, and do not start again", "disable", *manifest.units)
+        steps.append(replace(stop, may_fail=True))
+    removed = set()
+    for path, hashes in sorted(manifest.files.items()):
+        if (there := facts.files.get(path)) is None:
+            continue
+        if there in hashes or purge:
+            removed.add(path)
+            steps.append(RemovePath(path, "as installed" if there in hashes else "installed, edited since"))
+        else:
+            steps.append(KeepFile(path, "edited since; remove it yourself, or with --purge"))
+    steps.append(RemovePath(MANIFEST, "the record of the installation"))
+    if purge:
+        steps += [RemovePath(path, "the service's state", is_recursive=True) for path in STATE]
+    # nested folders first
+    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(manifest.folders, reverse=True)]
+    steps += _plan_reloads(facts, removed)
+    notes = []
+    if SYSCTL in removed:
+        notes.append("the kernel's limit of receive buffers stays until the next boot")
+    if not purge:
+        notes.append(f"the service's state is still in {path_in_root(facts.root, STATE[0])}; --purge removes it too")
+    return Plan(tuple(steps), tuple(notes))
+
+
+def _plan_reloads(facts: SystemFacts, changed: Iterable[str]) -> list[Step]:
+    """Return the commands that make a running system reload changed files."""
+    if not facts.is_live:
+        return []
+    changed = set(changed)
+    commands: list[tuple[tuple[str, ...], str]] = []
+    if RULES in changed:
+        trigger = ("udevadm", "trigger", "--subsystem-match=tty", "--action=change")
+        commands += [(("udevadm", "control", "--reload"), "apply the rules for serial ports")]
+        commands += [(trigger, "apply them to connected devices")]
+    if SYSCTL in changed and SYSCTL not in facts.files:
+        commands += [(("sysctl", "--quiet", "--load", SYSCTL), "apply the limit")]
+    steps: list[Step] = [
+        RunProgram((facts.programs[program], *rest), what, may_fail=True)
+        for (program, *rest), what in commands
+        if program in facts.programs
+    ]
+    if any(path.startswith(f"{UNITS}/") for path in changed):
+        steps.append(_systemctl(facts, "systemd reloads the units", "daemon-reload"))
+    return steps
+
+
+def parent_folders(path: str) -> list[str]:
+    """Return the folders around a file, the outermost first."""
+    parts = path.split("/")[:-1]
+    return ["/".join(parts[:n]) for n in range(2, len(parts) + 1)]
+
+
+def _systemctl(facts: SystemFacts, what: str, verb: str, *units: str) -> RunProgram:
+    root = () if facts.root == "/" else (f"--root={facts.root}",)
+    now = ("--now",) if verb == "disable" and facts.is_live else ()
+    return RunProgram((facts.programs.get("systemctl", "systemctl"), *root, verb, *now, *units), what)
+
+
+_OWN: Final = {
+    "file": rf"{re.escape(RULES)}|{re.escape(SYSCTL)}|{CONFIGURATION}/.*|{UNITS}/modelserver.*",
+    "unit": "modelserver[^/]*",
+    "folder": "/etc(/.*)?",
+    "hash": ".*",
+}
+"""What a manifest may name; it decides what is removed. A folder is removed only where it is empty."""
+
+
+def _parse(kind: str, value: Any) -> str:
+    is_own = isinstance(value, str) and re.fullmatch(_OWN[kind], value, re.DOTALL)
+    if not is_own or not {"..", "."}.isdisjoint(value.split("/")):
+        raise ValueError(f"{value!r} is no {kind} of this installation")
+    return str(value)
+
+
+BY_ID: Final = "/dev/serial/by-id/"
+DEVICE_FOLDER: Final = "/dev/modelserver/"
+REALTIME: Final = f"{UNITS}/{SERVICE}.d/50-realtime.conf"
+
+CREDENTIAL: Final = f"{UNITS}/{SERVICE}.d/60-key.conf"
+
+HIDDEN_FOLDERS: Final = {
+    "/root": "ProtectHome",
+    "/home": "ProtectHome",
+    "/run/user": "ProtectHome",
+    "/tmp": "PrivateTmp",
+    "/var/tmp": "PrivateTmp",
+}
+"""Folders that hardened units cannot access, with the unit setting that hides them."""
+
+INSTANCE_NAME: Final = re.compile(r"[A-Za-z0-9_.:][A-Za-z0-9_.:-]*")
+"""A driver name that equals its unit instance, without systemd's escapes."""
+
+_UNIT_PATH: Final = re.compile(r"/[A-Za-z0-9/._+@-]+")
+"""A path that means itself in a unit."""
+
+_DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9#+.:=@_-]+")
+"""Characters that udev allows in device names."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialDriver:
+    """A driver on a serial port: its name, and the port of the vehicle file."""
+
+    name: str
+    port: str
+
+
+def find_hiding_setting(path: str) -> str:
+    """Return the unit setting that hides a path from the service, empty for none."""
+    return next((why for folder, why in HIDDEN_FOLDERS.items() if path == folder or path.startswith(f"{folder}/")), "")
+
+
+def check_visible(paths: Iterable[tuple[str, str]], fix: str, subject: str = "this installation") -> None:
+    """Raise ConfigError for paths that the service cannot access; each is given with a description.
+
+    `subject` is the location in the error, `fix` the remedy.
+    """
+    if unseen := {f"{what} is {path}": setting for path, what in paths if (setting := find_hiding_setting(path))}:
+        why = " and ".join(f"{setting}=yes" for setting in dict.fromkeys(unseen.values()))
+        raise make_error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
+
+
+def check_program(program: str) -> None:
+    """Raise ConfigError for a command path that cannot be written in a unit."""
+    if not _UNIT_PATH.fullmatch(program):
+        fix = "install to a folder whose path has only letters, digits and ._+@-"
+        raise make_error(f"{program!r} cannot be written in a unit", "this installation", fix)
+
+
+def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError with all problems.
+
+    A driver named `all` or `none` can only be selected together with others.
+    """
+    known = tuple(known)
+    names = tuple(dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip()))
+    if names in (("all",), ()):
+        names = known
+    elif names == ("none",):
+        names = ()
+    gathered = ProblemCollector()
+    for name in names:
+        if name in ("all", "none") and name not in known:
+            others = ",".join(each for each in names if each not in ("all", "none"))
+            why = f"{name} is combined with other names in {quote(wanted, 80)}, and means "
+            why += "every driver" if name == "all" else "no driver at all"
+            fix = f"--drivers {name}, or only the names" + (f": --drivers {others}" if others else "")
+            gathered.add("--drivers", why, fix)
+        elif name not in known:
+            near = find_nearest_names(name, known)
+            offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
+            gathered.add("--drivers", f"the vehicle file has no driver {quote(name, 40)}; {offer}")
+        elif not INSTANCE_NAME.fullmatch(name):
+            why = f"driver {quote(name, 40)} cannot be a unit name"
+            fix = "rename it in the vehicle file with only letters, digits, _ . : and -"
+            gathered.add("--drivers", why, fix)
+    gathered.raise_any()
+    return names
+
+
+def loopback_group(url: str) -> str:
+    """Return the multicast group of a bus on this machine only, empty for one that leaves it or needs none."""
+    parts = urlsplit(url)
+    ttl = parse_qs(parts.query).get("ttl", ["0"])[-1]
+    if parts.scheme != "udpm" or ttl.strip() not in ("", "0"):
+        return ""
+    return group_of(url)
+
+
+LOCAL: Final = "localhost"
+NETWORK: Final = ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16")
+"""Private networks (RFC 1918, RFC 3927): the vehicle's other machines, for a bus with a ttl."""
+
+ANYWHERE: Final = "any"
+
+
+def bus_addresses(url: str) -> tuple[str, ...]:
+    """Return the addresses of a bus, for systemd's IPAddressAllow."""
+    parts = urlsplit(url)
+    if parts.scheme == "file":
+        return (LOCAL,)
+    if parts.scheme == "tcpq":
+        return (LOCAL, *host_addresses([parts.hostname or LOCAL]))
+    if parts.scheme != "udpm" or not group_of(url):
+        return (ANYWHERE,)
+    return (LOCAL, group_of(url), *(() if loopback_group(url) else NETWORK))
+
+
+def host_addresses(hosts: Iterable[str]) -> tuple[str, ...]:
+    """Return the addresses of hosts, in their order; `any` for a name, which may resolve differently later."""
+    return tuple(_parse_address(host) for host in hosts if host != LOCAL)
+
+
+def _parse_address(host: str) -> str:
+    try:
+        return str(ip_address(host))
+    except ValueError:
+        return ANYWHERE
+
+
+def _join_addresses(addresses: Iterable[str]) -> str:
+    """Return addresses for a unit: each once, or `any` alone."""
+    found = dict.fromkeys(addresses)
+    return ANYWHERE if ANYWHERE in found else " ".join(found)
+
+
+def render_units(
+    templates: Mapping[str, str],
+    program: str,
+    url: str,
+    ip: str,
+    drivers: bool,
+    hosts: Iterable[str] = (),
+) -> list[WriteFile]:
+    """Return the units of this installation.
+
+    `program` is the path of its command, `url` that of the bus; `hosts` are those of the drivers' devices.
+    """
+    check_program(program)
+    group, bus = loopback_group(url), bus_addresses(url)
+    places = {"MODELSERVER": program, "GROUP": group, "IP": ip, "ADDRESSES": _join_addresses(bus)}
+    places["DEVICES"] = _join_addresses((*bus, *host_addresses(hosts)))
+    wanted = {SERVICE: "the service"}
+    wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
+    wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
+    writes = []
+    for name, what in wanted.items():
+        text = re.sub("@([A-Z]+)@", lambda place: places[place[1]], templates[name])
+        summary = "\n".join(line for line in text.splitlines() if line.startswith("ExecStart="))
+        writes.append(WriteFile(f"{UNITS}/{name}", text.encode(), what, summary))
+    return writes
+
+
+def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()) -> list[WriteFile]:
+    """Return the vehicle's files. `sources` are by their paths relative to the vehicle file, which is vehicle.yaml.
+
+    Those in `secret` are readable by root only.
+    """
+    writes = []
+    for path, content in sources.items():
+        what, mode = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle", 0o644
+        if path in secret:
+            what, mode = "the key of signed commands", 0o600
+        writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, what, mode=mode))
+    return writes
+
+
+def render_sysctl(wanted: int, facts: SystemFacts) -> list[WriteFile]:
+    """Return the file that raises the kernel's limit of receive buffers, nothing where it is high enough."""
+    if facts.rmem_max >= wanted and SYSCTL not in facts.files:
+        return []
+    line = f"net.core.rmem_max = {wanted}"
+    text = f"# ModelServer: receive buffers for bursts on the bus.\n{line}\n"
+    return [WriteFile(SYSCTL, text.encode(), "receive buffers for bursts on the bus", line)]
+
+
+def render_realtime_drop_in(facts: SystemFacts) -> list[WriteFile]:
+    """Return the drop-in for real-time scheduling of the service's loop, nothing where that is not possible.
+
+    With two busy programs on two cores, ticks were up to 20 ms late without it, whatever the nice level, and 0.1 ms
+    with it.
+    """
+    if not facts.realtime:
+        return []
+    lines = "CPUSchedulingPolicy=rr\nCPUSchedulingPriority=1\n"
+    text = f"# Written by `modelserver install` where the machine supports it.\n[Service]\n{lines}"
+    return [WriteFile(REALTIME, text.encode(), "real-time scheduling of the loop", lines)]
+
+
+def render_credential_drop_in(key_file: str) -> list[WriteFile]:
+    """Return the drop-in by which systemd passes the key file to the service, nothing for a vehicle without one.
+
+    The service's user cannot read a file that is root's alone. Raises ModelServerError for a path that cannot be
+    written in a unit.
+    """
+    if not key_file:
+        return []
+    if not _UNIT_PATH.fullmatch(key_file):
+        raise ModelServerError(
+            f"the key file {quote(key_file)} cannot be written in a unit: use only letters, digits and ._+@-; rename it"
+        )
+    line = f"LoadCredential={key_file.rpartition('/')[2]}:{key_file}"
+    about = "# Written by `modelserver install`: the file stays root's, and systemd passes it to the service."
+    text = f"{about}\n[Service]\n{line}\n"
+    return [WriteFile(CREDENTIAL, text.encode(), "the key of signed commands", line)]
+
+
+def render_udev_rules(
+    drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: SystemFacts
+) -> tuple[list[WriteFile], list[str]]:
+    """Return the udev rules that give each driver's device a name of its own, and notes on them.
+
+    `given` are names below /dev/serial/by-id by driver, which take precedence over the found ones. Raises
+    ModelServerError.
+    """
+    lines, notes = [], []
+    drivers = list(drivers)
+    check_serial(given, drivers)
+    for driver in drivers:
+        own = f"{DEVICE_FOLDER}{driver.name}"
+        device = given.get(driver.name, "") or (driver.port if driver.port.startswith(BY_ID) else "")
+        device = device or next((name for name, port in sorted(facts.by_id.items()) if port == driver.port), "")
+        link = f'SYMLINK+="modelserver/{driver.name}"'
+        known = [each for each in facts.rules.splitlines() if each.startswith("SUBSYSTEM") and each.endswith(link)]
+        if device:
+            device = device.removeprefix(BY_ID)
+            _check_device(device)
+            # systemd's own rules make the link by id, from vendor, product and serial number
+            match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
+            # ModemManager would send data to it otherwise, from which some devices do not recover
+            lines.append(f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", {link}')
+        elif known:
+            lines.append(known[0])
+        else:
+            fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
+            notes.append(f"no device id is known for driver {driver.name} (port {driver.port}); {fix}")
+            continue
+        if driver.port != own and not driver.port.startswith(BY_ID):
+            notes.append(f"driver {driver.name}: set port: {own} in the vehicle file; {driver.port} may change")
+    if not lines:
+        return [], notes
+    text = "# ModelServer: the devices of the vehicle file, by their ids.\n" + "".join(f"{line}\n" for line in lines)
+    summary = "\n".join(f"{DEVICE_FOLDER}{line.rpartition('/')[2].rstrip(chr(34))}" for line in lines)
+    return [WriteFile(RULES, text.encode(), "names for the serial devices", summary)], notes
+
+
+def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> None:
+    """Raise ConfigError for invalid devices of --serial. `given` are names by driver."""
+    known = [each.name for each in drivers]
+    gathered = ProblemCollector()
+    for name, device in given.items():
+        if name not in known:
+            near = find_nearest_names(name, known)
+            offer = f"did you mean {near[0]}?" if near else f"there are: {', '.join(known) or 'none'}"
+            gathered.add("--serial", f"{quote(name, 40)} is not a driver on a serial port; {offer}")
+        with gathered.collect("--serial"):
+            _check_device(device.removeprefix(BY_ID))
+    gathered.raise_any()
+
+
+def _check_device(device: str) -> None:
+    if not _DEVICE_NAME.fullmatch(device):
+        raise ModelServerError(f"{quote(device)} is not a name below {BY_ID}: only letters, digits and #+-.:=@_")
+
+
+PROGRAMS: Final = ("systemctl", "systemd-run", "udevadm", "sysctl", "ip")
+SEARCH_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+COMMAND_TIMEOUT_S: Final = 120.0
+"""Time limit of a command: a start waits until the service is ready."""
+
+INSTALL_HINT: Final = (
+    "install with the system's Python, to a folder that all users may read: sudo /usr/bin/python3 -m venv --clear "
+    "/opt/modelserver && sudo /opt/modelserver/bin/pip install modelserver, then sudo /opt/modelserver/bin/modelserver "
+    "install ... (another python3 in the PATH may be in a home directory, and an environment that was made with it "
+    "keeps it unless it is cleared)"
+)
+
+
+def get_command_path() -> str:
+    return os.path.join(os.path.dirname(os.path.abspath(sys.executable)), "modelserver")
+
+
+def get_examples_folder() -> Path:
+    """Return the folder of vehicle files and units that comes with the package."""
+    installed = Path(str(files("modelserver"))) / "share" / "config"
+    return installed if installed.is_dir() else Path(__file__).resolve().parents[2] / "config"
+
+
+def check_installation() -> None:
+    """Raise ConfigError where the units could not access or read this installation, with all problems."""
+    subject, command = "this installation", get_command_path()
+    paths = [
+        (command, "the command of this installation"),
+        (os.path.realpath(sys.executable), "its Python"),
+        (sys.base_prefix, "its Python's library"),
+        (str(Path(str(files("modelserver"))).resolve()), "its package"),
+    ]
+    gathered = ProblemCollector()
+    with gathered.collect(subject):
+        check_visible(paths, INSTALL_HINT)
+    if not os.path.isfile(command):
+        gathered.add(subject, f"there is no {command}: the package is not installed", INSTALL_HINT)
+    else:
+        with gathered.collect(subject):
+            check_program(command)
+    for path, what in paths:
+        is_seen = os.path.exists(path) and not find_hiding_setting(path)
+        if is_seen and (closed := find_unreadable_part(path)):
+            why = f"{what} is {path}, and the service's user may not read {closed}"
+            gathered.add(subject, why, f"sudo chmod -R o+rX {closed}")
+    gathered.raise_any()
+
+
+def find_unreadable_part(path: str) -> str:
+    """Return the first part of a path that other users cannot read, empty for none."""
+    for part in (*reversed(Path(path).parents), Path(path)):
+        mode = part.stat().st_mode
+        if not mode & (stat.S_IXOTH if stat.S_ISDIR(mode) else stat.S_IROTH):
+            return str(part)
+    return ""
+
+
+def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
+    """Return the system's state below `root`; `paths` are the files that may be written. Raises ModelServerError."""
+    paths = tuple(paths)
+    manifest = read_manifest(root)
+    contents = {path: _read_file(path_in_root(root, path)) for path in {*paths, *manifest.files}}
+    around = {folder for path in (*paths, MANIFEST) for folder in parent_folders(path)}
+    programs = {name: found for name in PROGRAMS if (found := shutil.which(name, path=SEARCH_PATH))}
+    is_live = root == Path("/") and os.path.isdir("/run/systemd/system")
+    by_id, rmem_max = {}, 0
+    with suppress(OSError):
+        by_id = {link.name: os.path.realpath(link) for link in Path(BY_ID).iterdir()}
+    with suppress(OSError, ValueError):
+        rmem_max = int(Path("/proc/sys/net/core/rmem_max").read_text()) if root == Path("/") else 0
+    return SystemFacts(
+        files={path: digest(content) for path, content in contents.items() if content is not None},
+        absent=frozenset(folder for folder in around if not path_in_root(root, folder).is_dir()),
+        manifest=manifest,
+        by_id=by_id,
+        rules=(_read_file(path_in_root(root, RULES)) or b"").decode("utf-8", "replace"),
+        rmem_max=rmem_max,
+        programs=programs,
+        realtime=is_live and can_be_realtime(programs.get("systemd-run", "")),
+        is_live=is_live,
+        root=str(root),
+    )
+
+
+def read_manifest(root: Path) -> Manifest:
+    """Return what was installed below `root`; an empty manifest where nothing was. Raises ModelServerError."""
+    path = path_in_root(root, MANIFEST)
+    raw = _read_file(path)
+    return Manifest() if raw is None else Manifest.decode(raw, str(path))
+
+
+def _read_file(path: Path) -> bytes | None:
+    """Return the content of a file, None where there is none. Raises OSError."""
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def can_be_realtime(systemd_run: str) -> bool:
+    """Return whether systemd can schedule a unit in real time, and another core is left.
+
+    Some kernels (CONFIG_RT_GROUP_SCHED) deny it to units, and a unit that requests it does not start there.
+    """
+    if os.geteuid() != 0 or not systemd_run or (os.cpu_count() or 1) < 2:
+        return False
+    options = "--quiet --wait --collect -p CPUSchedulingPolicy=rr -p CPUSchedulingPriority=1 true"
+    try:
+        command = (systemd_run, *options.split())
+        return subprocess.run(command, capture_output=True, timeout=20.0, check=False).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def check_root_user(root: Path, command: str) -> None:
+    """Raise ModelServerError where this user cannot change the system."""
+    if os.geteuid() != 0 and root == Path("/"):
+        raise ModelServerError(f"this changes /etc and needs root: sudo {command} (to see what it would do: --dry-run)")
+
+
+def execute_plan(plan: Plan, root: Path, dry_run: bool) -> None:
+    """Print each step of a plan and execute it; the first that fails raises ModelServerError or OSError.
+
+    With `dry_run` the steps are only printed.
+    """
+    for step in plan.steps:
+        _print(str(step if isinstance(step, RunProgram) else replace(step, path=str(path_in_root(root, step.path)))))
+        if not dry_run:
+            _execute_step(step, root)
+    for note in plan.notes:
+        _print(f"note    {note}")
+    if dry_run:
+        typer.echo("nothing was done")
+
+
+def _print(text: str) -> None:
+    for line in text.splitlines():
+        typer.echo(escape(line))
+
+
+def _execute_step(step: Step, root: Path) -> None:
+    match step:
+        case WriteFile():
+            _write(path_in_root(root, step.path), step.content, step.mode)
+        case RemovePath():
+            path = path_in_root(root, step.path)
+            if path.is_symlink() or not path.is_dir():
+                path.unlink(missing_ok=True)
+            elif step.is_recursive:
+                shutil.rmtree(path)
+            else:
+                # a folder with other files is left
+                with suppress(OSError):
+                    path.rmdir()
+        case RunProgram():
+            _run(step)
+
+
+def _write(path: Path, content: bytes, mode: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+    # atomic: a power failure leaves the old file or the new one
+    handle, draft = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with open(handle, "wb") as file:
+            file.write(content)
+            os.fchmod(file.fileno(), mode)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(draft, path)
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(draft)
+
+
+def _run(step: RunProgram) -> None:
+    try:
+        done = subprocess.run(step.arguments, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False)
+        if done.returncode == 0:
+            return
+        output = (done.stderr or done.stdout).strip()
+    except (OSError, subprocess.TimeoutExpired) as error:
+        output = str(error)
+    if not step.may_fail:
+        hint = "see journalctl -e -u 'modelserver*'" if "restart" in step.arguments else "fix that, then try again"
+        raise ModelServerError(f"{' '.join(step.arguments)} failed: {output or 'without a message'}; {hint}")
+    _print(f"        failed, continuing: {output or 'without a message'}")

@@ -1,1 +1,0 @@
-"""Installation with systemd, and what the service needs of a machine."""

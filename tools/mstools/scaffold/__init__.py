@@ -1,1 +1,0 @@
-"""The files that `modelserver new` writes for a vehicle."""

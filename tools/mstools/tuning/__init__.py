@@ -1,1 +1,0 @@
-"""Search of noise settings by withheld fixes."""
