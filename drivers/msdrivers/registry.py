@@ -13,7 +13,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
-from modelserver.files.regular import read_regular
+from modelserver.files import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.plugins import PluginRegistry
 from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault

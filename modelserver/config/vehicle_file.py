@@ -15,13 +15,12 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver.config import reader
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.files.kinds import PROCESS_FIX, FileKind, detect_file_kind
-from modelserver.files.regular import NotRegularFileError, read_start
+from modelserver.files import PROCESS_FIX, FileKind, NotRegularFileError, detect_file_kind, read_start
 from modelserver.messages import Mode
 
 MAX_CHANNEL = 39

@@ -23,8 +23,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from modelserver.errors import Location, Suggestion, has_error, quote, suggest_name
-from modelserver.formats import reading
-from modelserver.formats.reading import ORIGIN, ElementReader, SyntaxProblemError, label, suggest_known_key
+from modelserver.formats.common import (
+    MAX_POSITION,
+    MAX_SUGGESTIONS,
+    ORIGIN,
+    ElementReader,
+    SyntaxProblemError,
+    find_cycles,
+    label,
+    parse_numbers,
+    suggest_known_key,
+)
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, Joint, JointType
@@ -223,7 +232,7 @@ class _BlockReader(ElementReader):
         line = self.fields[key].line
         if key == "quat":
             return self.repair_quaternion(values, line)
-        if max(map(abs, values)) > reading.MAX_POSITION:
+        if max(map(abs, values)) > MAX_POSITION:
             self.error(f"{key} is out of reach", "look for a slip in the exponent", line)
             return None
         if key == "rpy":
@@ -242,7 +251,7 @@ class _BlockReader(ElementReader):
         try:
             if isinstance(entry, ParamBlock):
                 raise ValueError(f"{key} is a block, not a list of {count} numbers")
-            return reading.parse_numbers(entry.texts, count, key)
+            return parse_numbers(entry.texts, count, key)
         except ValueError as error:
             self.error(str(error), f"write {key} = [{', '.join(['number'] * count)}]; ({unit})", entry.line)
             return None
@@ -352,16 +361,14 @@ class _BotFramesReader(ElementReader):
         missing = [each for each in self.frames.values() if each.parent != top and each.parent not in self.frames]
         for number, frame in enumerate(missing):
             near = Suggestion()
-            if number < reading.MAX_SUGGESTIONS:
+            if number < MAX_SUGGESTIONS:
                 near = suggest_name(frame.parent, (top, *self.frames))
             message = f"relative_to names frame {quote(frame.parent)}, which does not exist"
             fix = f"write {near[0]}" if near else "name the root frame, or a frame of this file"
             self.builder.add_error(message, frame.parent_source, fix, near)
         if missing:
             return False
-        for cycle in reading.find_cycles(
-            self.frames, lambda name: self.frames[name].parent if name in self.frames else None
-        ):
+        for cycle in find_cycles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
             message = f"frames form a cycle: {' in '.join(map(label, cycle))}"
             fix = f"one of them must be relative to the root frame {label(top)}, or to one that is"
             self.builder.add_error(message, self.frames[cycle[-1]].parent_source, fix)

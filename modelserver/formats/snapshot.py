@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from modelserver.errors import GeometryError, WireError
 from modelserver.formats import parse_model
-from modelserver.formats.yaml_writer import save
+from modelserver.formats.yaml_geometry import save
 from modelserver.geometry.model import Model
 
 MAX_BYTES = 64 << 20

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from lxml import etree
 
 from modelserver.errors import Location, quote
-from modelserver.formats.reading import ElementReader, label, suggest_known_key
+from modelserver.formats.common import ElementReader, label, suggest_known_key
 from modelserver.geometry.builder import ModelBuilder
 
 if TYPE_CHECKING:

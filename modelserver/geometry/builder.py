@@ -28,15 +28,13 @@ from modelserver.errors import (
     has_error,
     quote,
 )
-from modelserver.geometry import loop_closure as loops
 from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint
 from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
-from modelserver.geometry.shape import Shape
-from modelserver.geometry.topology import Topology, full_name
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Shape, Sigma, suggest_frame
+from modelserver.geometry.topology import MAX_SIGMAS, LoopMisclosure, Topology, compute_misclosure, full_name
 from modelserver.transforms.pose import Pose
 
 MAX_LOOP_SIGMAS = 3.0
@@ -407,7 +405,7 @@ class _ModelReview:
                 self.add_problem(Severity.WARNING, message, self.locations[body], fix)
         closures = tuple(topology.find_loop_closures())
         for closing in closures:
-            found = loops.compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
+            found = compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
             self.add_problem(
                 Severity.WARNING if bad else Severity.NOTE,
@@ -441,7 +439,7 @@ def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
     return bodies[body].frame(frame)
 
 
-def _describe_misclosure(found: loops.LoopMisclosure) -> str:
+def _describe_misclosure(found: LoopMisclosure) -> str:
     if found.is_exact:
         return "it closes exactly" + (", with joints at their defaults" if found.joints else "")
     joints = ", with joints at their defaults," if found.joints else ""
@@ -450,11 +448,11 @@ def _describe_misclosure(found: loops.LoopMisclosure) -> str:
         return f"{text}, and no sigma is stated for {format_names(found.missing_sigmas)}"
     if math.isinf(found.sigmas):
         return f"{text}, in a direction that the surveys state as exact"
-    more = "more than " if found.sigmas >= loops.MAX_SIGMAS else ""
+    more = "more than " if found.sigmas >= MAX_SIGMAS else ""
     return f"{text}, {more}{found.sigmas:.1f} sigma of the surveys"
 
 
-def _suggest_fix(found: loops.LoopMisclosure) -> str:
+def _suggest_fix(found: LoopMisclosure) -> str:
     if found.sigmas is None:
         missing = format_names(found.missing_sigmas)
         return f"state sigma: of {missing}, remove one constraint of the loop, or fix the survey"

@@ -17,8 +17,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
-from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.multibody import compute_turn_motion, compute_turn_rate
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath

@@ -21,10 +21,10 @@ from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.estimation.findings import find_unusable
 from modelserver.estimation.sensor_rig import SPEEDOMETER, Mounts, SensorRig, SpeedometerSignal, SteeringSignal
 from modelserver.formats import FileExamination, examine_file
+from modelserver.formats.common import is_far
 from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
-from modelserver.geometry.plausibility import is_far
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.signing.key_files import read_keys

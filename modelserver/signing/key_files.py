@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.errors import KeyFileError, quote
-from modelserver.files.regular import open_regular
+from modelserver.files import open_regular
 from modelserver.signing.signatures import MIN_KEY_BYTES, Key
 
 MAX_BYTES: Final = 8192

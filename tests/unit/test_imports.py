@@ -16,8 +16,8 @@ VALUES = {"errors", "version", "named_tuples", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "estimation.history"}
 CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
-FILES = {"files.kinds", "files.regular"}
-WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
+FILES = {"files"}
+WIRE = VALUES | {"messages", "wire", "mslcm", "files"}
 SIGNING = {"signing.signatures", "signing.key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
 DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
@@ -36,12 +36,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "dynamics": GEOMETRY,
     "messages": VALUES | {"earth"},
     "signing.signatures": VALUES | {"messages"},
-    "signing.key_files": VALUES | {"messages", "signing.signatures", "files.regular"},
+    "signing.key_files": VALUES | {"messages", "signing.signatures", "files"},
     "earth": VALUES,
     "estimation.history": VALUES | {"messages"},
     "joints": GEOMETRY | {"messages"},
-    "files.kinds": set(),
-    "files.regular": set(),
     # load code, and neither compute nor read anything
     "estimation.filterpy_import": set(),
     "plugins": set(),
@@ -70,7 +68,6 @@ MAY_IMPORT: dict[str, set[str]] = {
 PURE = {
     "errors",
     "named_tuples",
-    "files.kinds",
     "transforms",
     "geometry",
     "dynamics",

@@ -16,7 +16,7 @@ import pytest
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import ConfigError, GeometryError, KeyFileError, RecordingError
-from modelserver.files.regular import (
+from modelserver.files import (
     FileTooLargeError,
     NotRegularFileError,
     open_regular,

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from modelserver.errors import RecordingError
-from modelserver.files.regular import open_regular, read_start
+from modelserver.files import open_regular, read_start
 from modelserver.server.persistence.directory import FileLock, create_directory
 from modelserver.signing.signatures import Key
 from modelserver.wire.eventlog import Buffer, LogEvent, scan

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
-from modelserver.files.regular import read_regular
+from modelserver.files import read_regular
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import Clock

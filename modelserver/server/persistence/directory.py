@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from modelserver.files.regular import check_links
+from modelserver.files import check_links
 from modelserver.server.log import escape_text
 
 FILE_MODE: Final = 0o640

@@ -8,7 +8,7 @@ from support_urdf import URDF, pose_at
 
 from modelserver.errors import GeometryError, Severity
 from modelserver.formats import save_model
-from modelserver.formats.urdf_writer import list_link_names
+from modelserver.formats.urdf import list_link_names
 from modelserver.geometry import Joint, JointType, Material, Mimic, ModelBuilder, Shape, ShapeKind, Sigma
 from modelserver.transforms import Pose
 

@@ -133,7 +133,7 @@ def _compute(
 ) -> tuple[dict[str, Any], Any]:
     """Return what the files state, and the mass matrix."""
     from modelserver.dynamics import MassUncertainty, assess_stability
-    from modelserver.dynamics.settings import DynamicsSettings
+    from modelserver.dynamics.stability import DynamicsSettings
     from modelserver.transforms import so3
 
     root, known, variables = "", DynamicsSettings(), parse_variables(settings)

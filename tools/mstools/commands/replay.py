@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
-from modelserver.files.regular import FileTooLargeError, read_regular
+from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.encoded import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile

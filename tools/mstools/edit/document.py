@@ -13,11 +13,9 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from modelserver.errors import quote
-from modelserver.formats.reading import parse_number
-from modelserver.formats.writing import format_number
-from modelserver.formats.yaml_elements import POSE_KEYS, read_pose
-from modelserver.formats.yaml_nodes import YamlMapping, parse_yaml
-from modelserver.formats.yaml_writer import format_joint_fields, format_scalar_or_list, format_text, quote_text
+from modelserver.formats.common import format_number, parse_number
+from modelserver.formats.yaml_elements import POSE_KEYS, YamlMapping, parse_yaml, read_pose
+from modelserver.formats.yaml_geometry import format_joint_fields, format_scalar_or_list, format_text, quote_text
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint

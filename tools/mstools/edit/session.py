@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Problem, has_error
-from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
-from modelserver.files.regular import read_start
+from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
 from modelserver.geometry.model import Model
 from mstools.edit.document import GeometryDocument, GeometryItem

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from modelserver.errors import ModelServerError, quote
-from modelserver.formats.yaml_nodes import parse_yaml
+from modelserver.formats.yaml_elements import parse_yaml
 from modelserver.geometry.builder import ModelBuilder
 
 Path = Sequence[str]

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import typer
 
 from modelserver.errors import ModelServerError, Problem
-from modelserver.files.regular import check_links
+from modelserver.files import check_links
 from modelserver.geometry.model import Model
 
 

@@ -19,8 +19,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
-from modelserver.earth.origin import Origin
 from modelserver.errors import WireError
 from modelserver.formats.snapshot import decode_snapshot
 from modelserver.geometry.joint import coordinate_names

@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from modelserver.errors import QueryError, quote
-from modelserver.formats.writing import format_number
+from modelserver.formats.common import format_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model

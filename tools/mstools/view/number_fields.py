@@ -9,8 +9,7 @@ from typing import Any, Final
 
 import viser
 
-from modelserver.formats.reading import parse_number
-from modelserver.formats.writing import format_number
+from modelserver.formats.common import format_number, parse_number
 from mstools.edit.yaml_text import EditError
 
 PRECISION: Final = 6

@@ -1,22 +1,38 @@
-"""Read Miro body and constraint XML: the geometry file of the 2005 report (Annexes B.3, B.4 and C).
+"""Miro body and constraint XML, read and written: the geometry file of the 2005 report (Annexes B.3, B.4 and C).
 
 The names of the section and of the two lists vary between files, so a body is recognized by its parameter BodyName and
 a constraint by its ConstraintName, anywhere in the file. A frame or constraint without HTransform has the identity.
 White space around names is trimmed, and folded in descriptions, where it comes from line breaks of the file.
+
+The writer uses the layout of Annex C.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from modelserver.errors import Suggestion, quote
-from modelserver.formats.reading import ElementReader, label, parse_numbers, suggest_known_key
+from modelserver.formats.common import (
+    ElementReader,
+    SavedModel,
+    format_element,
+    format_names,
+    label,
+    list_inertia_features,
+    list_joint_and_shape_features,
+    parse_numbers,
+    suggest_known_key,
+)
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name, get_tag, iterate_children
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Body, Constraint
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
+
 
 _BODY_KEYS = ("BodyName", "Description", "HTransform", "Frames", "FrameList")
 _FRAME_KEYS = ("FrameName", "Description", "HTransform")
@@ -167,3 +183,71 @@ def _get_value(element: Element, key: str) -> str:
     """Return the value of the first parameter `key`, empty for none: it names the place of problems."""
     found = (each.get("value") or "" for each in iterate_children(element) if get_name(each) == key)
     return next(found, "").strip()
+
+
+def save(model: Model) -> SavedModel:
+    """Return the text of `model`, and its features that this format does not support."""
+    bodies = [line for body in model.bodies for line in _format_body(body)]
+    constraints = [line for each in model.constraints for line in _format_constraint(each)]
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<config>", ' <section name="Geometry">']
+    for name, inside in (("BodyList", bodies), ("ConstraintList", constraints)):
+        lines += [f'  <parameter name="{name}">', *(f"    {line}" for line in inside), "  </parameter>"]
+    lines += [" </section>", "</config>"]
+    return SavedModel("\n".join(lines) + "\n", tuple(_list_unsupported(model)))
+
+
+def _list_unsupported(model: Model) -> Iterator[str]:
+    if model.name:
+        yield f"the model's name, {model.name}"
+    if model.description:
+        yield "the model's description"
+    frames = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body if frame.sigma is not None]
+    if frames:
+        yield f"the sigmas of {len(frames)} frames: {format_names(frames)}"
+    constraints = [each.name for each in model.constraints if each.sigma is not None]
+    if constraints:
+        yield f"the sigmas of {len(constraints)} constraints: {format_names(constraints)}"
+    yield from list_inertia_features(model)
+    yield from list_joint_and_shape_features(model)
+    described = [(body.name, body.description) for body in model.bodies]
+    described += [(f"{body.name}:{frame.name}", frame.description) for body in model.bodies for frame in body]
+    described += [(each.name, each.description) for each in model.constraints]
+    if changed := [name for name, text in described if _fold_description(text) != text]:
+        yield f"line breaks and control characters in {len(changed)} descriptions: {format_names(changed)}"
+
+
+def _fold_description(text: str) -> str:
+    """Return a text as it is read back: without control characters, which XML does not have, and with folded spaces."""
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())
+
+
+def _format_body(body: Body) -> Iterator[str]:
+    lines = _format_head("BodyName", body.name, body.description)
+    if body.pose is not None:
+        lines += _format_transform(body.pose)
+    lines.append('<parameter name="Frames">')
+    for frame in body:
+        inside = [*_format_head("FrameName", frame.name, frame.description), *_format_transform(frame.pose)]
+        lines += [f"  {line}" for line in format_element("parameter", inside, "BodyFrame")]
+    lines.append("</parameter>")
+    return format_element("parameter", lines, "Body")
+
+
+def _format_constraint(each: Constraint) -> Iterator[str]:
+    lines = _format_head("ConstraintName", each.name, each.description)
+    for key, end in (("From", each.from_), ("To", each.to)):
+        lines += format_element("parameter", name=key, value=end)
+    return format_element("parameter", [*lines, *_format_transform(each.default_pose)], "Constraint")
+
+
+def _format_head(key: str, name: str, description: str) -> list[str]:
+    lines = [*format_element("parameter", name=key, value=name)]
+    if description:
+        lines += format_element("parameter", name="Description", value=_fold_description(description))
+    return lines
+
+
+def _format_transform(pose: Pose) -> Iterator[str]:
+    rows = enumerate(pose.matrix_rows()[:3], 1)
+    inside = [line for n, row in rows for line in format_element("parameter", name=f"Row{n}", value=row)]
+    return format_element("parameter", inside, name="HTransform")
