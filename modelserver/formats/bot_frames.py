@@ -22,13 +22,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from modelserver.errors import Location, Suggestion, has_error, quote, suggest_name
+from modelserver.errors import Location, Suggestion, SyntaxProblemError, has_error, quote, suggest_name
 from modelserver.formats.common import (
     MAX_POSITION,
     MAX_SUGGESTIONS,
     ORIGIN,
     ElementReader,
-    SyntaxProblemError,
     find_cycles,
     label,
     parse_numbers,

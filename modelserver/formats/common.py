@@ -82,15 +82,6 @@ def parse_numbers(texts: Sequence[str], count: int, key: str) -> list[float]:
     return values
 
 
-class SyntaxProblemError(Exception):
-    """A file cannot be parsed; with the line, and the fix."""
-
-    def __init__(self, message: str, line: int, fix: str):
-        super().__init__(message)
-        self.line = line
-        self.fix = fix
-
-
 class ElementReader:
     """Reads one element of a file, and reports its problems; `place` names it there, e.g. `body Raptor`."""
 

@@ -28,15 +28,12 @@ from dataclasses import dataclass
 
 import yaml
 
-from modelserver.errors import Location, Severity, Suggestion, has_error, quote, suggest_name
+from modelserver.errors import Location, Severity, Suggestion, SyntaxProblemError, has_error, quote, suggest_name
 from modelserver.formats.common import SavedModel, format_number, label, to_rpy_degrees
 from modelserver.formats.yaml_elements import (
     POSE_KEYS,
-    NodeKind,
     SigmaDefaults,
     YamlMapping,
-    YamlNode,
-    parse_yaml,
     read_inertia,
     read_joint,
     read_pose,
@@ -48,6 +45,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import DIMENSIONS, Body, BodyFrame, Constraint, Material, Shape, ShapeKind, Sigma
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
+from modelserver.yaml_tree import NodeKind, YamlNode, parse_yaml
 
 _SHAPE_KINDS = tuple(str(kind) for kind in ShapeKind)
 _SHAPE_KEYS = (*_SHAPE_KINDS, "scale", *POSE_KEYS, "name", "material")
@@ -142,8 +140,10 @@ _FrameNode = tuple[BodyFrame, YamlNode]
 
 def load(content: bytes, builder: ModelBuilder, file: str) -> None:
     """Add the model in a YAML file, and its problems, to `builder`."""
-    root = parse_yaml(content, builder, file)
-    if root is None:
+    try:
+        root = parse_yaml(content)
+    except SyntaxProblemError as error:
+        builder.add_error(str(error), Location(file, error.line), error.fix)
         return
     if root.kind is NodeKind.MAPPING:
         _GeometryReader(YamlMapping(builder, file, root, "", _TOP_KEYS)).read()

@@ -21,7 +21,7 @@ WIRE = VALUES | {"messages", "wire", "mslcm", "files"}
 SIGNING = {"signing.signatures", "signing.key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
 DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
-SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
+SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -43,13 +43,14 @@ MAY_IMPORT: dict[str, set[str]] = {
     # load code, and neither compute nor read anything
     "estimation.filterpy_import": set(),
     "plugins": set(),
-    "formats": GEOMETRY | FILES,
+    "formats": GEOMETRY | FILES | {"yaml_tree"},
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
     "core": CORE,
     "simulation": GEOMETRY | {"messages", "earth"},
     "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
-    "config.reader": {"errors"},
+    "config.reader": {"errors", "yaml_tree"},
+    "yaml_tree": {"errors"},
     "wire": WIRE,
     "server": SERVER,
     "client": WIRE | GEOMETRY | POSES | SIGNING | {"formats", "joints", "query"},

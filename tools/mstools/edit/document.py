@@ -12,15 +12,16 @@ from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from modelserver.errors import quote
+from modelserver.errors import SyntaxProblemError, quote
 from modelserver.formats.common import format_number, parse_number
-from modelserver.formats.yaml_elements import POSE_KEYS, YamlMapping, parse_yaml, read_pose
+from modelserver.formats.yaml_elements import POSE_KEYS, YamlMapping, read_pose
 from modelserver.formats.yaml_geometry import format_joint_fields, format_scalar_or_list, format_text, quote_text
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
+from modelserver.yaml_tree import parse_yaml
 from mstools.edit.yaml_text import EditError, Path, YamlText
 
 DECIMALS: Final = 9
@@ -335,11 +336,11 @@ def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
 
 def _read_pose(text: YamlText, path: Path) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
-    builder = ModelBuilder()
-    root = parse_yaml(text.get_entry(path).encode(), builder, "")
-    if root is None:
-        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first")
-    return read_pose(YamlMapping(builder, "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
+    try:
+        root = parse_yaml(text.get_entry(path).encode())
+    except SyntaxProblemError:
+        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first") from None
+    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
 
 
 def _set(text: YamlText, path: Path, key: str, value: str) -> YamlText:
