@@ -1,20 +1,21 @@
 """Bodies, frames, constraints and shapes as immutable values (report 4.2 to 4.4).
 
-Shapes and materials are for viewers, and not used in answers; mesh files are not opened.
+Shapes and materials are for viewers, and not used in answers; mesh files are not opened. A mimic joint follows another,
+also through chains of joints that follow each other: `resolve_mimics` finds the coordinates that drive each joint.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from modelserver.errors import UnknownFrameError, find_nearest_names, find_suggestion, quote
 from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
-from modelserver.geometry.joint import FIXED, Joint
+from modelserver.geometry.joint import FIXED, Joint, Mimic, coordinate_names
 from modelserver.transforms import covariance
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
@@ -286,3 +287,53 @@ def suggest_frame(name: str, bodies: Mapping[str, Body]) -> str:
         return names.join(body, near) if near else ""
     near = find_suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
     return names.join(near, frame) if near else ""
+
+
+class JointDrive(NamedTuple):
+    """The position of a joint: `multiplier` times the coordinates `names` of its `leader`, plus `offset`.
+
+    For a chain of mimic joints, multiplier and offset are those of the whole chain.
+    """
+
+    names: tuple[str, ...]
+    leader: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def resolve_mimics(joints: Iterable[Constraint]) -> dict[str, JointDrive]:
+    """Return the drive of each joint by its constraint's name.
+
+    Mimic chains end at a joint that follows none; `ModelBuilder` rejects those that do not.
+    """
+    by_name = {each.name: each for each in joints}
+    found: dict[str, JointDrive] = {}
+    for each in by_name.values():
+        links: list[tuple[str, Mimic]] = []
+        while each.name not in found and (mimic := each.joint.mimic) is not None:
+            links.append((each.name, mimic))
+            each = by_name[mimic.joint]
+        drive = found.setdefault(each.name, JointDrive(coordinate_names(each.name, each.joint), each.name))
+        for name, mimic in reversed(links):
+            offset = mimic.multiplier * drive.offset + mimic.offset
+            drive = JointDrive(drive.names, drive.leader, mimic.multiplier * drive.multiplier, offset)
+            found[name] = drive
+    return {name: found[name] for name in by_name}
+
+
+def apply_mimic_defaults(constraints: Iterable[Constraint]) -> tuple[Constraint, ...]:
+    """Return the constraints with the default of each mimic joint computed from its leader's default position.
+
+    Every mimic chain must end at a joint that follows none. Raises ValueError where a position is not finite.
+    """
+    constraints = tuple(constraints)
+    moving = {each.name: each for each in constraints if each.joint.is_movable}
+    drives = resolve_mimics(moving.values())
+    result = []
+    for each in constraints:
+        if each.joint.mimic is not None:
+            drive = drives[each.name]
+            (leader,) = moving[drive.leader].joint.default_position
+            each = replace(each, joint=replace(each.joint, default=(drive.multiplier * leader + drive.offset,)))
+        result.append(each)
+    return tuple(result)
