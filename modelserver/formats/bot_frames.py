@@ -198,17 +198,8 @@ class _BlockReader(ElementReader):
 
     def __init__(self, builder: ModelBuilder, file: str, block: ParamBlock, place: str, known: tuple[str, ...]):
         super().__init__(builder, file, block.line, place)
-        self.fields: dict[str, ParamValue | ParamBlock] = {}
-        for name, entry in block.entries:
-            if name in self.fields:
-                message = f"{name} is given twice (first on line {self.fields[name].line})"
-                self.error(message, "remove one of the two", entry.line)
-            elif name in known:
-                self.fields[name] = entry
-            else:
-                near = suggest_known_key(name, known)
-                fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-                self.warning(f"unknown name {quote(name)}; ignored", fix, entry.line, near)
+        entries = [(name, entry, entry.line) for name, entry in block.entries]
+        self.fields = self.select(entries, known, "name")
 
     def read_transform(self) -> Pose | None:
         turns = [key for key in _ROTATIONS if key in self.fields]

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, TypeVar
 from xml.sax import saxutils
 
 import numpy as np
@@ -24,6 +24,8 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
+
+T = TypeVar("T")
 
 ORIGIN = "Origin"
 """Frame of a body for a frame, instance or link of a format without frames in bodies."""
@@ -108,6 +110,35 @@ class ElementReader:
 
     def note(self, message: str, fix: str = "", at: int | str = 0) -> None:
         self.builder.add_problem(Severity.NOTE, message, self.locate(at), fix)
+
+    def select(
+        self, entries: Sequence[tuple[str, T, int]], known: tuple[str, ...], noun: str, is_strict: bool = False
+    ) -> dict[str, T]:
+        """Return the first entry of each `known` name, from names, entries and lines; report the others.
+
+        A second one is an error, an unknown name a warning. With `is_strict` it is an error too, and the entry of a
+        misspelled name is at the name that is meant: it is examined, and not missing.
+        """
+        found: dict[str, T] = {}
+        lines: dict[str, int] = {}
+        for name, entry, line in entries:
+            if name in lines:
+                self.error(f"{noun} {name} is given twice (first on line {lines[name]})", "remove one of the two", line)
+            elif name in known:
+                found[name], lines[name] = entry, line
+            else:
+                # a name that is present already is not what was meant
+                given = {each for each, _, _ in entries}
+                near = suggest_known_key(name, tuple(each for each in known if each not in given))
+                fix = f"write {near[0]}" if near else f"{noun}s here are {', '.join(known)}"
+                what = f"unknown {noun} {quote(name)}" if name else f"a {noun} without a name"
+                if is_strict:
+                    self.error(what, fix, line, near)
+                    if near:
+                        found.setdefault(near[0], entry)
+                else:
+                    self.warning(f"{what}; ignored", fix, line, near)
+        return found
 
     def check_position(self, position: Sequence[float], line: int = 0) -> bool:
         """Return whether each coordinate is at most `MAX_POSITION`; otherwise report an error."""

@@ -20,7 +20,6 @@ from modelserver.formats.common import (
     looks_like_degrees,
     looks_like_radians,
     parse_number,
-    suggest_known_key,
 )
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.inertia import RigidInertia, Rows
@@ -35,8 +34,7 @@ from modelserver.yaml_tree import NodeKind, YamlNode
 class YamlMapping(ElementReader):
     """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
 
-    Null values are left out of the fields; unknown and duplicate keys are errors. The value of a misspelled key is at
-    the key that is meant: it is examined, and not missing.
+    Null values are left out of the fields; unknown and duplicate keys are errors.
     """
 
     def __init__(self, builder: ModelBuilder, file: str, node: YamlNode, place: str, known: tuple[str, ...] = ()):
@@ -54,28 +52,9 @@ class YamlMapping(ElementReader):
             else:
                 self.pairs.append((key.text.strip(), key, value))
         if known:
-            self._select(known)
-
-    def _select(self, known: tuple[str, ...]) -> None:
-        first: dict[str, int] = {}
-        given = {name for name, _, _ in self.pairs}
-        for name, key, value in self.pairs:
-            if name in first:
-                message = f"{name} is given twice (first on line {first[name]})"
-                self.error(message, "remove one of the two", key.line)
-                continue
-            if name in known:
-                first[name] = key.line
-            else:
-                # a key that is present already is not what was meant
-                near = suggest_known_key(name, tuple(each for each in known if each not in given))
-                fix = f"write {near[0]}" if near else f"keys here are {', '.join(known)}"
-                self.error(f"unknown key {quote(name)}", fix, key.line, near)
-                if not near or near[0] in self.fields:
-                    continue
-                name = near[0]
-            if not value.is_null:
-                self.fields[name] = value
+            entries = [(name, value, key.line) for name, key, value in self.pairs]
+            selected = self.select(entries, known, "key", is_strict=True)
+            self.fields = {name: value for name, value in selected.items() if not value.is_null}
 
     def enter(self, node: YamlNode, place: str, known: tuple[str, ...] = ()) -> YamlMapping:
         return YamlMapping(self.builder, self.file, node, place, known)
