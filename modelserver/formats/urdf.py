@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from modelserver.errors import Suggestion, quote, suggest_name
@@ -100,8 +100,6 @@ class _UrdfReader:
     def __init__(self, root: UrdfElement):
         self.root = root
         self.builder = root.builder
-        self.types: dict[str, JointType] = {}
-        """Types of joints, for joints that follow them."""
         self.suggestion_count = 0
         self.links: dict[str, UrdfElement] = {}
         self.joints: dict[str, _ParsedJoint] = {}
@@ -145,11 +143,7 @@ class _UrdfReader:
             if self.is_valid_name(link, self.links.get(link.name)):
                 self.links[link.name] = link
         for joint in elements["joint"]:
-            if (kind := _JOINT_TYPES.get(joint.get("type"))) is not None:
-                self.types.setdefault(joint.name, kind)
-        for joint in elements["joint"]:
             self.read_joint(joint)
-        self.check_mimics()
         _report_unsupported(elements["joint"])
         order = self.sort_links()
         materials = read_materials(elements["material"])
@@ -194,21 +188,12 @@ class _UrdfReader:
             return name
         other = parts.get("parent" if key == "child" else "child")
         taken = "" if other is None else other.get("link")
-        near = self.suggest(name, [link for link in self.links if link != taken])
+        self.suggestion_count += 1
+        known = [link for link in self.links if link != taken]
+        near = suggest_name(name, known) if self.suggestion_count <= MAX_SUGGESTIONS else Suggestion()
         fix = f"write {near[0]}" if near else "name a link of this file"
         parts[key].error(f"{key} names link {quote(name)}, which does not exist", fix, nearest=near)
         return None
-
-    def check_mimics(self) -> None:
-        """Report cycles of joints that follow one another."""
-
-        def find_leader(name: str) -> str | None:
-            mimic = self.joints[name].joint.mimic if name in self.joints else None
-            return None if mimic is None else mimic.joint
-
-        for cycle in find_cycles(self.joints, find_leader):
-            message = f"joints follow one another in a cycle: {' follows '.join(map(label, cycle))}"
-            self.reject(self.joints[cycle[-1]].at, message, "one of them must follow none: remove its <mimic>")
 
     def sort_links(self) -> list[str]:
         """Return the links, root first; report an error if they are not a tree with one root."""
@@ -263,10 +248,6 @@ class _UrdfReader:
             ends = (names.join(parent, mount), names.join(child, ORIGIN))
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=at.locate())
 
-    def suggest(self, name: str, known: Iterable[str]) -> Suggestion:
-        self.suggestion_count += 1
-        return suggest_name(name, known) if self.suggestion_count <= MAX_SUGGESTIONS else Suggestion()
-
     def read_motion(self, at: UrdfElement, parts: dict[str, UrdfElement]) -> Joint | None:
         """Read the motion of a joint; None, with an error, if it is wrong."""
         name = at.read_text("type", f"add type, one of {', '.join(_JOINT_TYPES)}")
@@ -283,7 +264,7 @@ class _UrdfReader:
         x_axis = [1.0, 0.0, 0.0]
         axis = parts["axis"].read_numbers("xyz", 3, x_axis) if "axis" in parts else x_axis
         limits = _read_limits(at, name, parts.get("limit"))
-        mimic = self.read_mimic(parts["mimic"], kind) if "mimic" in parts else None
+        mimic = _read_mimic(parts["mimic"], kind) if "mimic" in parts else None
         if axis is None or limits is None:
             return None
         try:
@@ -293,25 +274,17 @@ class _UrdfReader:
             where.error(str(error), "write <axis> as a direction, and <limit> with lower below upper")
             return None
 
-    def read_mimic(self, at: UrdfElement, kind: JointType) -> Mimic | None:
-        """Read the joint that a joint follows; None, with an error, if it is wrong."""
-        leader = at.read_text("joint")
-        factor, offset = at.read_number("multiplier", 1.0), at.read_number("offset", 0.0)
-        if leader is None or factor is None or offset is None:
-            return None
-        found = self.types.get(leader)
-        if kind not in _SINGLE_COORDINATE:
-            at.error(f"a {kind} joint has several coordinates and can follow none", "remove <mimic>")
-        elif found is None:
-            near = self.suggest(leader, self.types)
-            fix = f"write {near[0]}" if near else "name a joint of this file"
-            at.error(f"mimic names joint {quote(leader)}, which does not exist", fix, nearest=near)
-        elif found not in _SINGLE_COORDINATE:
-            fix = "name a revolute, continuous or prismatic joint"
-            at.error(f"mimic names joint {label(leader)}, which is {found}", fix)
-        else:
-            return Mimic(leader, factor, offset)
+
+def _read_mimic(at: UrdfElement, kind: JointType) -> Mimic | None:
+    """Read the joint that a joint follows, which the builder checks; None, with an error, if it is wrong."""
+    leader = at.read_text("joint")
+    factor, offset = at.read_number("multiplier", 1.0), at.read_number("offset", 0.0)
+    if leader is None or factor is None or offset is None:
         return None
+    if kind not in _SINGLE_COORDINATE:
+        at.error(f"a {kind} joint has several coordinates and can follow none", "remove <mimic>")
+        return None
+    return Mimic(leader, factor, offset)
 
 
 def _read_limits(
