@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from modelserver.errors import WireError
 from modelserver.messages import Envelope, VehicleCommand
-from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.codec import decode
 from msdrivers.endpoint import HostTime
 

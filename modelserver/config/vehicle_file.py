@@ -357,7 +357,7 @@ class CommandsConfig:
     drive: Literal["auto", "signed", "unsigned"] = "auto"
     """Whether commands to the vehicle controller must be signed. `auto`: where there is a key file."""
     key_file: str = ""
-    """Keys with which such a message must be signed, relative to this file; see `modelserver.signing.key_files`."""
+    """Keys with which such a message must be signed, relative to this file; see `modelserver.key_files`."""
     window_s: float = 5.0
     """Greatest age of a signed message, seconds, by the vehicle's clock."""
 

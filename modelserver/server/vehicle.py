@@ -25,10 +25,10 @@ from modelserver.formats.common import is_far
 from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
+from modelserver.key_files import read_keys
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
-from modelserver.signing.key_files import read_keys
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import get_type_name
 from modelserver.wire.urls import leaves_machine

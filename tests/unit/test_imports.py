@@ -18,7 +18,7 @@ POSES = VALUES | {"messages", "earth", "estimation.history"}
 CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
 FILES = {"files"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "files"}
-SIGNING = {"signing.signatures", "signing.key_files"}
+SIGNING = {"signing", "key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
 DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
@@ -29,14 +29,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     # folders
     "config": set(),
     "files": set(),
-    "signing": set(),
     "errors": set(),
     "transforms": {"errors"},
     "geometry": VALUES | {"plugins"},
     "dynamics": GEOMETRY,
     "messages": VALUES | {"earth"},
-    "signing.signatures": VALUES | {"messages"},
-    "signing.key_files": VALUES | {"messages", "signing.signatures", "files"},
+    "signing": VALUES | {"messages"},
+    "key_files": VALUES | {"messages", "signing", "files"},
     "earth": VALUES,
     "estimation.history": VALUES | {"messages"},
     "joints": GEOMETRY | {"messages"},
@@ -58,7 +57,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "msdrivers.endpoint": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.endpoint"},
     "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.endpoint"},
-    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing.signatures"},
+    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing"},
     "mslcm": set(),
     "mstools": SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"},
     # the public names, loaded when they are first used
@@ -75,7 +74,7 @@ PURE = {
     "earth",
     "estimation",
     "messages",
-    "signing.signatures",
+    "signing",
     "estimation.history",
     "joints",
     "query",

@@ -24,9 +24,9 @@ from modelserver.files import (
     read_start,
 )
 from modelserver.formats import load_model
+from modelserver.key_files import read_keys
 from modelserver.server.journal.segments import Ring, files_of
 from modelserver.server.persistence.directory import write_atomically
-from modelserver.signing.key_files import read_keys
 from modelserver.wire.eventlog import LogFile
 from msdrivers.factory import make_driver
 from msdrivers.raw_log import open_for_reading, open_for_writing

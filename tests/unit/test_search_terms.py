@@ -99,7 +99,7 @@ TERMS = {
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",
     "watchdog": "modelserver/server/supervision/systemd.py",
-    "HMAC": "modelserver/signing/signatures.py",
+    "HMAC": "modelserver/signing.py",
     "replay attack": "modelserver/server/requests/signed_commands.py",
     "clock drift": "drivers/msdrivers/device_clock.py",
     "checksum": "drivers/msdrivers/protocol/framing.py",

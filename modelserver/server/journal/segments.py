@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 from modelserver.errors import RecordingError
 from modelserver.files import open_regular, read_start
 from modelserver.server.persistence.directory import FileLock, create_directory
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire.eventlog import Buffer, LogEvent, scan
 from modelserver.wire.journal import MAGIC, SegmentEnd, SegmentHead, read_end, read_segment
 

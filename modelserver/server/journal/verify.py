@@ -26,7 +26,7 @@ from modelserver.server.journal import state as journal_state
 from modelserver.server.journal.comparison import Deviation, compute_deviation
 from modelserver.server.journal.replay import PublishedMessage, ReplayLoop
 from modelserver.server.journal.segments import NEWEST_NAME, ChainVerifier, open_mapped, read_newest
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire import journal
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode

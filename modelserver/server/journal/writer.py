@@ -45,7 +45,7 @@ from modelserver.server.persistence.directory import (
     to_file_name,
     write_atomically,
 )
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire import journal
 
 log = logging.getLogger(__name__)

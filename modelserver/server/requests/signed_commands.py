@@ -12,7 +12,7 @@ from typing import Final
 from modelserver import messages
 from modelserver.core import Instant, commands
 from modelserver.errors import WireError
-from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode, read_request_header
 

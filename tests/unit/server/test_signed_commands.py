@@ -29,7 +29,7 @@ from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import PollReload
 from modelserver.server.requests.signed_commands import CommandVerifier
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 

@@ -34,7 +34,7 @@ def create(
     name: Annotated[str, option("--name TEXT", "Name of the key.")] = "",
 ) -> None:
     """Write a new key to a file that only its owner can read."""
-    from modelserver.signing.key_files import generate_key, write_key
+    from modelserver.key_files import generate_key, write_key
 
     key = generate_key(name)
     write_key(file, key)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import Location, ModelServerError, NoServerError
+from modelserver.key_files import KEY_FILE_VARIABLE
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
-from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener

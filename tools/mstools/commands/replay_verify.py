@@ -27,9 +27,9 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
     `key`: the vehicle's key file. Without one authenticity is not verified, and a journal that is reproduced bit for
     bit exits with 0.
     """
+    from modelserver.key_files import read_keys
     from modelserver.server.journal.segments import files_of
     from modelserver.server.journal.verify import VerificationResult, verify
-    from modelserver.signing.key_files import read_keys
 
     keys = () if key is None else read_keys(key)
     files = files_of(journal)

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final
 
 from modelserver.config.vehicle_file import VehicleConfig, read_config_lines
 from modelserver.errors import KeyFileError, Problem, Severity
+from modelserver.key_files import find_group_writable_folder, read_keys
 from modelserver.server.diagnostics.checks import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
 from modelserver.server.journal.segments import LOCK_NAME, list_segments
 from modelserver.server.journal.writer import get_journal_directory, get_max_bytes
 from modelserver.server.persistence.directory import get_state_directory
-from modelserver.signing.key_files import find_group_writable_folder, read_keys
 from mstools.deployment.files import CREDENTIAL
 from mstools.deployment.plan import SERVICE, STATE, UNITS, VEHICLE
 from mstools.terminal.output import format_count

@@ -20,7 +20,7 @@ from typing import Final
 
 from modelserver.errors import KeyFileError, quote
 from modelserver.files import open_regular
-from modelserver.signing.signatures import MIN_KEY_BYTES, Key
+from modelserver.signing import MIN_KEY_BYTES, Key
 
 MAX_BYTES: Final = 8192
 MAX_KEYS: Final = 8
