@@ -30,7 +30,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -119,41 +119,6 @@ def parse_path(text: str) -> FramePath:
     return FramePath(tuple(parts), text.startswith("/"))
 
 
-@dataclass(slots=True)
-class Ancestry:
-    """The names of the ancestors of frames, by `parents`: the key of each frame's parent, "" for a root.
-
-    The parent of a frame that is not in `parents` is not known yet.
-    """
-
-    names: Mapping[str, str]
-    parents: Mapping[str, str]
-    steps: int = 0
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether more than `MAX_STEPS` levels were visited."""
-        return self.steps > MAX_STEPS
-
-    def match(self, path: FramePath, names: list[str]) -> bool:
-        """Return whether a path matches the frame with these names; False when exhausted."""
-        self.steps += len(names) * (len(path.parts) if ANY in path.parts else 1)
-        return not self.is_exhausted and path.matches(names)
-
-    def of(self, key: str) -> list[str] | None:
-        """Return the names from the root down to a frame; None if a parent is not known yet, or for a cycle."""
-        found: list[str] = []
-        seen: set[str] = set()
-        while key:
-            self.steps += 1
-            if key in seen or key not in self.parents or self.is_exhausted:
-                return None
-            seen.add(key)
-            found.append(self.names[key])
-            key = self.parents[key]
-        return found[::-1]
-
-
 def find_instances(root: Element) -> Iterator[Element]:
     for element in root.iter("{*}instance"):
         if (element.get("type") or "").strip().endswith("FrameRpyParameters"):
@@ -196,7 +161,11 @@ class _FrameTreeReader(ElementReader):
         """By name; a second frame of a name, with another parent, by parent and name."""
         self.parents: dict[str, str] = {}
         """Key of the parent of each frame, empty for a root."""
+        self.keys: defaultdict[str, list[str]] = defaultdict(list)
+        """Keys of the frames of each name."""
         self.undefined: defaultdict[str, list[Location]] = defaultdict(list)
+        self.steps = 0
+        """Levels visited for paths."""
 
     def read_frame(self, element: Element) -> None:
         """Read one instance; a second one of the same name and parent is ignored with a warning."""
@@ -305,6 +274,27 @@ class _FrameTreeReader(ElementReader):
             else:
                 self.note(message, at=lines[0])
 
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether more than `MAX_STEPS` levels were visited."""
+        return self.steps > MAX_STEPS
+
+    def match(self, path: FramePath, above: list[str]) -> bool:
+        """Return whether a path matches the frame with these names; False when exhausted."""
+        self.steps += len(above) * (len(path.parts) if ANY in path.parts else 1)
+        return not self.is_exhausted and path.matches(above)
+
+    def list_names(self, key: str) -> list[str] | None:
+        """Return the names from the root down to a frame; None if a parent is not known yet, or for a cycle."""
+        found: dict[str, str] = {}
+        while key:
+            self.steps += 1
+            if key in found or key not in self.parents or self.is_exhausted:
+                return None
+            found[key] = self.frames[key].name
+            key = self.parents[key]
+        return list(found.values())[::-1]
+
     def find_parents(self) -> bool:
         """Find the parent of each frame; report missing parents and cycles. Return whether there are none."""
         named = {frame.name for frame in self.frames.values()}
@@ -313,13 +303,11 @@ class _FrameTreeReader(ElementReader):
                 # a name may hold slashes
                 frame.path = FramePath((frame.parent,), False)
         self.add_external_roots()
-        keys: defaultdict[str, list[str]] = defaultdict(list)
         for key, frame in self.frames.items():
-            keys[frame.name].append(key)
-        ancestry = Ancestry({key: frame.name for key, frame in self.frames.items()}, self.parents)
+            self.keys[frame.name].append(key)
         several: list[str] = []
         for key, frame in self.frames.items():
-            candidates = keys.get(frame.path.name, [])
+            candidates = self.keys.get(frame.path.name, [])
             if not frame.path.parts:
                 self.parents[key] = ""
             elif len(candidates) == 1:
@@ -327,19 +315,19 @@ class _FrameTreeReader(ElementReader):
                 self.parents[key] = candidates[0]
             elif candidates:
                 several.append(key)
-        self.resolve_shared_names(several, keys, ancestry)
+        self.resolve_shared_names(several)
         missing = [key for key in self.frames if key not in self.parents]
         is_tree = self.has_no_cycles()
         if is_tree:
             for key, frame in self.frames.items():
                 parent = self.parents.get(key, "")
-                if parent and not frame.path.is_plain and not self.is_parent_on_path(frame, parent, keys, ancestry):
+                if parent and not frame.path.is_plain and not self.is_parent_on_path(frame, parent):
                     missing.append(key)
-        if not ancestry.is_exhausted:
-            self.report_missing(missing, keys, ancestry)
+        if not self.is_exhausted:
+            self.report_missing(missing)
         else:
             self.error("the paths of parents are too many and too deep", "write plain names")
-        return is_tree and not missing and not ancestry.is_exhausted
+        return is_tree and not missing and not self.is_exhausted
 
     def add_external_roots(self) -> None:
         """Add a root for each parent that is outside the file by its nature."""
@@ -365,30 +353,30 @@ class _FrameTreeReader(ElementReader):
                     Severity.NOTE, f"Parent {label(frame.parent)} is not in the file; it becomes a root", source
                 )
 
-    def resolve_shared_names(self, several: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+    def resolve_shared_names(self, several: list[str]) -> None:
         """Find the parents whose name several frames have, when the ancestors of those are known."""
         while several:
             left: list[str] = []
             for key in several:
-                if ancestry.is_exhausted:
+                if self.is_exhausted:
                     return
                 path = self.frames[key].path
-                above = {each: ancestry.of(each) for each in keys[path.name] if each != key}
-                fitting = [(len(at), each) for each, at in above.items() if at is not None and ancestry.match(path, at)]
+                above = {each: self.list_names(each) for each in self.keys[path.name] if each != key}
+                fitting = [(len(at), each) for each, at in above.items() if at is not None and self.match(path, at)]
                 if None in above.values() and not any(depth == 1 for depth, _ in fitting):
                     left.append(key)
                 elif fitting:
                     self.parents[key] = min(fitting, key=lambda found: found[0])[1]
                     if len(fitting) > 1:
-                        self.report_ambiguous(key, [each for _, each in fitting], ancestry)
+                        self.report_ambiguous(key, [each for _, each in fitting])
             if len(left) == len(several):
                 return
             several = left
 
-    def report_ambiguous(self, key: str, fitting: list[str], ancestry: Ancestry) -> None:
+    def report_ambiguous(self, key: str, fitting: list[str]) -> None:
         frame = self.frames[key]
-        paths = ["/".join(ancestry.of(each) or ()) for each in fitting]
-        chosen = "/".join(ancestry.of(self.parents[key]) or ())
+        paths = ["/".join(self.list_names(each) or ()) for each in fitting]
+        chosen = "/".join(self.list_names(self.parents[key]) or ())
         self.builder.add_warning(
             f"Parent {label(frame.parent)} names {len(fitting)} frames: {', '.join(map(label, paths[:4]))}; "
             f"{label(chosen)} is used",
@@ -396,30 +384,30 @@ class _FrameTreeReader(ElementReader):
             "write the path of the one that is meant",
         )
 
-    def is_parent_on_path(self, frame: _FrameInstance, parent: str, named: Collection[str], ancestry: Ancestry) -> bool:
+    def is_parent_on_path(self, frame: _FrameInstance, parent: str) -> bool:
         """Return whether the ancestors of a frame's parent match its path."""
-        above = ancestry.of(parent)
+        above = self.list_names(parent)
         if above is None:
-            return ancestry.is_exhausted
+            return self.is_exhausted
         path = frame.path
         if path.is_absolute:
             # the part above the roots of the file cannot be compared
-            inside = next((n for n, part in enumerate(path.parts) if part in named or part == ANY), 0)
+            inside = next((n for n, part in enumerate(path.parts) if part in self.keys or part == ANY), 0)
             path = FramePath(path.parts[inside:], True)
-        return ancestry.match(path, above) or ancestry.is_exhausted
+        return self.match(path, above) or self.is_exhausted
 
-    def report_missing(self, missing: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+    def report_missing(self, missing: list[str]) -> None:
         """Report missing parents, each with a suggestion if it is unambiguous."""
         meant: dict[FramePath, str] = {}
         for key in missing:
             frame = self.frames[key]
             path = frame.path
             if path not in meant:
-                meant[path] = self.suggest_parent(frame, keys, ancestry) if len(meant) < MAX_SUGGESTIONS else ""
+                meant[path] = self.suggest_parent(frame) if len(meant) < MAX_SUGGESTIONS else ""
             near = meant[path]
             why = ""
             if self.parents.get(key):
-                why = f": {label(path.name)} is {label('/'.join(ancestry.of(self.parents[key]) or ()))}"
+                why = f": {label(path.name)} is {label('/'.join(self.list_names(self.parents[key]) or ()))}"
             self.builder.add_error(
                 f"Parent names {quote(frame.parent)}, which does not exist{why}",
                 frame.parent_source,
@@ -427,23 +415,23 @@ class _FrameTreeReader(ElementReader):
                 Suggestion.of(frame.parent, near),
             )
 
-    def suggest_parent(self, frame: _FrameInstance, keys: dict[str, list[str]], ancestry: Ancestry) -> str:
+    def suggest_parent(self, frame: _FrameInstance) -> str:
         """Return the path of which one name is misspelled in a Parent; empty if that is ambiguous.
 
         It has as many names: an ancestor is another place, and a frame cannot be its own parent.
         """
         parts = list(frame.path.parts)
-        unknown = [n for n, part in enumerate(parts) if part not in keys and part != ANY]
+        unknown = [n for n, part in enumerate(parts) if part not in self.keys and part != ANY]
         if len(unknown) != 1:
             return ""
         (at,) = unknown
-        near = find_suggestion(parts[at], [name for name in keys if name != frame.name and name not in parts])
+        near = find_suggestion(parts[at], [name for name in self.keys if name != frame.name and name not in parts])
         if not near:
             return ""
         parts[at] = near
         found = FramePath(tuple(parts), frame.path.is_absolute)
-        placed = (ancestry.of(key) for key in keys[found.name])
-        if not found.is_plain and not any(above is not None and ancestry.match(found, above) for above in placed):
+        placed = (self.list_names(key) for key in self.keys[found.name])
+        if not found.is_plain and not any(above is not None and self.match(found, above) for above in placed):
             return ""
         return ("/" if found.is_absolute else "") + "/".join(parts)
 
