@@ -43,14 +43,6 @@ Path_ = tuple[str | int, ...]
 """Keys and list indices from the top of the file down to a value."""
 
 
-def read(raw: bytes, name: str, schema: type[S]) -> S:
-    """Return the instance of a dataclass that the file `name` holds. Raises ConfigError with every problem."""
-    found, problems = read_partly(raw, name, schema)
-    if found is None or problems:
-        raise ConfigError(problems)
-    return found
-
-
 def read_partly(
     raw: bytes, name: str, schema: type[S], blanks: Mapping[str, str] | None = None
 ) -> tuple[S | None, tuple[Problem, ...]]:
