@@ -13,8 +13,8 @@ Rotation vectors of ball joints by time: three coordinates that are one orientat
 Between two readings the orientation turns at a constant rate about one axis (slerp). v and v + 2 pi k v/|v| are the
 same orientation: the result is the rotation vector nearest to the readings. With the left Jacobian J of SO(3) the
 angular velocity is w = J(v) v' (Sola, "Quaternion kinematics", 2017, eq. 183); v' and v'' are computed from w and its
-change, with J differenced along v'. Assumption: the three coordinates have readings of the same instants; otherwise
-each is interpolated by itself. Pure.
+change by the inverse of J (`transforms.pose`). Assumption: the three coordinates have readings of the same instants;
+otherwise each is interpolated by itself. Pure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from typing import Final, NamedTuple, TypeAlias
 
@@ -34,6 +34,7 @@ from modelserver.geometry.joint import JointType
 from modelserver.messages import NAN
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import pose_array, so3
+from modelserver.transforms.pose import compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array, Vector3
 
 MAX_GAP_S: Final = 1.0
@@ -516,9 +517,6 @@ def _sort_key(values: ReadingValues) -> tuple[float, ...]:
 ROTATION_VECTOR_TYPES: Final = (JointType.SPHERICAL, JointType.FLOATING)
 """The joint types whose last three coordinates are a rotation vector."""
 
-_STEP: Final = 1e-4
-"""Seconds over which the Jacobian is differenced."""
-
 _UNKNOWN: Final[Vector3] = (math.nan, math.nan, math.nan)
 
 
@@ -580,13 +578,13 @@ def combine(
     ends = _Ends.of((x.find_pair(utime), y.find_pair(utime), z.find_pair(utime)))
     if ends is None:
         return readings
-    w0, w1 = so3.left_jacobian(ends.v0) @ ends.rate0, so3.left_jacobian(ends.v1) @ ends.rate1
+    w0, w1 = _compute_turn(ends.v0, ends.rate0), _compute_turn(ends.v1, ends.rate1)
     change = (w1 - w0) / ends.span if ends.span >= MIN_SPAN_S else np.array(_UNKNOWN)
     v = so3.to_vector3([each.position for each in readings])
     if provenance is Provenance.MEASURED:
         rates = np.array([each.rate for each in readings])
         has_rates = not np.isnan(rates).any()
-        w = so3.left_jacobian(v) @ rates if has_rates else ends.angular_velocity
+        w = _compute_turn(v, rates) if has_rates else ends.angular_velocity
     else:
         pair = x.find_pair(utime)
         fraction = (utime - pair.t0) / (pair.t1 - pair.t0) if pair is not None else 0.0
@@ -625,7 +623,7 @@ def _predict(
                 for track, limit, slope in zip(tracks, rate_limits, slopes, strict=True)
             ]
         )
-    w = so3.left_jacobian(v1) @ [each.rate for each in readings]
+    w = _compute_turn(v1, [each.rate for each in readings])
     dt = readings[0].gap
     turned = so3.multiply(so3.exponential(so3.to_vector3(w * dt)), so3.exponential(v1))
     v = find_nearest_equivalent(so3.logarithm(so3.normalize(turned)), v1)
@@ -633,17 +631,20 @@ def _predict(
     return tuple([each._replace(position=v[n], rate=float(rate[n])) for n, each in enumerate(readings)])
 
 
+def _compute_turn(v: Vector3, rate: Iterable[float]) -> Array:
+    """Return the angular velocity J(v) v'."""
+    return np.array(compute_turn_motion(v, so3.to_vector3(rate))[0])
+
+
 def _to_vector_rates(v: Vector3, w: Array, change: Array) -> tuple[Array, Array]:
     """Return v' and v'' from an angular velocity and its change; nan near full turns, where J is singular."""
-    J = so3.left_jacobian(v)
-    if abs(np.linalg.det(J)) < 1e-6:
+    angle = math.hypot(*v)
+    # the determinant of J is the square of 2 sin(angle / 2) / angle
+    if angle > 1.0 and abs(2.0 * math.sin(0.5 * angle)) < 1e-3 * angle:
         return np.array(_UNKNOWN), np.array(_UNKNOWN)
-    rate = np.asarray(np.linalg.solve(J, w), dtype=float)
-    after, before = (
-        so3.left_jacobian(so3.to_vector3(v + _STEP * rate)),
-        so3.left_jacobian(so3.to_vector3(v - _STEP * rate)),
-    )
-    return rate, np.asarray(np.linalg.solve(J, change - (after - before) @ rate / (2.0 * _STEP)), dtype=float)
+    rate = compute_turn_rate(v, so3.to_vector3(w))
+    _, turning = compute_turn_motion(v, rate)
+    return np.array(rate), np.array(compute_turn_rate(v, so3.to_vector3(change - turning)))
 
 
 def find_nearest_equivalent(v: Vector3, other: Vector3) -> Vector3:

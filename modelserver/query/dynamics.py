@@ -17,7 +17,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
-from modelserver.dynamics.multibody import compute_turn_motion, compute_turn_rate
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
@@ -38,7 +37,7 @@ from modelserver.query.motion import compute_motion
 from modelserver.query.steps import Steps
 from modelserver.query.view import PlatformView
 from modelserver.transforms import so3
-from modelserver.transforms.pose import Pose
+from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array
 
 MAX_COORDINATES: Final = 100
