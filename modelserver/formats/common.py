@@ -276,14 +276,10 @@ def list_text_and_sigma_features(model: Model) -> Iterator[str]:
         yield f"{sigmas} sigmas"
 
 
-def list_inertia_features(model: Model) -> Iterator[str]:
-    """Yield the bodies whose inertia a format without inertias drops."""
+def list_physical_features(model: Model) -> Iterator[str]:
+    """Yield the inertias and shapes that the formats of Miro drop, and the joints that they write as fixed."""
     if heavy := [body.name for body in model.bodies if body.inertia is not None]:
         yield f"the inertia of {len(heavy)} bodies: {format_names(heavy)}"
-
-
-def list_joint_and_shape_features(model: Model) -> Iterator[str]:
-    """Yield the joints that a format without joints writes as fixed, and the bodies whose shapes it drops."""
     if model.joints:
         count = f"{len(model.joints)} joint{'' if len(model.joints) == 1 else 's'}"
         yield f"the motion of {count}, written as fixed at the default position: {format_names(list(model.joints))}"

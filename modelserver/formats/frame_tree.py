@@ -44,8 +44,7 @@ from modelserver.formats.common import (
     format_element,
     format_names,
     label,
-    list_inertia_features,
-    list_joint_and_shape_features,
+    list_physical_features,
     list_text_and_sigma_features,
     parse_number,
     to_rpy_degrees,
@@ -594,8 +593,7 @@ def _list_unsupported(model: Model, used: set[str]) -> Iterator[str]:
     if model.name:
         yield f"the model's name, {model.name}"
     yield from list_text_and_sigma_features(model)
-    yield from list_inertia_features(model)
-    yield from list_joint_and_shape_features(model)
+    yield from list_physical_features(model)
     if model.constraints:
         yield "the names of constraints, and on which of their frames bodies meet"
     if loops := [each.name for each in model.constraints if each.name not in used]:

@@ -19,8 +19,7 @@ from modelserver.formats.common import (
     format_element,
     format_names,
     label,
-    list_inertia_features,
-    list_joint_and_shape_features,
+    list_physical_features,
     parse_numbers,
     suggest_known_key,
 )
@@ -207,8 +206,7 @@ def _list_unsupported(model: Model) -> Iterator[str]:
     constraints = [each.name for each in model.constraints if each.sigma is not None]
     if constraints:
         yield f"the sigmas of {len(constraints)} constraints: {format_names(constraints)}"
-    yield from list_inertia_features(model)
-    yield from list_joint_and_shape_features(model)
+    yield from list_physical_features(model)
     described = [(body.name, body.description) for body in model.bodies]
     described += [(f"{body.name}:{frame.name}", frame.description) for body in model.bodies for frame in body]
     described += [(each.name, each.description) for each in model.constraints]

@@ -16,19 +16,36 @@ visuals:
 The writer's text is readable for a person, and exact for the reader. Every float is written in the shortest text that
 reads back as the same float. A rotation is written as roll, pitch, yaw in degrees if these read back as the same
 quaternion to 1e-13, else as the quaternion. A text is written without quotes if every YAML reader takes it for the same
-text."""
+text.
+
+A snapshot is the exact text with all that a mirror needs to answer queries by itself, as a message (model_snapshot_t).
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
 import yaml
 
-from modelserver.errors import Location, Severity, Suggestion, SyntaxProblemError, has_error, quote, suggest_name
+from modelserver.errors import (
+    GeometryError,
+    Location,
+    Severity,
+    Suggestion,
+    SyntaxProblemError,
+    WireError,
+    has_error,
+    quote,
+    suggest_name,
+)
+from modelserver.formats import parse_model
 from modelserver.formats.common import SavedModel, format_number, label, to_rpy_degrees
 from modelserver.formats.yaml_elements import (
     POSE_KEYS,
@@ -573,3 +590,56 @@ def _escape(character: str) -> str:
         return "\\n"
     code = ord(character)
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+MAX_SNAPSHOT_BYTES = 64 << 20
+"""Greatest size of a decompressed snapshot."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSnapshot:
+    """The geometry of a vehicle, and the settings that a mirror of the service needs."""
+
+    vehicle: str
+    model: Model
+    base_frame: str
+    rolling_frame: str
+    history_s: float
+    joints_channel: str
+    joints_latency_us: int = 0
+    """Microseconds by which the stamps on `joints_channel` are later than the measurement."""
+
+
+_SETTINGS: Final[dict[str, Callable[[Any], Any]]] = {
+    "vehicle": str,
+    "base_frame": str,
+    "rolling_frame": str,
+    "history_s": float,
+    "joints_channel": str,
+    "joints_latency_us": int,
+}
+
+
+def encode_snapshot(snapshot: ModelSnapshot) -> bytes:
+    """Encode a snapshot as a zlib stream of JSON."""
+    content = {key: getattr(snapshot, key) for key in _SETTINGS}
+    content |= {"revision": snapshot.model.revision, "geometry": save(snapshot.model, exact=True).text}
+    return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)
+
+
+def decode_snapshot(data: bytes) -> ModelSnapshot:
+    """Decode a snapshot. Raises WireError for other bytes, or a geometry of another revision."""
+    unpacker = zlib.decompressobj()
+    try:
+        text = unpacker.decompress(data, MAX_SNAPSHOT_BYTES)
+        if unpacker.unconsumed_tail:
+            raise WireError("malformed", f"a snapshot decompresses to more than {MAX_SNAPSHOT_BYTES} bytes")
+        content = json.loads(text)
+        model = parse_model(content["geometry"].encode(), "the service's snapshot")
+        settings = {key: kind(content[key]) for key, kind in _SETTINGS.items()}
+        revision = str(content["revision"])
+    except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError, GeometryError) as error:
+        raise WireError("malformed", f"not a snapshot of a geometry: {error}") from None
+    if model.revision != revision:
+        raise WireError("malformed", f"the snapshot states revision {revision}, but its geometry has {model.revision}")
+    return ModelSnapshot(model=model, **settings)

@@ -22,7 +22,7 @@ from modelserver.estimation.findings import find_unusable
 from modelserver.estimation.sensor_rig import SPEEDOMETER, Mounts, SensorRig, SpeedometerSignal, SteeringSignal
 from modelserver.formats import FileExamination, examine_file
 from modelserver.formats.common import is_far
-from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
 from modelserver.key_files import read_keys

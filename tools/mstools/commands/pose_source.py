@@ -91,7 +91,7 @@ def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
 def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:
     """Open a log as a source of poses, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
     from modelserver.client.mirror_state import HISTORY_S
-    from modelserver.formats.snapshot import ModelSnapshot
+    from modelserver.formats.yaml_geometry import ModelSnapshot
     from mstools.recordings.log_platform import LogPlatform
 
     if model is None:

@@ -24,7 +24,7 @@ from mstools.terminal.options import PrefixOption, UrlOption, Variables, argumen
 from mstools.terminal.output import check_writable, describe_size, escape, format_count, replace_unencodable, write_file
 
 if TYPE_CHECKING:
-    from modelserver.formats.snapshot import ModelSnapshot
+    from modelserver.formats.yaml_geometry import ModelSnapshot
 
 TIMEOUT_S = 11.0
 """Timeout for MODEL_SNAPSHOT, seconds; it is published every 5 s by default."""
@@ -86,7 +86,7 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
 
 def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
     """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
-    from modelserver.formats.snapshot import decode_snapshot
+    from modelserver.formats.yaml_geometry import decode_snapshot
     from modelserver.wire.provider import open_lcm, resolve_url
     from modelserver.wire.snapshot import SnapshotAssembler
     from mstools.commands.listener import DaemonListener

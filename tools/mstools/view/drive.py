@@ -22,7 +22,7 @@ import numpy.typing as npt
 from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.errors import WireError
-from modelserver.formats.snapshot import decode_snapshot
+from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.geometry.joint import coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import (
