@@ -30,7 +30,6 @@ from modelserver.formats.common import (
     ElementReader,
     find_cycles,
     label,
-    parse_numbers,
     suggest_known_key,
 )
 from modelserver.geometry import names
@@ -237,14 +236,11 @@ class _BlockReader(ElementReader):
         return so3.exponential((x * scale, y * scale, z * scale))
 
     def read_numbers(self, key: str, count: int, unit: str) -> list[float] | None:
-        entry = self.fields[key]
-        try:
-            if isinstance(entry, ParamBlock):
-                raise ValueError(f"{key} is a block, not a list of {count} numbers")
-            return parse_numbers(entry.texts, count, key)
-        except ValueError as error:
-            self.error(str(error), f"write {key} = [{', '.join(['number'] * count)}]; ({unit})", entry.line)
+        entry, fix = self.fields[key], f"write {key} = [{', '.join(['number'] * count)}]; ({unit})"
+        if isinstance(entry, ParamBlock):
+            self.error(f"{key} is a block, not a list of {count} numbers", fix, entry.line)
             return None
+        return self.read_row(entry.texts, count, key, fix, entry.line)
 
 
 @dataclass(slots=True)

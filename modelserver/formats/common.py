@@ -76,14 +76,6 @@ def parse_number(text: str, where: str = "") -> float:
     raise ValueError(f"{where}{quote(text, 40)} is not a number")
 
 
-def parse_numbers(texts: Sequence[str], count: int, key: str) -> list[float]:
-    """Return `count` finite numbers. Raises ValueError, whose message begins with `key`."""
-    values = [parse_number(text, f"{key}: ") for text in texts]
-    if len(values) != count:
-        raise ValueError(f"{key} has {len(values)} number{'' if len(values) == 1 else 's'}, not {count}")
-    return values
-
-
 class ElementReader:
     """Reads one element of a file, and reports its problems; `place` names it there, e.g. `body Raptor`."""
 
@@ -139,6 +131,18 @@ class ElementReader:
                 else:
                     self.warning(f"{what}; ignored", fix, line, near)
         return found
+
+    def read_row(self, texts: Sequence[str], count: int, key: str, fix: str, at: int | str = 0) -> list[float] | None:
+        """Return `count` finite numbers; None, with an error, if they are not."""
+        try:
+            values = [parse_number(text, f"{key}: ") for text in texts]
+            if len(values) == count:
+                return values
+            message = f"{key} has {len(values)} number{'' if len(values) == 1 else 's'}, not {count}"
+        except ValueError as error:
+            message = str(error)
+        self.error(message, fix, at)
+        return None
 
     def check_position(self, position: Sequence[float], line: int = 0) -> bool:
         """Return whether each coordinate is at most `MAX_POSITION`; otherwise report an error."""

@@ -20,7 +20,6 @@ from modelserver.formats.common import (
     format_names,
     label,
     list_physical_features,
-    parse_numbers,
     suggest_known_key,
 )
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name, get_tag, iterate_children
@@ -161,17 +160,11 @@ def _read_transform(owner: NamedParameters) -> Pose | None:
 
 def _read_row(parts: NamedParameters, name: str) -> list[float] | None:
     """Read the four numbers of a row; None, with an error, if there are not four."""
+    fix = f'write <parameter name="{name}" value="r r r p"/>: a row of the rotation, then a position in meters'
+    if name not in parts.elements:
+        parts.error(f"{name} is missing", fix, name)
     text = parts.read_text(name)
-    if text is None and name in parts.elements:
-        return None
-    try:
-        if text is None:
-            raise ValueError(f"{name} is missing")
-        return parse_numbers(text.split(), 4, name)
-    except ValueError as error:
-        fix = f'write <parameter name="{name}" value="r r r p"/>: a row of the rotation, then a position in meters'
-        parts.error(str(error), fix, name)
-        return None
+    return None if text is None else parts.read_row(text.split(), 4, name, fix, name)
 
 
 def _read_description(parts: NamedParameters) -> str:

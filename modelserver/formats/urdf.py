@@ -38,7 +38,6 @@ from modelserver.formats.common import (
     label,
     list_text_and_sigma_features,
     looks_like_degrees,
-    parse_numbers,
     suggest_known_key,
 )
 from modelserver.formats.xml_document import get_line, get_name, get_tag, iterate_children
@@ -383,15 +382,11 @@ class UrdfElement(ElementReader):
         """Read the numbers of an attribute; `default` if it is absent, an error if there is no default."""
         fix = f'write {key}="{" ".join(["number"] * count)}"'
         text = self.element.get(key)
-        try:
-            if text is not None:
-                return parse_numbers(text.split(), count, key)
-            if default is not None:
-                return list(default)
-            raise ValueError(f"<{self.tag}> has no {key}")
-        except ValueError as error:
-            self.error(str(error), fix)
-            return None
+        if text is not None:
+            return self.read_row(text.split(), count, key, fix)
+        if default is None:
+            self.error(f"<{self.tag}> has no {key}", fix)
+        return None if default is None else list(default)
 
     def read_number(self, key: str, default: float | None = None) -> float | None:
         values = self.read_numbers(key, 1, None if default is None else (default,))
