@@ -219,9 +219,10 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Dec
     before = state.nav
     state, decision = fuse_constraint(setup, state, constraints.NON_HOLONOMIC, innovation)
     nav = hold_latency(before, state.nav, setup.layout)
-    if isinstance(state, Aligned) and state.common.wheels.is_suspect and propagation.is_outage(state, utime):
-        # a speed that nothing measures may be wrong by more than its uncertainty: by it the constraint would turn the
-        # heading and change the bias for good
+    is_measured = state.common.measures_wheel_speed(utime)
+    if isinstance(state, Aligned) and propagation.is_outage(state, utime) and not is_measured:
+        # a speed that nothing measures may be wrong by more than its uncertainty, and H leaves out the product of its
+        # error and the heading's: by it the constraint would turn the heading and change the bias for good
         nav = hold_bias(before, nav, (8, 11))
     return state._replace(nav=nav), (decision,)
 

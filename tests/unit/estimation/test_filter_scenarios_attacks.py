@@ -28,9 +28,8 @@ from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Leveling
 from modelserver.estimation.filter.timeline import Timeline
-from modelserver.messages import GpsSample, ImuSample, Invalid, Phase, Verdict, WheelSample, WheelsSample
-from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.messages import GpsSample, ImuSample, Invalid, Mode, Phase, Verdict, WheelSample, WheelsSample
+from modelserver.simulation import START_UTIME, DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
 
 pytestmark = pytest.mark.slow
@@ -117,14 +116,23 @@ def test_given_encoders_stuck_at_rest_when_it_starts_without_fixes_then_speed_an
     assert found.last.valid
 
 
-def test_given_stuck_wheels_in_an_outage_then_the_constraint_changes_no_gyro_bias_and_makes_no_heading_known():
+@pytest.mark.parametrize(
+    "unmeasured",
+    [
+        pytest.param(lambda common: common._replace(wheels=common.wheels.suspect()), id="stuck wheels"),
+        pytest.param(lambda common: common._replace(mode=Mode.NO_WHEELS), id="no wheels"),
+    ],
+)
+def test_given_a_speed_that_nothing_measures_then_the_constraint_changes_no_gyro_bias_and_shows_no_heading(
+    unmeasured,
+):
     gps = replace(PLAIN_GPS, outages=((25.0, 60.0),))
     localizer = drive(simulation(EIGHT, gps_model=gps), 35.0).localizer
     state, setup = localizer.head, localizer.setup
     assert isinstance(state, Aligned)
     x, y, z = state.nav.velocity
     sliding = state._replace(nav=state.nav._replace(velocity=(x - 0.2 * y, y + 0.2 * x, z)))
-    stuck = sliding._replace(common=state.common._replace(wheels=state.common.wheels.suspect()))
+    stuck = sliding._replace(common=unmeasured(state.common))
 
     def constrain(slid: Aligned) -> tuple[float, float, np.ndarray]:
         """Return the change of the bias, the sideways speed, and the change of the variances."""

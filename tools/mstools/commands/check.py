@@ -14,7 +14,6 @@ from modelserver.errors import ConfigError, Location, Problem, Severity, has_err
 from modelserver.files import EXAMINED_BYTES, FileKind, NotRegularFileError, detect_file_kind, read_start
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
-from mstools.commands.driver import find_driver_problems
 from mstools.terminal.options import JsonOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import describe_size, escape, format_count, print_problems, to_json
 from mstools.terminal.problems import find_nearest_path
@@ -80,6 +79,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     # imported here: a geometry file needs no configuration libraries and no geodesy
     from modelserver.config.vehicle_file import add_lines, load_partly
     from modelserver.server.vehicle import examine_vehicle, load_vehicle
+    from mstools.deployment.diagnosis import find_driver_problems
 
     try:
         config, problems = load_partly(file, blank=True)
