@@ -9,9 +9,9 @@ import sys
 import time
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
+from msdrivers.devices.gps.driver import GpsStream
+from msdrivers.devices.gps.novatel import NovatelLog
 from msdrivers.emulate import gps as gps_logs
-from msdrivers.protocol.gps_stream import GpsStream
-from msdrivers.protocol.novatel import NovatelLog
 
 REQUIRED = 5_000
 INSTANTS = 10_000

@@ -9,12 +9,10 @@ import time
 from collections.abc import Callable
 
 from benchmarks.support import print_verdict
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings
-from msdrivers.emulate.gx1 import Eeprom
+from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser, RequestParser
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
+from msdrivers.emulate.imu import Eeprom
 from msdrivers.endpoint import HostTime, MeasuredSample, Send
-from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
-from msdrivers.protocol.gx1.requests import RequestParser
 
 REPLIES = 50_000
 ROUNDS = 3

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.gps_parse import stream_of
-from msdrivers.protocol.gps_stream import GpsStream
-from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.novatel import NovatelLog
+from msdrivers.devices.gps.driver import GpsStream
+from msdrivers.devices.gps.nmea import NmeaEpoch
+from msdrivers.devices.gps.novatel import NovatelLog
 
 SIZE = 10_000_000
 CHUNK = 4096

@@ -24,7 +24,7 @@ _FORKS.set_forkserver_preload(
         "modelserver.config.vehicle_file",
         "modelserver.server.daemon",
         "modelserver.simulation",
-        "msdrivers.factory",
+        "msdrivers.settings",
         "mstools.commands.driver",
         "mstools.commands.emulate",
         "mstools.commands.run",

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
-from msdrivers.emulate.gx1 import Gx1Emulator
+from msdrivers.emulate.imu import Gx1Emulator
 from msdrivers.endpoint import Endpoint, EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 
 START_UTIME = 1_700_000_000_000_000

@@ -9,22 +9,11 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from modelserver.messages import Direction, JointsSample, SensorHeader, VehicleStatusSample, WheelSample, WheelsSample
-from msdrivers.devices.axis import AxisSettings, NodSettings
-from msdrivers.devices.vehicle import CommandLimits, VehicleSettings
-from msdrivers.devices.wheels import WheelsSettings
+from msdrivers.devices.axis import AxisRegisters, AxisSettings, NodSettings, RegisterMap
+from msdrivers.devices.can import CanDatabase, SignalMap, parse_dbc
+from msdrivers.devices.vehicle import CommandLimits, CommandMap, StatusMap, VehicleSettings
+from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, WheelsSettings
 from msdrivers.endpoint import Endpoint, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.can.database import CanDatabase
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.mapping import (
-    CommandMap,
-    CountMap,
-    DirectionMap,
-    SignalMap,
-    SpeedMap,
-    StatusMap,
-    WheelMap,
-)
-from msdrivers.protocol.modbus.registers import AxisRegisters, RegisterMap
 
 START_UTIME = 1_750_000_000_000_000
 START_NS = 5_000_000_000

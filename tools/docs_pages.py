@@ -97,7 +97,6 @@ SUPPLEMENT = {
     "CanSettings.can": "Channel of the bus, e.g. `can0`; with `udp_multicast` GROUP:PORT.",
     "CanSettings.interface": "Interface name of python-can.",
     "CanSettings.bitrate": "Bits per second; 0: already set up, e.g. by `ip link`.",
-    "GpsSettings.attempts": "How often a command is sent.",
     "GpsSettings.delay_sigma": "Standard deviation of `delay`, seconds.",
     "Gx1Settings.delay_sigma": "Standard deviation of `delay`, seconds.",
     "Gx1Settings.poll_period": "Seconds between two polls.",

@@ -1,4 +1,12 @@
-"""Corrections for a receiver from an NTRIP caster: a thread that receives them while the driver runs.
+"""Corrections for a receiver from an NTRIP caster: RTCM 3 frames, the NTRIP session, and the thread that receives them.
+
+RTCM: a frame is D3, six zero bits and a length of ten, the message, and CRC-24Q of all before (RTCM 10403.3, 4). The
+first twelve bits of a message are its number; in observations and station messages the reference station follows, also
+twelve bits.
+
+NTRIP, both versions (RTCM 10410.0 and 10410.1): the client asks for a mountpoint by HTTP. A caster of version 1 answers
+`ICY 200 OK` and sends corrections at once; one of version 2 answers as HTTP does, usually in chunks. For an unknown
+mountpoint it sends its source table.
 
 The driver takes the frames in each pass and sends them to the receiver. Without an answer, or after the connection was
 lost, the thread connects again, later each time.
@@ -11,14 +19,200 @@ import logging
 import socket
 import threading
 import time
+from base64 import b64encode
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from modelserver.messages import FixType, GpsSample, Sample
-from msdrivers.line_settings import NtripSettings, split_address
-from msdrivers.protocol.ntrip import NtripError, NtripRequest, NtripSession, make_gga
+from modelserver.version import __version__
+from msdrivers.devices.gps import DAY, nmea
+from msdrivers.devices.stream import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
+from msdrivers.registry import NtripSettings, split_address
 from msdrivers.runner import Runner
+
+PREAMBLE: Final = 0xD3
+HEADER_BYTES: Final = 3
+CRC_BYTES: Final = 3
+
+_POLYNOMIAL: Final = 0x1864CFB
+
+
+def _make_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 16
+        for _ in range(8):
+            crc = crc << 1 ^ (_POLYNOMIAL if crc & 0x800000 else 0)
+        table.append(crc & 0xFFFFFF)
+    return tuple(table)
+
+
+_TABLE: Final = _make_table()
+
+
+def compute_crc(data: bytes) -> int:
+    """Return CRC-24Q (Qualcomm) of some bytes."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 & 0xFFFFFF) ^ _TABLE[crc >> 16 ^ byte]
+    return crc
+
+
+@dataclass(frozen=True, slots=True)
+class RtcmFrame:
+    """A frame as it was received, the number of its message, and its reference station; -1 where it has none."""
+
+    data: bytes
+    number: int
+    station: int
+
+
+class RtcmFormat:
+    """A `FrameFormat` of RTCM 3."""
+
+    start_bytes = bytes((PREAMBLE,))
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[RtcmFrame] | RejectedFrame | None:
+        if len(buffer) < at + HEADER_BYTES:
+            return None
+        if buffer[at + 1] & 0xFC:
+            return NO_FRAME
+        end = at + HEADER_BYTES + (buffer[at + 1] << 8 | buffer[at + 2]) + CRC_BYTES
+        if len(buffer) < end:
+            return None
+        data = bytes(buffer[at:end])
+        if compute_crc(data[:-CRC_BYTES]) != int.from_bytes(data[-CRC_BYTES:], "big"):
+            return RejectedFrame("crc")
+        message = data[HEADER_BYTES:-CRC_BYTES]
+        number = message[0] << 4 | message[1] >> 4 if len(message) >= 2 else 0
+        station = (message[1] & 0x0F) << 8 | message[2] if len(message) >= 3 and _has_station(number) else -1
+        return ParsedFrame(end, f"rtcm.{number}", RtcmFrame(data, number, station))
+
+
+def _has_station(number: int) -> bool:
+    """Return whether the station follows the number: observations, station coordinates and antennas, MSM."""
+    return 1001 <= number <= 1012 or number in (1033, 1230) or 1071 <= number <= 1137
+
+
+class RtcmStream(FrameScanner[RtcmFrame]):
+    """Parses bytes to frames. Never raises; memory is bounded."""
+
+    formats = (RtcmFormat(),)
+
+
+MAX_HEADER: Final = 8192
+MAX_CHUNK: Final = 1 << 20
+
+
+def encode_request(settings: NtripSettings) -> bytes:
+    """Return the request for a mountpoint."""
+    lines = [
+        f"GET /{settings.mountpoint} HTTP/1.1",
+        f"Host: {split_address(settings.caster)[0]}",
+        "Ntrip-Version: Ntrip/2.0",
+        f"User-Agent: NTRIP ModelServer/{__version__}",
+        "Connection: close",
+    ]
+    if settings.user:
+        lines.append(f"Authorization: Basic {b64encode(f'{settings.user}:{settings.password}'.encode()).decode()}")
+    return ("\r\n".join(lines) + "\r\n\r\n").encode("utf-8")
+
+
+class NtripError(Exception):
+    """The caster does not send corrections; the message has the reason and what to do."""
+
+
+class NtripSession:
+    """Bytes of a caster in, frames out. `stream.counts` has the frames by kind and what was rejected."""
+
+    def __init__(self, mountpoint: str) -> None:
+        self._mountpoint = mountpoint
+        self._buffer = b""
+        self.is_answered = self._is_chunked = False
+        self._chunk_left = 0
+        self.stream = RtcmStream()
+
+    def feed(self, data: bytes) -> list[RtcmFrame]:
+        """Return the frames that `data` completes. Raises NtripError."""
+        if not self.is_answered:
+            self._buffer += data
+            body = self._read_header()
+            if body is None:
+                return []
+            data = body
+        return self.stream.feed(self._read_chunks(data) if self._is_chunked else data)
+
+    def _read_header(self) -> bytes | None:
+        """Return what follows the header; None while it is incomplete."""
+        line, end, rest = self._buffer.partition(b"\r\n")
+        if not end:
+            if len(self._buffer) > MAX_HEADER:
+                raise NtripError("the server's answer is not that of an NTRIP caster: check caster")
+            return None
+        status = line.decode("latin-1")
+        if status.startswith("ICY 200"):
+            self.is_answered, self._buffer = True, b""
+            return rest
+        if status.startswith("SOURCETABLE"):
+            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+        words = status.split(" ", 2)
+        if not words[0].startswith("HTTP/") or len(words) < 2:
+            raise NtripError(f"the server's answer {status[:60]!r} is not that of an NTRIP caster: check caster")
+        if words[1] != "200":
+            fix = {"401": "check user and password", "404": "check mountpoint"}.get(words[1], "try again later")
+            raise NtripError(f"the caster answers {' '.join(words[1:])[:60]}: {fix}")
+        header, end, body = self._buffer.partition(b"\r\n\r\n")
+        if not end:
+            if len(self._buffer) > MAX_HEADER:
+                raise NtripError("the caster's header is too long")
+            return None
+        text = header.decode("latin-1").lower()
+        if "gnss/sourcetable" in text:
+            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+        self.is_answered, self._buffer = True, b""
+        self._is_chunked = "transfer-encoding: chunked" in text
+        return body
+
+    def _read_chunks(self, data: bytes) -> bytes:
+        content = b""
+        self._buffer += data
+        while self._buffer:
+            if self._chunk_left:
+                part = self._buffer[: self._chunk_left]
+                content += part
+                self._buffer = self._buffer[len(part) :]
+                self._chunk_left -= len(part)
+                continue
+            line, end, rest = self._buffer.partition(b"\r\n")
+            if not end:
+                if len(self._buffer) > 64:
+                    raise NtripError("the caster's chunks are damaged")
+                break
+            self._buffer = rest
+            if not line:  # the end of the chunk before
+                continue
+            try:
+                size = int(line.split(b";")[0], 16)
+            except ValueError:
+                raise NtripError("the caster's chunks are damaged") from None
+            if size == 0:
+                raise NtripError("the caster has ended the stream")
+            if not 0 < size <= MAX_CHUNK:
+                raise NtripError("the caster's chunks are damaged")
+            self._chunk_left = size
+        return content
+
+
+def make_gga(sample: GpsSample, time_of_day_us: int) -> bytes:
+    """Return the sentence by which a network of stations computes corrections for the place of a fix."""
+    height = sample.height_msl if sample.height_msl == sample.height_msl else sample.height_ellipsoidal
+    place = (*nmea.format_angle(sample.latitude_deg, "NS", 2), *nmea.format_angle(sample.longitude_deg, "EW", 3))
+    heights = (nmea.format_number(height if height == height else 0.0, 2), "M", "0.0", "M")
+    quality = ("1", str(max(sample.satellites, 4)), "1.0")
+    return nmea.encode("GP", "GGA", (nmea.format_time_of_day(time_of_day_us), *place, *quality, *heights, "", ""))
+
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +225,6 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 """Delays before another attempt, doubled each time."""
 MAX_WAITING: Final = 256
 """Frames that wait for the driver; of more the oldest are lost: old corrections are of no use."""
-DAY_US: Final = 86_400_000_000
 
 
 class CorrectionsClient:
@@ -112,19 +305,17 @@ class CorrectionsClient:
     def _receive(self) -> None:
         """Receive until the connection ends. Raises OSError, NtripError."""
         settings = self._settings
-        host, port = split_address(settings.caster)
-        request = NtripRequest(host, settings.mountpoint, settings.user, settings.password)
-        session = NtripSession(request)
-        with contextlib.closing(socket.create_connection((host, port), CONNECT_TIMEOUT_S)) as connection:
+        session, address = NtripSession(settings.mountpoint), split_address(settings.caster)
+        with contextlib.closing(socket.create_connection(address, CONNECT_TIMEOUT_S)) as connection:
             self._counts["connects"] += 1
-            connection.sendall(request.encode())
+            connection.sendall(encode_request(settings))
             connection.settimeout(POLL_S)
             last_s, gga_s = self._monotonic(), -1e9
             while not self._is_stopping.is_set():
                 now = self._monotonic()
                 if session.is_answered and settings.gga_period and now - gga_s >= settings.gga_period and self._place:
                     gga_s = now
-                    connection.sendall(_make_position(self._place))
+                    connection.sendall(make_gga(self._place, (time.time_ns() // 1000) % DAY))
                 try:
                     data = connection.recv(4096)
                 except TimeoutError:
@@ -154,11 +345,3 @@ class CorrectionsClient:
         if text != self._reported:
             self._reported = text
             log.warning("%s: %s", self._name, text)
-
-
-def _make_position(sample: GpsSample) -> bytes:
-    height = sample.height_msl if sample.height_msl == sample.height_msl else sample.height_ellipsoidal
-    height = height if height == height else 0.0
-    return make_gga(
-        sample.latitude_deg, sample.longitude_deg, height, sample.satellites, (time.time_ns() // 1000) % DAY_US
-    )

@@ -1,14 +1,18 @@
-"""Interface of an endpoint: the sans-I/O protocol object at one end of a device line.
+"""Interface of an endpoint: the sans-I/O protocol object at one end of a device line, and the units that lines carry.
 
 A driver is an endpoint, and so is the emulator of its device. An endpoint neither opens a port nor reads a clock: it
-gets received units (bytes, CAN frames, Modbus messages) and timer events, and returns outputs: what to send, samples,
-status, or a request to reopen the line. The runner does the I/O, so every decision can be tested with scripted times.
+gets received units and timer events, and returns outputs: what to send, samples, status, or a request to reopen the
+line. The runner does the I/O, so every decision can be tested with scripted times.
+
+A unit is bytes, a CAN frame, or a Modbus request, reply or failure (MODBUS Application Protocol Specification V1.1b3).
+Modbus addresses are those of the protocol, from 0; manuals that number holding registers from 40001 mean address 0 by
+it. `transaction` ties a reply to its request, as the header of Modbus/TCP does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -124,3 +128,157 @@ class HasMaxSilence(Protocol):
     @property
     def max_silence(self) -> float:
         """Longest normal silence in seconds; inf where no data is expected."""
+
+
+BUS_OFF = 0x40
+"""Class of error in the identifier of an error frame, as Linux gives it (linux/can/error.h, CAN_ERR_BUSOFF)."""
+
+
+class FrameKey(NamedTuple):
+    """Identifier of a kind of frame."""
+
+    arbitration_id: int
+    is_extended: bool = False
+
+    def __str__(self) -> str:
+        return f"0x{self.arbitration_id:08X}" if self.is_extended else f"0x{self.arbitration_id:03X}"
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """A data frame, or with `is_error` an error frame of the interface.
+
+    In an error frame `arbitration_id` holds the error classes. `utime`: receive time by the host's clock, microseconds;
+    0: unknown. Frames are compared by content only.
+    """
+
+    arbitration_id: int
+    data: bytes = b""
+    is_extended: bool = False
+    is_error: bool = False
+    utime: int = field(default=0, compare=False)
+
+    @property
+    def key(self) -> FrameKey:
+        return FrameKey(self.arbitration_id, self.is_extended)
+
+    @property
+    def is_bus_off(self) -> bool:
+        """Whether the interface reports bus-off: too many of its frames failed."""
+        return self.is_error and bool(self.arbitration_id & BUS_OFF)
+
+
+def make_bus_off_frame() -> CanFrame:
+    """Make the error frame of an interface that went bus-off."""
+    return CanFrame(BUS_OFF, is_error=True)
+
+
+MAX_READ = 125
+MAX_WRITE = 123
+"""Registers in one request."""
+
+LAST_ADDRESS = 0xFFFF
+
+
+class RegisterTable(Enum):
+    """Table of a register; each table has its own addresses."""
+
+    HOLDING = "holding"
+    """Read and written (functions 3 and 16)."""
+    INPUT = "input"
+    """Only read (function 4)."""
+
+
+class FailureKind(Enum):
+    """Why there is no reply."""
+
+    EXCEPTION = "exception"
+    """The device rejected the request; see `code`."""
+    TIMEOUT = "silence"
+    """No reply in time."""
+    LINE = "line"
+    """The line failed, or the data was not Modbus."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRegisters:
+    """Read `count` registers from `address` on."""
+
+    address: int
+    count: int
+    table: RegisterTable = RegisterTable.HOLDING
+    transaction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WriteRegisters:
+    """Write registers from `address` on: numbers 0..65535."""
+
+    address: int
+    values: tuple[int, ...]
+    transaction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Registers:
+    """The requested registers: numbers 0..65535 from `address` on."""
+
+    address: int
+    values: tuple[int, ...]
+    transaction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RegistersWritten:
+    """`count` registers were written from `address` on."""
+
+    address: int
+    count: int
+    transaction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusFailure:
+    """A request without reply; `code` is the device's for an EXCEPTION."""
+
+    kind: FailureKind
+    text: str = ""
+    code: int = 0
+    transaction: int = 0
+
+
+ModbusUnit: TypeAlias = ReadRegisters | WriteRegisters | Registers | RegistersWritten | ModbusFailure
+
+EXCEPTION_TEXTS = {
+    1: "it does not know the function: use the other table (holding, input)",
+    2: "it has no such register: check the addresses in the settings against its manual, which may count from 1",
+    3: "it does not take the value or the count of registers: check limits and rate against its manual",
+    4: "it failed at the task: look at the device itself",
+    5: "it needs time for the task",
+    6: "it is busy",
+    8: "its memory is damaged: look at the device itself",
+    10: "the gateway has no path to it: check the device's number (unit id)",
+    11: "the gateway gets no reply from it: check its power and its number (unit id)",
+}
+"""Meaning of the exception codes (MODBUS Application Protocol V1.1b3, 7)."""
+
+
+def explain_exception(code: int) -> str:
+    return f"exception {code}: {EXCEPTION_TEXTS.get(code, 'a code that the standard does not have; see its manual')}"
+
+
+def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bool:
+    """Return whether a unit is a reply to a request: of its kind, with its address and number of registers."""
+    if isinstance(request, ReadRegisters):
+        return (
+            isinstance(unit, Registers)
+            and (unit.address, len(unit.values)) == (request.address, request.count)
+            and all(0 <= value <= 0xFFFF for value in unit.values)
+        )
+    return isinstance(unit, RegistersWritten) and (unit.address, unit.count) == (request.address, len(request.values))
+
+
+def describe_request(request: ReadRegisters | WriteRegisters) -> str:
+    if isinstance(request, ReadRegisters):
+        return f"reading {request.count} {request.table.value} registers from {request.address}"
+    return f"writing {len(request.values)} registers from {request.address}"

@@ -20,16 +20,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TextIO, TypeVar
+from typing import Generic, NamedTuple, Protocol, TextIO
 
 from modelserver.errors import RecordingError
 from modelserver.files import NotRegularFileError, open_regular
-from msdrivers.endpoint import HostTime
+from msdrivers.endpoint import HostTime, U
 from msdrivers.links import EndOfRecordingError, Link, LinkWrapper
 
 log = logging.getLogger(__name__)
-
-U = TypeVar("U")
 
 MAGIC = "# modelserver raw 1 "
 
@@ -89,7 +87,6 @@ class RawWriter:
     dropped: int = 0
 
     def begin(self, kind: str, source: str, device: str) -> None:
-        """Write the first line."""
         self._put(f"{MAGIC}{kind} {source} {device}\n")
 
     def record(self, way: RecordDirection, now: HostTime, data: bytes) -> None:
@@ -236,13 +233,11 @@ class RecordingLink(LinkWrapper[U]):
         self._is_open = False
 
     def open(self, baud: int | None = None) -> None:
-        """Open the line. Raises LinkError."""
         self._link.open(baud)
         self._is_open = True
         self._record(RecordDirection.EVENT, f"open {self.description} {self.baud}".encode())
 
     def close(self) -> None:
-        """Close the line."""
         self._link.close()
         # one that cannot be opened is closed each time that it was tried
         if self._is_open:
@@ -250,14 +245,12 @@ class RecordingLink(LinkWrapper[U]):
         self._is_open = False
 
     def poll(self, timeout: float) -> Sequence[U]:
-        """Return received units. Raises LinkError."""
         units = self._link.poll(timeout)
         for unit in units:
             self._record(RecordDirection.RECEIVED, self._codec.pack(unit))
         return units
 
     def send(self, unit: U) -> None:
-        """Send a unit. Raises LinkError."""
         self._link.send(unit)
         self._record(RecordDirection.SENT, self._codec.pack(unit))
 
@@ -283,10 +276,10 @@ class ReplayLink(Generic[U]):
         self._replay_offset_ns: int | None = None
 
     def open(self, baud: int | None = None) -> None:
-        """Begin, or go on."""
+        pass
 
     def close(self) -> None:
-        """Stop."""
+        pass
 
     def poll(self, timeout: float) -> Sequence[U]:
         """Return what is due, waiting `timeout` seconds at most.
@@ -316,7 +309,7 @@ class ReplayLink(Generic[U]):
         return (unit,)
 
     def send(self, unit: U) -> None:
-        """Send nothing."""
+        pass
 
     def _make_end_error(self) -> EndOfRecordingError | RecordingError:
         damaged = self._reader.damaged + self._unreadable

@@ -1,27 +1,199 @@
-"""Registry of the kinds of devices: settings, lines, drivers, emulators.
+"""The kinds of devices: one table of name, lines, settings, driver and emulator; and the settings of a line.
 
-A kind's modules are imported on demand, so that a driver does not load those of other devices.
+A kind's modules are named in the table and imported on demand, so that a driver does not load those of other devices.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from importlib import import_module
+from ipaddress import ip_address
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.plugins import PluginRegistry
-from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault
+from msdrivers.emulate import FAULT_AMOUNTS, FaultInjector, InjectedFault
 from msdrivers.endpoint import Endpoint
-from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 
 if TYPE_CHECKING:
-    from msdrivers.protocol.can.database import CanDatabase
+    from msdrivers.devices.can import CanDatabase
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """A serial port: its path, and symbols a second; 0: what the device has from its maker."""
+
+    description: ClassVar[str] = "a serial port"
+    port: str
+    baud: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.port:
+            raise ValueError("port is the path of a serial port, e.g. /dev/ttyUSB0; modelserver driver --list")
+        if self.baud and not 50 <= self.baud <= 4_000_000:
+            raise ValueError(f"baud is between 50 and 4000000, got {self.baud}")
+
+    def __str__(self) -> str:
+        return f"{self.port}, {self.baud} baud" if self.baud else self.port
+
+
+@dataclass(frozen=True, slots=True)
+class TcpSettings:
+    """A device server: `HOST:PORT`."""
+
+    description: ClassVar[str] = "a server"
+    address: str
+
+    def __post_init__(self) -> None:
+        split_address(self.address)
+
+    def __str__(self) -> str:
+        return f"TCP {self.address}"
+
+
+@dataclass(frozen=True, slots=True)
+class CanSettings:
+    """A CAN bus: its channel as its interface names it, python-can's name of the interface, bits a second.
+
+    bitrate 0: the interface is set up already, as socketcan's are by `ip link`.
+    """
+
+    description: ClassVar[str] = "a CAN bus"
+    can: str
+    interface: str = "socketcan"
+    bitrate: int = 0
+
+    def __post_init__(self) -> None:
+        if why := find_interface_problem(self.interface):
+            raise ValueError(f"interface {why}")
+        if why := find_channel_problem(self.can, self.interface):
+            raise ValueError(f"can {why}")
+        if not 0 <= self.bitrate <= 10_000_000:
+            raise ValueError(f"bitrate is 0 (set up already) to 10000000 bits a second, got {self.bitrate}")
+
+    def __str__(self) -> str:
+        return f"{self.interface} {self.can}" + (f", {self.bitrate} bit/s" if self.bitrate else "")
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusSettings:
+    """A Modbus/TCP server: `HOST:PORT`, the port customarily 502, and the number of the device behind it."""
+
+    description: ClassVar[str] = "a server"
+    address: str
+    unit_id: int = 1
+
+    def __post_init__(self) -> None:
+        split_address(self.address)
+        if not 0 <= self.unit_id <= 255:
+            raise ValueError(f"unit_id is between 0 and 255, got {self.unit_id}")
+
+    def __str__(self) -> str:
+        return f"Modbus {self.address}, unit {self.unit_id}"
+
+
+@dataclass(frozen=True, slots=True)
+class NtripSettings:
+    """A caster and its mountpoint. Raises ValueError for an invalid value."""
+
+    caster: str
+    """`HOST:PORT` of the caster; the port is customarily 2101."""
+    mountpoint: str
+    """Name of the stream."""
+    user: str = ""
+    """User name; empty for none."""
+    password: str = ""
+    """Password."""
+    gga_period: float = 0.0
+    """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; 0: none."""
+
+    def __post_init__(self) -> None:
+        try:
+            split_address(self.caster)
+        except ValueError:
+            raise ValueError(f"caster is HOST:PORT, e.g. rtk.example.org:2101, got {quote(self.caster)}") from None
+        if not self.mountpoint or not self.mountpoint.isprintable() or set(self.mountpoint) & set(" /\r\n"):
+            raise ValueError(f"mountpoint is the name of a stream, got {quote(self.mountpoint)}")
+        if not (self.gga_period == 0.0 or 1.0 <= self.gga_period <= 3600.0):
+            raise ValueError(f"gga_period is 0 or 1 to 3600 s, got {self.gga_period:g}")
+
+
+LineSettings: TypeAlias = SerialSettings | TcpSettings | CanSettings | ModbusSettings
+
+
+def get_line_key(kind: type[LineSettings]) -> str:
+    return dataclasses.fields(kind)[0].name
+
+
+def split_address(address: str) -> tuple[str, int]:
+    """Return host and port of `HOST:PORT`. Raises ValueError."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f"address is HOST:PORT, e.g. 192.168.1.10:3001, got {quote(address)}")
+    return host.strip("[]"), int(port)
+
+
+MULTICAST = "udp_multicast"
+"""The interface that carries frames over UDP, for trials without hardware: its channel is GROUP:PORT."""
+
+MULTICAST_PORT = 43113
+"""python-can's own, where a channel names none."""
+
+MAX_INTERFACE_NAME = 15
+"""Characters in the name of a network interface, IFNAMSIZ - 1 in linux/if.h."""
+
+
+def find_interface_problem(interface: str) -> str:
+    """Return why python-can has no interface of a name; empty where it has one."""
+    from can import VALID_INTERFACES
+
+    if interface in VALID_INTERFACES:
+        return ""
+    near = suggest_name(interface, VALID_INTERFACES)
+    fix = f"write {near[0]}" if near else f"known: {', '.join(sorted(VALID_INTERFACES))}"
+    return f"{quote(interface)} is no interface of python-can's; {fix}"
+
+
+def find_channel_problem(channel: str, interface: str) -> str:
+    """Return why a CAN interface cannot have a channel; empty where it can, or nothing is known of its channels."""
+    try:
+        split_group(channel)
+        why = ""
+    except ValueError as error:
+        why = str(error)
+    if interface == MULTICAST:
+        return why
+    if interface != "socketcan":
+        return "" if channel else "is the channel as the interface names it, got nothing"
+    if not why:
+        fix = f"add interface: {MULTICAST}, or to modelserver emulate --interface {MULTICAST}"
+        return f"{quote(channel)} is a group of IP multicast; {fix}"
+    if not 0 < len(channel) <= MAX_INTERFACE_NAME or not channel.isprintable() or set(channel) & set("/: "):
+        return f"is the name of a network interface, e.g. can0, got {quote(channel)}"
+    return ""
+
+
+def split_group(channel: str) -> tuple[str, int]:
+    """Return group and port of `GROUP:PORT` or `GROUP`; IPv6 with a port is `[GROUP]:PORT`. Raises ValueError."""
+    found = _GROUP_PORT.fullmatch(channel)
+    group, port = (found[1] or found[2], int(found[3] or MULTICAST_PORT)) if found else (channel, MULTICAST_PORT)
+    try:
+        is_group = ip_address(group).is_multicast
+    except ValueError:
+        is_group = False
+    if not is_group or not 0 < port < 65536:
+        raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {quote(channel)}")
+    return group, port
+
+
+_GROUP_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::([0-9]{1,5}))?")
+"""IPv6 in brackets, or a group without a colon; an IPv6 group alone has none of either."""
 
 CHANNELS: Mapping[type[Sample], str] = {
     GpsSample: "GPS",
@@ -85,111 +257,37 @@ class DeviceKind:
     takes_corrections: bool = False
 
 
-def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
-    """Import the settings and the driver of a kind by their names below `msdrivers.devices`."""
-    kind, make = (resolve_name(f"msdrivers.devices.{name}") for name in (settings, driver))
-    return DeviceModules(kind, lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])))
+def _load(module: str, prefix: str, has_dbc: bool = False) -> Callable[[], DeviceModules]:
+    """Return a function that imports the settings and the driver of a kind, below `msdrivers.devices`."""
+
+    def load() -> DeviceModules:
+        device = import_module(f"msdrivers.devices.{module}")
+        make = getattr(device, f"{prefix}Driver")
+        return DeviceModules(
+            getattr(device, f"{prefix}Settings"),
+            lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])),
+        )
+
+    return load
 
 
-_load_gps = partial(_load, "gps.settings:GpsSettings", "gps.driver:GpsDriver")
-_load_ublox = partial(_load, "ublox:UbloxSettings", "ublox:UbloxDriver")
-_load_vectornav = partial(_load, "vectornav:VectornavSettings", "vectornav:VectornavDriver")
-_load_xsens = partial(_load, "xsens:XsensSettings", "xsens:XsensDriver")
-_load_gpsd = partial(_load, "gpsd:GpsdSettings", "gpsd:GpsdDriver")
-_load_text_imu = partial(_load, "text_imu:TextImuSettings", "text_imu:TextImuDriver")
-_load_text_joints = partial(_load, "text_joints:TextJointsSettings", "text_joints:TextJointsDriver")
-_load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
-_load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
-_load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
-_load_axis = partial(_load, "axis:AxisSettings", "axis:AxisDriver")
+def _emulate(
+    module: str, make: Callable[[Any, EmulatorInputs], Endpoint[Any]]
+) -> Callable[[EmulatorInputs], Endpoint[Any]]:
+    """Return a function that imports a module below `msdrivers.emulate` and makes the emulator of a kind."""
 
+    def make_emulator(inputs: EmulatorInputs) -> Endpoint[Any]:
+        emulators = import_module(f"msdrivers.emulate.{module}")
+        # one series for the device before and after a restart
+        inputs = inputs._replace(samples=iter(inputs.samples))
+        return FaultInjector(lambda: make(emulators, inputs), inputs.faults)
 
-def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-
-    unit = GpsUnit()
-    if wanted.settings.protocol == "nmea":
-        period = 1.0 / wanted.settings.rate_hz
-        saved = tuple(f"log com1 {sentence} ontime {period:g}" for sentence in ("gpgga", "gprmc", "gpgst"))
-        unit = GpsUnit(saved=saved, is_answering=False)
-    # one series for the receiver before and after a restart
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: GpsEmulator(samples, unit), wanted.faults)
-
-
-def _make_ublox_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.ublox import UbloxEmulator, UbloxUnit
-
-    unit = UbloxUnit()
-    # one series for the receiver before and after a restart
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: UbloxEmulator(samples, unit), wanted.faults)
-
-
-def _make_gpsd_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gpsd import GpsdEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: GpsdEmulator(samples), wanted.faults)
-
-
-def _make_text_imu_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.text_imu import TextImuEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: TextImuEmulator(samples, wanted.settings), wanted.faults)
-
-
-def _make_text_joints_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.text_joints import TextJointsEmulator
-
-    return FaultInjector(lambda: TextJointsEmulator(wanted.settings), wanted.faults)
-
-
-def _make_vectornav_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vectornav import VectornavEmulator
-
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: VectornavEmulator(samples), wanted.faults)
-
-
-def _make_xsens_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.xsens import XsensEmulator, XsensUnit
-
-    unit = XsensUnit(field_strength=wanted.settings.field_strength or 5e-5)
-    samples = iter(wanted.samples)
-    return FaultInjector(lambda: XsensEmulator(samples, unit), wanted.faults)
-
-
-def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gx1 import Gx1Emulator, Gx1Unit
-
-    return Gx1Emulator(wanted.samples, unit=Gx1Unit(faults=wanted.faults))
-
-
-def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.wheels import WheelsEmulator
-
-    database = _load_dbc(wanted.settings, wanted.folder)
-    return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, wanted.faults)
-
-
-def _make_vehicle_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.vehicle import VehicleEmulator
-
-    settings, database = wanted.settings, _load_dbc(wanted.settings, wanted.folder)
-    return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=wanted.faults)
-
-
-def _make_axis_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.axis import AxisEmulator
-
-    return AxisEmulator(wanted.settings.registers, faults=wanted.faults)
+    return make_emulator
 
 
 def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
     """Load the DBC file of a driver's settings. Raises ConfigError."""
-    from msdrivers.protocol.can.dbc_file import MAX_DBC_CHARS, parse_dbc
+    from msdrivers.devices.can import MAX_DBC_CHARS, parse_dbc
 
     path = Path(settings.dbc)
     file = folder / path.expanduser()
@@ -217,8 +315,8 @@ _KINDS = (
         "u-blox receiver, by its protocol UBX",
         GpsSample,
         _BYTE_LINES,
-        _load_ublox,
-        _make_ublox_emulator,
+        _load("ublox", "Ublox"),
+        _emulate("gps", lambda emulators, inputs: emulators.UbloxEmulator(inputs.samples)),
         38400,
         takes_corrections=True,
     ),
@@ -228,8 +326,8 @@ _KINDS = (
             text,
             GpsSample,
             _BYTE_LINES,
-            _load_gps,
-            _make_gps_emulator,
+            _load("gps.driver", "Gps"),
+            _emulate("gps", lambda emulators, inputs: emulators.make_gps_emulator(inputs.settings, inputs.samples)),
             baud,
             presets={"protocol": name},
             takes_corrections=True,
@@ -239,16 +337,23 @@ _KINDS = (
             ("nmea", "receiver that speaks NMEA 0183", 4800),
         )
     ),
-    DeviceKind("gpsd", "gpsd, by its JSON reports", GpsSample, (TcpSettings,), _load_gpsd, _make_gpsd_emulator),
+    DeviceKind(
+        "gpsd",
+        "gpsd, by its JSON reports",
+        GpsSample,
+        (TcpSettings,),
+        _load("gpsd", "Gpsd"),
+        _emulate("gps", lambda emulators, inputs: emulators.GpsdEmulator(inputs.samples)),
+    ),
     DeviceKind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_gx1,
-        _make_gx1_emulator,
+        _load("gx1.driver", "Gx1"),
+        _emulate("imu", lambda emulators, inputs: emulators.Gx1Emulator(inputs.samples)),
         38400,
-        faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
+        faults={**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"},
         has_z_down=True,
     ),
     DeviceKind(
@@ -256,8 +361,8 @@ _KINDS = (
         "VectorNav VN-100 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_vectornav,
-        _make_vectornav_emulator,
+        _load("vectornav", "Vectornav"),
+        _emulate("imu", lambda emulators, inputs: emulators.VectornavEmulator(inputs.samples)),
         115200,
         has_z_down=True,
     ),
@@ -266,8 +371,13 @@ _KINDS = (
         "Xsens MTi inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load_xsens,
-        _make_xsens_emulator,
+        _load("xsens", "Xsens"),
+        _emulate(
+            "imu",
+            lambda emulators, inputs: emulators.XsensEmulator(
+                inputs.samples, field_strength=inputs.settings.field_strength or 5e-5
+            ),
+        ),
         115200,
     ),
     DeviceKind(
@@ -275,8 +385,8 @@ _KINDS = (
         "inertial unit that sends lines of text",
         ImuSample,
         _BYTE_LINES,
-        _load_text_imu,
-        _make_text_imu_emulator,
+        _load("text", "TextImu"),
+        _emulate("imu", lambda emulators, inputs: emulators.TextImuEmulator(inputs.samples, inputs.settings)),
         115200,
         example=(
             "columns: 7   # MEASURE: the columns of a line: time, force x y z, rate x y z",
@@ -295,8 +405,13 @@ _KINDS = (
         "wheels on a CAN bus, by a DBC file",
         WheelsSample,
         (CanSettings,),
-        _load_wheels,
-        _make_wheels_emulator,
+        _load("wheels", "Wheels", True),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.WheelsEmulator(
+                inputs.settings.wheels, _load_dbc(inputs.settings, inputs.folder), inputs.samples
+            ),
+        ),
         faults=_CAN_FAULTS,
     ),
     DeviceKind(
@@ -304,8 +419,16 @@ _KINDS = (
         "vehicle controller on a CAN bus, by a DBC file",
         VehicleStatusSample,
         (CanSettings,),
-        _load_vehicle,
-        _make_vehicle_emulator,
+        _load("vehicle", "Vehicle", True),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.VehicleEmulator(
+                _load_dbc(inputs.settings, inputs.folder),
+                inputs.settings.status,
+                inputs.settings.command,
+                samples=inputs.samples,
+            ),
+        ),
         command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
     ),
@@ -314,8 +437,8 @@ _KINDS = (
         "pan-tilt head or other joints that send lines of text",
         JointsSample,
         _BYTE_LINES,
-        _load_text_joints,
-        _make_text_joints_emulator,
+        _load("text", "TextJoints"),
+        _emulate("vehicle", lambda emulators, inputs: emulators.TextJointsEmulator(inputs.settings)),
         115200,
         follows_samples=False,
     ),
@@ -324,8 +447,11 @@ _KINDS = (
         "nodding axis behind Modbus/TCP",
         JointsSample,
         (ModbusSettings,),
-        _load_axis,
-        _make_axis_emulator,
+        _load("axis", "Axis"),
+        _emulate(
+            "vehicle",
+            lambda emulators, inputs: emulators.AxisEmulator(inputs.settings.registers),
+        ),
         follows_samples=False,
         faults={
             **FAULT_AMOUNTS,

@@ -5,19 +5,27 @@ deadline of the endpoint or of the health report, pass on received units, fire t
 
 Reconnect: the wait doubles from `min_backoff` to `max_backoff` with 20 % jitter and is reset once the line was open for
 5 s. Errors of the endpoint are counted and logged and the driver continues; errors of the link close the line.
+
+Health (`HealthReporter`): regular reports to DRIVER_HEALTH, and changes of status to the log, both rate limited.
+
+Signed commands (`DriveVerifier`) are verified before they reach the endpoint: a stranger on the bus cannot drive.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic
 
-from modelserver.messages import DriverHealth, DriverPhase, Sample, VehicleCommand
+from modelserver.errors import WireError, quote
+from modelserver.messages import NAN, DriverHealth, DriverPhase, Envelope, Sample, VehicleCommand
+from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.wire.codec import decode, encode
 from msdrivers.device_clock import DeviceClock, Stamper
 from msdrivers.endpoint import (
     CommandableEndpoint,
@@ -29,10 +37,153 @@ from msdrivers.endpoint import (
     Output,
     Reopen,
     Send,
+    U,
 )
-from msdrivers.health import HealthReporter
-from msdrivers.links import EndOfRecordingError, GuardedLink, Link, LinkError
+from msdrivers.links import EndOfRecordingError, Link, LinkError
 from msdrivers.raw_log import TimeSource
+from msdrivers.registry import CHANNELS
+
+HEALTH_CHANNEL = "DRIVER_HEALTH"
+
+
+@dataclass(frozen=True, slots=True)
+class DriverPublisher:
+    """Encodes and publishes messages. channels: by type of sample, without prefix; default `CHANNELS`."""
+
+    send: Callable[[str, bytes], object]
+    channels: Mapping[type, str]
+    prefix: str = ""
+
+    def publish_sample(self, sample: Sample) -> None:
+        kind = type(sample)
+        self.send(f"{self.prefix}{self.channels.get(kind) or CHANNELS[kind]}", encode(sample))
+
+    def publish_health(self, health: DriverHealth) -> None:
+        self.send(f"{self.prefix}{HEALTH_CHANNEL}", encode(health))
+
+
+log = logging.getLogger(__name__)
+
+MAX_CHANGES_PER_PERIOD = 10
+"""Rate limit: changes that are logged and reported between two regular reports."""
+
+MAX_COUNTED_STATES = 100
+"""Different states of an unstable line whose repetitions are counted."""
+
+WARNING_LIFETIME_NS = 60_000_000_000
+"""How long a warning is shown as the likely cause of a silence."""
+
+
+class HealthReporter:
+    """Tracks the status of one driver and calls `send` when a report is due. Times in seconds.
+
+    While the line is unstable, the same state is logged only at its 1st, 10th, 100th repetition.
+    """
+
+    def __init__(self, source: str, silence: float, period: float, now: HostTime, send: Callable[[HostTime], object]):
+        self.samples = 0
+        self.rate_hz = 0.0
+        self.is_silent = False
+        """Nothing was received for `silence` seconds on an open line."""
+        self.is_ending = False
+        """The driver is stopping: a closed line is no warning then."""
+        self.next_report_ns = now.monotonic_ns
+        """Deadline of the next report, monotonic nanoseconds."""
+        self._source, self._silence, self._period_ns = source, silence, round(period * 1e9)
+        self._send = send
+        self._sample_ns: int | None = None
+        self._counted_ns, self._counted = now.monotonic_ns, 0
+        self._phase, self._text, self._suffix, self._is_warning = DriverPhase.CLOSED, "not opened yet", "", False
+        self._last_warning, self._last_warning_ns = "", 0
+        self._reported = self._logged = (DriverPhase.CLOSED, "")
+        self._changes = 0
+        self._is_stable = False
+        self._repetitions: Counter[tuple[DriverPhase, str, bool]] = Counter()
+
+    @property
+    def state(self) -> tuple[DriverPhase, str]:
+        phase, text = self._phase, self._text
+        # an endpoint that reports silence itself knows the cause better
+        if self.is_silent and phase is not DriverPhase.SILENT:
+            phase, text = DriverPhase.SILENT, f"nothing received for {self._silence:g} s"
+        if phase is DriverPhase.SILENT and self._last_warning not in text:
+            text += f"; before that: {self._last_warning}"
+        return phase, text + self._suffix
+
+    def sample_age(self, now: HostTime) -> float:
+        """Return the seconds since the last sample; nan before the first."""
+        return NAN if self._sample_ns is None else (now.monotonic_ns - self._sample_ns) * 1e-9
+
+    def count_sample(self, now: HostTime) -> None:
+        self.samples += 1
+        self._sample_ns = now.monotonic_ns
+
+    def set_status(
+        self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False, suffix: str = ""
+    ) -> None:
+        """Set phase and text and report a change.
+
+        A warning is repeated with a silence that follows it, until data arrives or the line is reopened; a change of
+        `suffix` alone is not reported as a change.
+        """
+        if is_warning:
+            self._last_warning, self._last_warning_ns = text, now.monotonic_ns
+        elif phase in (DriverPhase.WAITING, DriverPhase.STREAMING):
+            self._last_warning = ""
+        self._phase, self._text, self._suffix, self._is_warning = phase, text, suffix, is_warning
+        self.report_change(now)
+
+    def set_stable(self, is_stable: bool) -> None:
+        """Set whether the line has been open for some time."""
+        if is_stable is not self._is_stable:
+            self._is_stable = is_stable
+            self._repetitions.clear()
+            if is_stable and self.state != self._logged:
+                self._log()
+
+    def report_change(self, now: HostTime) -> None:
+        """Log and report a change, if there is one."""
+        state = self.state
+        if state == self._reported:
+            return
+        self._reported = state
+        self._changes += 1
+        if self._changes > MAX_CHANGES_PER_PERIOD and not self.is_ending:
+            return
+        if self._is_stable or self.is_ending or self._is_logged_repetition():
+            self._log()
+        self._send(now)
+
+    def on_timer(self, now: HostTime) -> None:
+        """Send the regular report if it is due."""
+        if now.monotonic_ns - self._last_warning_ns > WARNING_LIFETIME_NS:
+            self._last_warning = ""
+        if now.monotonic_ns < self.next_report_ns:
+            return
+        if self._changes > MAX_CHANGES_PER_PERIOD and self._is_stable and self.state != self._logged:
+            self._log()
+        self._changes = 0
+        self.next_report_ns = now.monotonic_ns + self._period_ns
+        since = (now.monotonic_ns - self._counted_ns) * 1e-9
+        self.rate_hz = (self.samples - self._counted) / since if since > 0 else 0.0
+        self._counted_ns, self._counted = now.monotonic_ns, self.samples
+        self._send(now)
+
+    def _is_logged_repetition(self) -> bool:
+        """Count the present state; return whether this is its 1st, 10th, 100th repetition."""
+        if len(self._repetitions) >= MAX_COUNTED_STATES:
+            self._repetitions.clear()
+        state = (self.state[0], self._text, bool(self._suffix))
+        self._repetitions[state] += 1
+        return str(self._repetitions[state]).strip("0") == "1"
+
+    def _log(self) -> None:
+        self._logged = self.state
+        phase, text = self._logged
+        bad = phase is DriverPhase.SILENT or (phase is DriverPhase.CLOSED and not self.is_ending)
+        level = logging.WARNING if bad or self._is_warning else logging.INFO
+        log.log(level, "%s: %s%s", self._source, phase.name.lower(), f": {text}" if text else "")
+
 
 STABLE_NS = 5_000_000_000
 """A line that was open for this long is stable; one that is lost earlier counts as a failed attempt."""
@@ -88,10 +239,6 @@ class ReconnectBackoff:
         seconds = (at_ns - self._failing_since_ns) * 1e-9
         return f"; opened and closed {self._failures} times in {seconds:.0f} s: does another program use it?"
 
-
-log = logging.getLogger(__name__)
-
-U = TypeVar("U")
 
 MAX_COUNTERS = 200
 """Largest number of the endpoint's counters in a health report; the runner's own come on top."""
@@ -155,7 +302,7 @@ class Runner(Generic[U]):
         """Errors and dropped commands, by kind."""
         self.reconnects = 0
         self._endpoint, self._settings, self._time_source = endpoint, settings, time_source
-        self._link = GuardedLink(link, self._count_error)
+        self._link = link
         self._publish, self._publish_health = publish, publish_health
         self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
         max_silence = endpoint.max_silence if isinstance(endpoint, HasMaxSilence) else 0.0
@@ -235,7 +382,8 @@ class Runner(Generic[U]):
             self._time_source.sleep(min(wait, self._settings.poll_timeout))
             return
         try:
-            self._link.open(self._baud)
+            with self._guard_link("open"):
+                self._link.open(self._baud)
         except LinkError as error:
             self._on_link_error(error)
             return
@@ -276,14 +424,16 @@ class Runner(Generic[U]):
         self._reporter.set_stable(False)
 
     def _close_line(self) -> None:
-        self._link.close()
+        with contextlib.suppress(LinkError), self._guard_link("close"):
+            self._link.close()
         self._is_open = self._reporter.is_silent = False
 
     def _transfer(self) -> None:
         due = self._endpoint.get_deadline()
         now = self._time_source.now()
         next_ns = min(self._reporter.next_report_ns, due) if due is not None else self._reporter.next_report_ns
-        units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.poll_timeout))
+        with self._guard_link("poll"):
+            units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.poll_timeout))
         now = self._time_source.now()
         if units:
             self._received_ns, self._reporter.is_silent = now.monotonic_ns, False
@@ -304,6 +454,19 @@ class Runner(Generic[U]):
             self._count_error(what)
             return ()
 
+    @contextlib.contextmanager
+    def _guard_link(self, what: str) -> Iterator[None]:
+        """Turn any other exception of the link into a LinkError; it is counted and logged."""
+        try:
+            yield
+        except LinkError:
+            raise
+        except Exception as error:
+            self._count_error(f"link.{what}")
+            why = f"{type(error).__name__}: {quote(str(error), 100)}"
+            fix = "an error of the line's own, with its place in the log"
+            raise LinkError(self._link.description, why, fix) from error
+
     def _count_error(self, what: str) -> None:
         self.counts[f"errors.{what}"] += 1
         count = self.counts[f"errors.{what}"]
@@ -314,7 +477,8 @@ class Runner(Generic[U]):
     def _execute(self, outputs: Sequence[Output[U]]) -> None:
         for output in outputs:
             if isinstance(output, Send):
-                self._link.send(output.unit)
+                with self._guard_link("send"):
+                    self._link.send(output.unit)
             elif isinstance(output, MeasuredSample):
                 self._publish_sample(output)
             elif isinstance(output, EndpointStatus):
@@ -351,7 +515,6 @@ class Runner(Generic[U]):
             self._count_error("report")
 
     def make_health(self, now: HostTime) -> DriverHealth:
-        """Return the driver's health report."""
         phase, text = self._reporter.state
         clock = self._stamper.clock
         return DriverHealth(
@@ -382,3 +545,52 @@ class Runner(Generic[U]):
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._close_line()
         self._set_status(DriverPhase.CLOSED, self._close_reason)
+
+
+COMMAND_TYPE = "vehicle_command_t"
+
+
+class CommandDeniedError(Exception):
+    """A denied command: the name of its counter, and why."""
+
+    def __init__(self, reason: str, text: str):
+        super().__init__(text)
+        self.reason = reason
+
+
+class DriveVerifier:
+    """Verifies envelopes with commands for `channel` (without the vehicle's `prefix`).
+
+    `started_ns`: when the driver started, monotonic; a command that an earlier run could have accepted is denied.
+    """
+
+    def __init__(self, keys: Iterable[Key], prefix: str, channel: str, window_s: float, started_ns: int):
+        self._keys = {key.name: key for key in keys}
+        self._prefix, self._channel = prefix, channel
+        self._window_us = round(window_s * 1e6)
+        self._started_ns = started_ns
+        self._freshness = Freshness()
+
+    def verify(self, data: bytes, now: HostTime) -> VehicleCommand:
+        """Return the command in an envelope. Raises CommandDeniedError."""
+        try:
+            envelope: Envelope = decode("signed_t", data)
+        except WireError as error:
+            raise CommandDeniedError(error.reason, f"no signed message: {error}") from None
+        key = self._keys.get(envelope.key_name)
+        if key is None:
+            raise CommandDeniedError("unknown_key", "signed with a key that is not in the vehicle's key file")
+        if not has_valid_signature(key, self._prefix, envelope):
+            raise CommandDeniedError("bad_signature", "its signature is wrong: another key, or another vehicle")
+        if envelope.channel != self._channel:
+            raise CommandDeniedError("channel", f"it was signed for another channel than {self._channel}")
+        uptime_us = (now.monotonic_ns - self._started_ns) // 1000
+        check = check_freshness(self._freshness, envelope, now.utime, uptime_us, self._window_us)
+        self._freshness = check.freshness
+        if check.reason:
+            raise CommandDeniedError(check.reason, check.message)
+        try:
+            command: VehicleCommand = decode(COMMAND_TYPE, envelope.payload)
+        except WireError as error:
+            raise CommandDeniedError(error.reason, str(error)) from None
+        return command

@@ -1,26 +1,55 @@
-"""Read and validate the `drivers` section of a vehicle file.
+"""Read and validate the `drivers` section of a vehicle file, make what it describes, and check it against the rest.
 
     drivers:
       gps: {device: novatel, port: /dev/ttyUSB0, baud: 38400}
 
 `device` is the kind. The other keys follow from the dataclasses of the kind's lines and settings, which alone define
 names, types and limits. `SectionReader` validates a section as `modelserver.config.reader` does a file, and collects
-every problem with its line and fix.
+every problem with its line and fix. Of the settings drivers, emulators, links and codecs are made (`make_driver`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import struct
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, get_args
 
-from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
-from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
-from msdrivers.line_settings import LineSettings, NtripSettings, TcpSettings, get_line_key
-from msdrivers.registry import KINDS, DeviceKind
+from modelserver.config.reader import Path_, SettingsReader, get_adapter, get_value, list_known_keys
+from modelserver.errors import (
+    ConfigError,
+    Location,
+    Problem,
+    Severity,
+    Suggestion,
+    find_suggestion,
+    quote,
+    suggest_key,
+    suggest_name,
+)
+from msdrivers.emulate import InjectedFault
+from msdrivers.endpoint import CanFrame, Endpoint, ModbusUnit
+from msdrivers.links import Link
+from msdrivers.raw_log import BYTES_CODEC, UnitCodec
+from msdrivers.registry import (
+    KINDS,
+    CanSettings,
+    DeviceKind,
+    EmulatorInputs,
+    LineSettings,
+    ModbusSettings,
+    NtripSettings,
+    SerialSettings,
+    TcpSettings,
+    get_line_key,
+    split_address,
+)
 
 _LIST_ERRORS = ("tuple_type", "list_type")
 _SECTION_ERRORS = ("dataclass_type", "dict_type")
@@ -35,25 +64,6 @@ _EXPECTED = {
     **dict.fromkeys(_LIST_ERRORS, "a list"),
     **dict.fromkeys(_SECTION_ERRORS, "a section"),
 }
-
-
-def describe_error(detail: Any, keys: Sequence[str]) -> tuple[str, str, tuple[str, ...]]:
-    """Describe one of pydantic's errors: message, fix, nearest known names.
-
-    `keys` are those of the section that is expected there.
-    """
-    kind, got = detail["type"], detail.get("input")
-    *path, last = detail["loc"]
-    name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
-    actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
-    if kind in _CHOICE_ERRORS:
-        expected = detail["ctx"]["expected"]
-        near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
-        return f"{name} is {expected}{actual}", f"write {near[0]}" if near else "", near
-    if kind not in _EXPECTED:
-        message = str(detail["msg"])
-        return f"{name}: {message[:1].lower()}{message[1:]}{actual}", "", ()
-    return f"{name} is {_EXPECTED[kind]}{actual}", _suggest_fix(kind, got, keys), ()
 
 
 def _suggest_fix(kind: str, got: Any, keys: Sequence[str]) -> str:
@@ -191,8 +201,19 @@ class SectionReader(SettingsReader):
 
     def explain_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
         """Return suggestion, fix and message for a single wrong value."""
-        message, fix, near = describe_error(detail, list_known_keys(self.schema, tuple(detail["loc"])))
-        return near, fix, message
+        kind, got = detail["type"], detail.get("input")
+        *path, last = detail["loc"]
+        name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
+        actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
+        if kind in _CHOICE_ERRORS:
+            expected = detail["ctx"]["expected"]
+            near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
+            return near, f"write {near[0]}" if near else "", f"{name} is {expected}{actual}"
+        if kind not in _EXPECTED:
+            message = str(detail["msg"])
+            return (), "", f"{name}: {message[:1].lower()}{message[1:]}{actual}"
+        keys = list_known_keys(self.schema, tuple(detail["loc"]))
+        return (), _suggest_fix(kind, got, keys), f"{name} is {_EXPECTED[kind]}{actual}"
 
 
 def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
@@ -253,6 +274,11 @@ class DriverSettings:
     channel: str = ""
     source_map: SourceMap = field(default=SourceMap(), compare=False, repr=False)
     ntrip: NtripSettings | None = None
+
+    def make_warning(self, message: str, fix: str, *path: str, nearest: tuple[str, ...] = ()) -> Problem:
+        """Return a problem of the key at a path of the driver's section."""
+        source = self.source_map.locate("drivers", self.name, *path)
+        return Problem(Severity.WARNING, message, source, fix, nearest)
 
 
 def read_drivers(
@@ -325,3 +351,175 @@ NTRIP_FIELD = "ntrip"
 
 COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
 """Keys that every driver has."""
+
+_CAN_HEADER = struct.Struct(">IB")
+
+_EXTENDED_FLAG, _ERROR_FLAG = 1, 2
+
+
+def _pack_frame(frame: CanFrame) -> bytes:
+    flags = _EXTENDED_FLAG * frame.is_extended + _ERROR_FLAG * frame.is_error
+    return _CAN_HEADER.pack(frame.arbitration_id, flags) + frame.data
+
+
+def _unpack_frame(data: bytes) -> CanFrame:
+    if len(data) < _CAN_HEADER.size:
+        raise ValueError(f"{len(data)} bytes are no CAN frame")
+    identifier, flags = _CAN_HEADER.unpack_from(data)
+    return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
+
+
+def _pack_modbus(unit: ModbusUnit) -> bytes:
+    fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
+    return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
+
+
+def _unpack_modbus(data: bytes) -> ModbusUnit:
+    try:
+        name, fields = json.loads(data)
+        unit: ModbusUnit = get_adapter(_MODBUS_TYPES[name]).validate_python(fields)
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"no Modbus unit: {error}") from None
+    return unit
+
+
+_MODBUS_TYPES: Mapping[str, Any] = {kind.__name__: kind for kind in get_args(ModbusUnit)}
+
+CAN_CODEC = UnitCodec("can", _pack_frame, _unpack_frame)
+"""The identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); the data."""
+
+MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
+"""JSON of the unit's kind and fields."""
+
+
+def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
+    """Return how the units of a driver's line are recorded."""
+    if isinstance(settings.line, CanSettings):
+        return CAN_CODEC
+    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
+
+
+def make_link(settings: DriverSettings) -> Link[Any]:
+    """Return a driver's line, not opened yet."""
+    line = settings.line
+    # each kind of line needs another library, and some of them are slow to load
+    if isinstance(line, SerialSettings):
+        from msdrivers.links.serial_port import SerialLink
+
+        return SerialLink(line.port, choose_first_baud(settings))
+    if isinstance(line, CanSettings):
+        from msdrivers.links.can_bus import CanLink
+
+        return CanLink(line.can, line.interface, line.bitrate)
+    from msdrivers.links import TcpLink
+
+    link = TcpLink(*split_address(line.address))
+    if isinstance(line, TcpSettings):
+        return link
+    from msdrivers.links.modbus import ModbusLink
+
+    return ModbusLink(link, line.unit_id)
+
+
+def choose_first_baud(settings: DriverSettings) -> int:
+    """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
+    bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
+    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
+    return bauds[0] if bauds else given or settings.kind.baud
+
+
+def make_driver(driver: DriverSettings, folder: Path) -> Endpoint[Any]:
+    """Return a driver's station; paths in its settings start from `folder`. Raises ConfigError."""
+    with _locate_errors(driver):
+        return driver.kind.load().make_driver(driver.device_settings, folder)
+
+
+def make_emulator(
+    driver: DriverSettings,
+    folder: Path,
+    samples: Iterable[Any],
+    faults: tuple[InjectedFault, ...] = (),
+) -> Endpoint[Any]:
+    """Return the endpoint of the emulated device; see `EmulatorInputs`. Raises ConfigError."""
+    with _locate_errors(driver):
+        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults))
+
+
+@contextmanager
+def _locate_errors(driver: DriverSettings) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(driver.source_map.locate_problems(driver.name, error.problems)) from None
+
+
+def find_unbuildable_drivers(drivers: Iterable[DriverSettings], folder: Path) -> Iterator[Problem]:
+    """Yield the problems of drivers that cannot be made: a missing DBC file, an unknown signal; and of their files."""
+    for driver in drivers:
+        try:
+            yield from getattr(make_driver(driver, folder), "problems", ())
+        except ConfigError as error:
+            yield from error.problems
+
+
+def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
+    """Yield lines that several drivers use exclusively; a CAN bus can be shared."""
+    owners: dict[Hashable, str] = {}
+    for driver in drivers:
+        owned = _exclusive_resource(driver.line)
+        owner = driver.name if owned is None else owners.setdefault(owned, driver.name)
+        if owner != driver.name:
+            message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"
+            fix = "give each a line of its own, or start only one of them"
+            yield driver.make_warning(message, fix, get_line_key(type(driver.line)))
+
+
+def _exclusive_resource(line: LineSettings) -> Hashable | None:
+    if isinstance(line, CanSettings):
+        return None
+    if isinstance(line, SerialSettings):
+        # a port has several names, e.g. below /dev/serial/by-id/
+        return os.path.realpath(line.port)
+    return (line.address, line.unit_id) if isinstance(line, ModbusSettings) else line.address
+
+
+def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:
+    """Yield wheels that are not in `sensors.wheels.frames`; none if that is empty."""
+    wheels = tuple(getattr(driver.device_settings, "wheels", ()))
+    for name in wheels if frames else ():
+        if name in frames:
+            continue
+        what = f"sensors.wheels.frames has no {quote(name)}: what is measured of this wheel is not used"
+        # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
+        left = [frame for frame in frames if frame not in wheels]
+        near = find_suggestion(name, left)
+        if near:
+            fix = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
+        else:
+            fix = f"known: {', '.join(list(frames)[:10])}"
+        yield driver.make_warning(what, fix, "wheels", name)
+
+
+def find_backward_counters(driver: DriverSettings) -> Iterator[Problem]:
+    """Yield the wheels whose count falls as they roll forward."""
+    for name, wheel in getattr(driver.device_settings, "wheels", {}).items():
+        if wheel.count is not None and wheel.count.meters_per_count < 0.0:
+            why = (
+                f"wheel {name} rolls backward as its count rises: meters_per_count is {wheel.count.meters_per_count:g}"
+            )
+            fix = "right for an encoder that is mounted mirrored, else drop the sign"
+            yield driver.make_warning(why, fix, "wheels", name)
+
+
+def find_unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Iterator[Problem]:
+    """Yield the joints that are no constraints of the geometry."""
+    settings = driver.device_settings
+    places = {joint: ("joint",) for joint in [getattr(settings, "joint", "")] if joint}
+    places |= {joint: ("joints", joint) for joint in getattr(settings, "joints", ())}
+    for joint, place in places.items():
+        if joint in constraints:
+            continue
+        what = f"the geometry has no constraint {quote(joint)}: what is measured of this joint moves nothing"
+        near = suggest_name(joint, constraints)
+        fix = f"write {near[0]}" if near else f"known: {', '.join(list(constraints)[:10]) or 'none'}"
+        yield driver.make_warning(what, fix, *place, nearest=near)

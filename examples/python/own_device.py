@@ -13,12 +13,11 @@ from functools import reduce
 from operator import xor
 
 from modelserver.messages import NAN, Sample, SensorHeader, WheelSample, WheelsSample
-from msdrivers.emulate.faults import FaultInjector
+from msdrivers.devices.stream import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
+from msdrivers.emulate import FaultInjector
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
-from msdrivers.line_settings import SerialSettings, TcpSettings
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.framing import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
-from msdrivers.registry import DeviceKind, DeviceModules, EmulatorInputs
+from msdrivers.registry import DeviceKind, DeviceModules, EmulatorInputs, SerialSettings, TcpSettings
 from msdrivers.runner import Runner, RunnerSettings
 
 MAX_FRAME_LENGTH = 32

@@ -12,11 +12,9 @@ from hypothesis import strategies as st
 from support_gps import drive, split_randomly
 
 from modelserver.messages import GpsSample
-from msdrivers.emulate import gps as gps_logs
-from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
-from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.nmea.fields import format_angle, parse_angle
-from msdrivers.protocol.novatel import (
+from msdrivers.devices.gps.driver import GpsMessage, GpsStream
+from msdrivers.devices.gps.nmea import NmeaEpoch, format_angle, parse_angle
+from msdrivers.devices.gps.novatel import (
     LogHeader,
     NovatelLog,
     Position,
@@ -25,8 +23,10 @@ from msdrivers.protocol.novatel import (
     TimeStatus,
     UtmPosition,
     Velocity,
+    crc32,
+    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32, encode
+from msdrivers.emulate import gps as gps_logs
 
 MAX_PENDING = 1024
 ALL = (*gps_logs.NMEA, *(f"{log}{letter}" for log in gps_logs.NOVATEL for letter in "ab"))

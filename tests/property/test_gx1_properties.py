@@ -8,12 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support_gx1 import Line, RepeatingDevice, rotating_samples
 
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings
-from msdrivers.emulate.gx1 import Gx1Emulator
+from msdrivers.devices.gx1 import (
+    LAYOUTS,
+    MEASUREMENTS,
+    Gx1Packet,
+    Gx1Parser,
+    RequestParser,
+    TickUnwrapper,
+    decode_packet,
+)
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
+from msdrivers.emulate.imu import Gx1Emulator
 from msdrivers.endpoint import MeasuredSample
-from msdrivers.protocol.gx1 import LAYOUTS, MEASUREMENTS, Gx1Packet, Gx1Parser, TickUnwrapper, decode_packet
-from msdrivers.protocol.gx1.requests import RequestParser
 
 words = st.integers(-32768, 32767)
 

@@ -20,15 +20,12 @@ from support_vehicle_bus import (
 
 from modelserver.errors import ConfigError
 from modelserver.messages import VehicleCommand, VehicleStatusSample, WheelsSample
-from msdrivers.devices.vehicle import VehicleDriver
-from msdrivers.devices.wheels import WheelsDriver
-from msdrivers.emulate.axis import AxisEmulator, AxisUnit
-from msdrivers.endpoint import MeasuredSample, Send
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.can.odometer import Odometer
-from msdrivers.protocol.can.vehicle import bind_command
-from msdrivers.protocol.modbus.registers import ReadRegisters, RegisterMap, Registers
+from msdrivers.devices.axis import RegisterMap
+from msdrivers.devices.can import parse_dbc
+from msdrivers.devices.vehicle import VehicleDriver, bind_command
+from msdrivers.devices.wheels import Odometer, WheelsDriver
+from msdrivers.emulate.vehicle import AxisEmulator, AxisUnit
+from msdrivers.endpoint import CanFrame, MeasuredSample, ReadRegisters, Registers, Send
 
 DATABASE = raptor_dbc()
 COMMAND = bind_command(RAPTOR_COMMAND, DATABASE, "command")

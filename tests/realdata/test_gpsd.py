@@ -20,9 +20,9 @@ import pytest
 from support_gps import split_randomly
 
 from modelserver.messages import FixType
-from msdrivers.protocol.gps_stream import GpsStream
-from msdrivers.protocol.gps_time import ROLLOVER
-from msdrivers.protocol.nmea import NmeaEpoch
+from msdrivers.devices.gps import ROLLOVER
+from msdrivers.devices.gps.driver import GpsStream
+from msdrivers.devices.gps.nmea import NmeaEpoch
 
 pytestmark = pytest.mark.realdata
 

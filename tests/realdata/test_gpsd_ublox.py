@@ -9,7 +9,7 @@ from support_gps import Line, now_at
 
 from modelserver.messages import FixType
 from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
-from msdrivers.emulate.ublox import UbloxEmulator
+from msdrivers.emulate.gps import UbloxEmulator
 from tests.realdata.test_gpsd import reports, utime
 
 pytestmark = pytest.mark.realdata

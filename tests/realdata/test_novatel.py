@@ -10,10 +10,9 @@ import pytest
 from support_gps import split_randomly
 from support_pcap import streams
 
-from msdrivers.devices.gps.fixes import FIX_TYPES
-from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
-from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.novatel import NovatelLog, Position, Prompt, TimeStatus, UtmPosition
+from msdrivers.devices.gps.driver import FIX_TYPES, GpsMessage, GpsStream
+from msdrivers.devices.gps.nmea import NmeaEpoch
+from msdrivers.devices.gps.novatel import NovatelLog, Position, Prompt, TimeStatus, UtmPosition
 
 pytestmark = pytest.mark.realdata
 

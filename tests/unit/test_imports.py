@@ -20,7 +20,7 @@ FILES = {"files"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "files"}
 SIGNING = {"signing", "key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
-DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
+DRIVERS = {"msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
 TOOLS = {
     # each imports only those before it
     "terminal": set(),
@@ -67,10 +67,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "wire": WIRE,
     "server": SERVER,
     "client": WIRE | GEOMETRY | POSES | SIGNING | {"formats", "joints", "query"},
-    "msdrivers.protocol": VALUES | {"messages"},
     "msdrivers.endpoint": VALUES | {"messages"},
-    "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.endpoint"},
-    "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.endpoint"},
+    "msdrivers.devices": VALUES | {"messages", "msdrivers.endpoint"},
+    "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.devices", "msdrivers.endpoint"},
     "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing"},
     "mslcm": set(),
     **{f"mstools.{name}": BELOW_TOOLS | {f"mstools.{each}" for each in below} for name, below in TOOLS.items()},
@@ -274,7 +273,7 @@ def test_the_table_itself_has_no_cycle():
             "import importlib\nimportlib.import_module('modelserver.wire')",
             "modelserver.wire",
         ),
-        ("msdrivers.protocol.nmea", "from msdrivers import runner", "msdrivers.protocol imports msdrivers.runner"),
+        ("msdrivers.devices.nmea", "from msdrivers import runner", "msdrivers.devices imports msdrivers.runner"),
         ("mstools.recordings.drive", "from mstools.view import page", "mstools.recordings imports mstools.view.page"),
         ("mstools.view.page", "from mstools import cli", "mstools.view imports mstools.cli"),
         ("modelserver.novelty", "import math", "package novelty is not in the table"),
@@ -291,7 +290,7 @@ def test_the_check_sees_what_points_the_wrong_way(module, code, message):
         ("modelserver.transforms.pose", "from modelserver.transforms import so3\nfrom . import so3\nimport numpy"),
         ("modelserver.core", "from modelserver import messages\nfrom modelserver.geometry.model import Model"),
         ("modelserver.wire.codec", "from mslcm.gps_t import gps_t\nfrom modelserver import messages"),
-        ("msdrivers.gps", "from msdrivers.protocol import nmea\nfrom msdrivers import transport"),
+        ("msdrivers.gps", "from msdrivers.devices import nmea\nfrom msdrivers import transport"),
     ],
 )
 def test_the_check_lets_pass_what_points_the_right_way(module, code):

@@ -28,9 +28,8 @@ from modelserver.key_files import read_keys
 from modelserver.server.journal.segments import Ring, files_of
 from modelserver.server.persistence.directory import write_atomically
 from modelserver.wire.eventlog import LogFile
-from msdrivers.factory import make_driver
 from msdrivers.raw_log import open_for_reading, open_for_writing
-from msdrivers.settings import SourceMap, read_driver
+from msdrivers.settings import SourceMap, make_driver, read_driver
 from mstools.commands.import_bag import import_bag
 from mstools.commands.replay import read_times
 from mstools.terminal.output import write_file

@@ -102,7 +102,7 @@ TERMS = {
     "HMAC": "modelserver/signing.py",
     "replay attack": "modelserver/server/requests/signed_commands.py",
     "clock drift": "drivers/msdrivers/device_clock.py",
-    "checksum": "drivers/msdrivers/protocol/framing.py",
+    "checksum": "drivers/msdrivers/devices/stream.py",
     "multicast": "modelserver/server/diagnostics/checks.py",
 }
 

@@ -1,1 +1,33 @@
-"""Drivers of devices: each an `Endpoint` at the host's end of a line."""
+"""Drivers of devices: each an `Endpoint` at the host's end of a line, with its protocol and settings in one module.
+
+Protocols are parsers and encoders without clock, socket, file, thread or log.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+
+def check_ranges(settings: object, **ranges: tuple[float, float]) -> None:
+    """Raise ValueError for the first attribute that is outside its range."""
+    for key, (low, high) in ranges.items():
+        value: float = getattr(settings, key)
+        if not low <= value <= high:
+            raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+
+
+STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
+
+
+class Strict:
+    """Base of settings that pydantic reads without conversions and without further keys."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+
+def check_factor(value: float, key: str) -> None:
+    """Raise ValueError for a factor that is 0 or not finite."""
+    if not math.isfinite(value) or value == 0.0:
+        raise ValueError(f"{key} is a number and not 0, got {value:g}")

@@ -1,4 +1,4 @@
-"""Driver of a nodding axis on Modbus/TCP: polls angle and rate, and sets the nodding motion.
+"""Driver of a nodding axis on Modbus/TCP: its register map, polling of angle and rate, setup of the nodding motion.
 
 Polling: one request at a time, at `poll_hz`. The angle is stamped in the middle between request and reply; delay and
 delay_sigma are half the round trip and the deviation of a uniform distribution over it.
@@ -16,14 +16,155 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices.ranges import check_ranges
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.framing import BoundedCounter
-from msdrivers.protocol.modbus import registers as modbus
-from msdrivers.protocol.modbus.registers import STRICT, AxisRegisters
+from msdrivers.devices import STRICT, check_ranges
+from msdrivers.devices.stream import BoundedCounter
+from msdrivers.endpoint import (
+    LAST_ADDRESS,
+    MAX_READ,
+    EndpointPhase,
+    EndpointStatus,
+    FailureKind,
+    HostTime,
+    MeasuredSample,
+    ModbusFailure,
+    ModbusUnit,
+    Output,
+    ReadRegisters,
+    Registers,
+    RegistersWritten,
+    RegisterTable,
+    Reopen,
+    Send,
+    WriteRegisters,
+    describe_request,
+    explain_exception,
+    is_reply_to,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterMap:
+    """A number in degrees or degrees a second: the registers' whole number times `scale_deg` plus `offset_deg`."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    address: int
+    """Address of the protocol, from 0: what manuals call 40001 is 0."""
+    registers: int = 1
+    """1 for a number of 16 bits, 2 for 32."""
+    is_signed: bool = True
+    """Two's complement; False: from 0 up."""
+    high_word_first: bool = True
+    """Of two registers the first holds the higher 16 bits, as the standard has bytes; False: the lower."""
+    scale_deg: float = 1.0
+    """Degrees (a second) for each unit; negative turns the sense."""
+    offset_deg: float = 0.0
+    """Degrees (a second) at 0."""
+
+    def __post_init__(self) -> None:
+        if self.registers not in (1, 2):
+            raise ValueError(f"registers is 1 (16 bits) or 2 (32 bits), got {self.registers}")
+        if not 0 <= self.address <= LAST_ADDRESS + 1 - self.registers:
+            raise ValueError(
+                f"address is 0 to {LAST_ADDRESS + 1 - self.registers}, got {self.address}; a manual's 40001 is 0"
+            )
+        if not math.isfinite(self.scale_deg) or self.scale_deg == 0.0:
+            raise ValueError(f"scale_deg is a number and not 0, got {self.scale_deg:g}")
+        if not math.isfinite(self.offset_deg):
+            raise ValueError(f"offset_deg is a number, got {self.offset_deg:g}")
+
+    @property
+    def lowest(self) -> int:
+        """The lowest whole number that the registers hold."""
+        return -(1 << (16 * self.registers - 1)) if self.is_signed else 0
+
+    @property
+    def highest(self) -> int:
+        """The highest whole number that the registers hold."""
+        return self.lowest + (1 << (16 * self.registers)) - 1
+
+    def to_number(self, values: Sequence[int]) -> int:
+        """Return the integer of `registers` registers."""
+        words = values if self.high_word_first else values[::-1]
+        number = 0
+        for word in words:
+            number = number << 16 | word
+        return number - (1 << 16 * self.registers) if number > self.highest else number
+
+    def to_words(self, number: int) -> tuple[int, ...]:
+        """Return the registers of a whole number. Raises ValueError for one that they do not hold."""
+        if not self.lowest <= number <= self.highest:
+            raise ValueError(f"{number} is not within {self.lowest} to {self.highest}")
+        words = tuple(number >> shift & 0xFFFF for shift in range(16 * (self.registers - 1), -1, -16))
+        return words if self.high_word_first else words[::-1]
+
+    def to_degrees(self, values: Sequence[int]) -> float:
+        """Return the value of registers in degrees (a second)."""
+        return self.to_number(values) * self.scale_deg + self.offset_deg
+
+    def from_degrees(self, degrees: float) -> tuple[int, ...]:
+        """Return the registers nearest to a value. Raises ValueError for one that they do not hold."""
+        return self.to_words(round((degrees - self.offset_deg) / self.scale_deg))
+
+    def can_hold(self, degrees: float) -> bool:
+        return self.lowest <= round((degrees - self.offset_deg) / self.scale_deg) <= self.highest
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRegisters:
+    """Registers of the axis. Angles and rates are the joint's, in its positive direction."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    angle: RegisterMap
+    """Angle of the axis."""
+    rate: RegisterMap | None = None
+    """Rate of the axis; None: no rate is published."""
+    sequence: RegisterMap | None = None
+    """Sequence number of the measurement; an unchanged one means that nothing new was measured."""
+    table: Literal["holding", "input"] = "holding"
+    """Table of angle, rate and sequence; the others are holding registers."""
+    lower_limit: RegisterMap | None = None
+    """Lower limit of the nodding motion, written."""
+    upper_limit: RegisterMap | None = None
+    """Upper limit of the nodding motion, written."""
+    nod_rate: RegisterMap | None = None
+    """Rate of the nodding motion, written; 0: stationary."""
+
+    def __post_init__(self) -> None:
+        if self.table not in ("holding", "input"):
+            raise ValueError(f"table is holding or input, got {self.table!r}")
+        if len(self.commanded) not in (0, 3):
+            raise ValueError(
+                "lower_limit, upper_limit and nod_rate are given together or not at all: nodding needs all"
+            )
+        spread = max(each.address + each.registers for each in self.measured.values()) - self.begin
+        if spread > MAX_READ:
+            raise ValueError(
+                f"angle, rate and sequence lie {spread} registers apart; at most {MAX_READ} are read at one instant"
+            )
+
+    @property
+    def measured(self) -> Mapping[str, RegisterMap]:
+        """Registers read at each poll, by name."""
+        return self._get_given("angle", "rate", "sequence")
+
+    @property
+    def begin(self) -> int:
+        """The first address that is read at each poll."""
+        return min(each.address for each in self.measured.values())
+
+    @property
+    def commanded(self) -> Mapping[str, RegisterMap]:
+        """Registers written to set the nodding motion, by name; empty for a read-only axis."""
+        return self._get_given("lower_limit", "upper_limit", "nod_rate")
+
+    def _get_given(self, *names: str) -> dict[str, RegisterMap]:
+        return {name: each for name in names if (each := getattr(self, name)) is not None}
+
 
 MIN_POLL_HZ = 50.0
 
@@ -111,21 +252,16 @@ class AxisSettings:
         return ""
 
 
-class _Step(NamedTuple):
-    """Write `degrees` to a commanded register; None: read it."""
-
-    name: str
-    degrees: float | None = None
-
-
-_Steps: TypeAlias = Generator[_Step, modbus.Registers | modbus.RegistersWritten, None]
+_Step: TypeAlias = tuple[str, ReadRegisters | WriteRegisters]
+"""What is done, and its request."""
+_Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
 
 
 class NodSetup:
     """The setup of a nodding motion: one step at a time, completed by `on_reply` or repeated."""
 
     def __init__(self, settings: AxisSettings):
-        self._registers: Mapping[str, modbus.RegisterMap] = settings.registers.commanded
+        self._registers: Mapping[str, RegisterMap] = settings.registers.commanded
         self._steps: _Steps | None = None
         self._step: _Step | None = None
         self.found: dict[str, tuple[int, ...]] = {}
@@ -138,28 +274,18 @@ class NodSetup:
         self._step = next(self._steps, None)
 
     def cancel(self) -> None:
-        """Discard the remaining steps."""
         self._step = None
 
     @property
     def step_text(self) -> str:
         """Description of the next step; empty when done."""
-        if self._step is None:
-            return ""
-        name, degrees = self._step
-        verb = "reading" if degrees is None else f"writing {degrees:g} to"
-        return f"{verb} {name} (register {self._registers[name].address})"
+        return "" if self._step is None else self._step[0]
 
-    def make_request(self, transaction: int) -> modbus.ReadRegisters | modbus.WriteRegisters | None:
+    def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
         """Make the request of the next step; None when done."""
-        if self._step is None:
-            return None
-        mapped, degrees = self._registers[self._step.name], self._step.degrees
-        if degrees is None:
-            return modbus.ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
-        return modbus.WriteRegisters(mapped.address, mapped.from_degrees(degrees), transaction)
+        return None if self._step is None else replace(self._step[1], transaction=transaction)
 
-    def on_reply(self, reply: modbus.Registers | modbus.RegistersWritten) -> str:
+    def on_reply(self, reply: Registers | RegistersWritten) -> str:
         """Complete a step; return a warning if the axis holds another value than was written, else empty."""
         self._warning = ""
         try:
@@ -168,31 +294,36 @@ class NodSetup:
             self._step = None
         return self._warning
 
-    def make_restore_requests(self) -> list[modbus.WriteRegisters]:
-        """Make the requests that restore the registers."""
+    def make_restore_requests(self) -> list[WriteRegisters]:
         if not self.found or self.found.keys() != self._registers.keys():
             return []
         degrees = {name: self._registers[name].to_degrees(words) for name, words in self.found.items()}
         order = _order_writes(degrees["lower_limit"], self._current["upper_limit"])
-        return [modbus.WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
+        return [WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
 
     def _run(self, nod: NodSettings) -> _Steps:
         for name, mapped in self._registers.items():
-            reply = yield _Step(name)
-            if isinstance(reply, modbus.Registers):
+            reply = yield self._read(name)
+            if isinstance(reply, Registers):
                 self._current[name] = mapped.to_degrees(reply.values)
                 self.found.setdefault(name, reply.values)
         wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
         order = _order_writes(nod.lower_deg, self._current["upper_limit"])
         for name in order:
-            yield _Step(name, wanted[name])
+            mapped = self._registers[name]
+            text = f"writing {wanted[name]:g} to {name} (register {mapped.address})"
+            yield text, WriteRegisters(mapped.address, mapped.from_degrees(wanted[name]))
             self._current[name] = wanted[name]
         for name in order:
-            mapped, reply = self._registers[name], (yield _Step(name))
-            if isinstance(reply, modbus.Registers) and reply.values != mapped.from_degrees(wanted[name]):
+            mapped, reply = self._registers[name], (yield self._read(name))
+            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
                 self._current[name] = mapped.to_degrees(reply.values)
                 actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
                 self._warning = f"{actual}: the axis's own limit"
+
+    def _read(self, name: str) -> _Step:
+        mapped = self._registers[name]
+        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.registers)
 
 
 def _order_writes(lower: float, present_upper: float) -> tuple[str, ...]:
@@ -271,7 +402,7 @@ BUSY_EXCEPTIONS = (5, 6)
 class _PendingRequest(NamedTuple):
     """The request that awaits its reply."""
 
-    request: modbus.ReadRegisters | modbus.WriteRegisters
+    request: ReadRegisters | WriteRegisters
     sent_ns: int
     is_poll: bool
 
@@ -288,7 +419,7 @@ class AxisDriver:
         self.max_silence = settings.silence
         self.counts = BoundedCounter()
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
-        self._table = modbus.RegisterTable(registers.table)
+        self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
         self._readings = ReadingValidator(settings)
         self._nod_setup = NodSetup(settings)
@@ -303,8 +434,7 @@ class AxisDriver:
         self._phase = EndpointPhase.WAITING
         self._seq = 0
 
-    def on_open(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
-        """Begin: set the nodding up, then read."""
+    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self._is_open, self._pending = True, None
         self._readings.clear()
         self._reported.clear()
@@ -315,30 +445,27 @@ class AxisDriver:
             self._nod_setup.start(self.settings.nod)
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
-    def on_receive(self, unit: modbus.ModbusUnit, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
-        """Process a reply or a failure."""
-        if isinstance(unit, modbus.ModbusFailure) and unit.kind is modbus.FailureKind.LINE:
+    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
+        if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
         if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
             self.counts["rejected.stale"] += 1
             return []
-        if isinstance(unit, modbus.ModbusFailure):
-            if unit.kind is modbus.FailureKind.TIMEOUT:
+        if isinstance(unit, ModbusFailure):
+            if unit.kind is FailureKind.TIMEOUT:
                 return self._on_timeout(now)
             return self._on_exception(pending, unit, now)
         self._pending = None
         self._received_ns = now.monotonic_ns
-        if not modbus.is_reply_to(unit, pending.request):
+        if not is_reply_to(unit, pending.request):
             self.counts["rejected.length"] += 1
-            text = (
-                f"the reply to {modbus.describe_request(pending.request)} has another address or length; it is not used"
-            )
+            text = f"the reply to {describe_request(pending.request)} has another address or length; it is not used"
             return self._warn_once("length", text) + self._send_next(now)
-        if pending.is_poll and isinstance(unit, modbus.Registers):
+        if pending.is_poll and isinstance(unit, Registers):
             return self._publish_reading(unit, pending, now) + self._send_next(now)
-        outputs: list[Output[modbus.ModbusUnit]] = []
-        if isinstance(unit, modbus.Registers | modbus.RegistersWritten):
+        outputs: list[Output[ModbusUnit]] = []
+        if isinstance(unit, Registers | RegistersWritten):
             warning = self._nod_setup.on_reply(unit)
             if warning:
                 self.counts["readback"] += 1
@@ -347,9 +474,9 @@ class AxisDriver:
                 outputs.append(EndpointStatus(self._phase, "the nodding motion is set"))
         return outputs + self._send_next(now)
 
-    def on_timer(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
+    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Process timeouts; send the next request."""
-        outputs: list[Output[modbus.ModbusUnit]] = []
+        outputs: list[Output[ModbusUnit]] = []
         if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + self._reply_ns:
             outputs += self._on_timeout(now)
         if self._silent_ns is not None and now.monotonic_ns >= self._silent_ns:
@@ -363,7 +490,6 @@ class AxisDriver:
         return outputs + self._send_next(now)
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         if not self._is_open:
             return None
         if self._pending is not None:
@@ -372,7 +498,7 @@ class AxisDriver:
             next_ns = min(self._next_ns, self._step_ns) if self._nod_setup.step_text else self._next_ns
         return next_ns if self._silent_ns is None else min(next_ns, self._silent_ns)
 
-    def on_close(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
+    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Write back what was found before this driver wrote."""
         self._is_open = False
         return [
@@ -380,7 +506,7 @@ class AxisDriver:
             for request in self._nod_setup.make_restore_requests()
         ]
 
-    def _send_next(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
+    def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
         at = now.monotonic_ns
         if self._pending is not None or not self._is_open:
@@ -391,7 +517,7 @@ class AxisDriver:
         transaction = self._new_transaction()
         request = None if is_poll else self._nod_setup.make_request(transaction)
         if request is None:
-            request = modbus.ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
+            request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
             self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
             self.counts["skipped"] += late
@@ -403,9 +529,7 @@ class AxisDriver:
         self._transaction = self._transaction % 0xFFFF + 1
         return self._transaction
 
-    def _publish_reading(
-        self, unit: modbus.Registers, pending: _PendingRequest, now: HostTime
-    ) -> list[Output[modbus.ModbusUnit]]:
+    def _publish_reading(self, unit: Registers, pending: _PendingRequest, now: HostTime) -> list[Output[ModbusUnit]]:
         round_trip_ns = now.monotonic_ns - pending.sent_ns
         joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
@@ -429,7 +553,7 @@ class AxisDriver:
             MeasuredSample(JointsSample(header, (joint,)), round_trip / 2.0, round_trip / math.sqrt(12.0)),
         ]
 
-    def _on_timeout(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
+    def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self.counts["unanswered"] += 1
         self._pending = None
         if now.monotonic_ns - self._received_ns < self._silence_ns:
@@ -438,8 +562,8 @@ class AxisDriver:
         return self._on_line_error(f"{why}; check its power, the network cable, address and port")
 
     def _on_exception(
-        self, pending: _PendingRequest, failure: modbus.ModbusFailure, now: HostTime
-    ) -> list[Output[modbus.ModbusUnit]]:
+        self, pending: _PendingRequest, failure: ModbusFailure, now: HostTime
+    ) -> list[Output[ModbusUnit]]:
         self.counts.add(f"rejected.exception_{failure.code}")
         self._pending = None
         self._received_ns = now.monotonic_ns
@@ -448,19 +572,17 @@ class AxisDriver:
             self._next_ns = again_ns
             if failure.code not in BUSY_EXCEPTIONS:
                 self._phase = EndpointPhase.SILENT
-            text = (
-                f"the axis rejects {modbus.describe_request(pending.request)}: {modbus.explain_exception(failure.code)}"
-            )
+            text = f"the axis rejects {describe_request(pending.request)}: {explain_exception(failure.code)}"
             retry = f"retried every {self.settings.retry_delay:g} s, nothing is published"
             return self._warn_once("rejected", f"{text}; {retry}")
-        text = f"the axis rejects {self._nod_setup.step_text}: {modbus.explain_exception(failure.code)}"
+        text = f"the axis rejects {self._nod_setup.step_text}: {explain_exception(failure.code)}"
         if failure.code in BUSY_EXCEPTIONS:
             self._step_ns = again_ns
             return [*self._warn_once("nod", f"{text}; trying again"), *self._send_next(now)]
         self._nod_setup.cancel()
         return [*self._warn_once("nod", f"{text}; its nodding motion is not changed"), *self._send_next(now)]
 
-    def _on_line_error(self, why: str) -> list[Output[modbus.ModbusUnit]]:
+    def _on_line_error(self, why: str) -> list[Output[ModbusUnit]]:
         if not self._is_open:
             return []
         self._is_open, self._pending, self._silent_ns = False, None, None
@@ -468,7 +590,7 @@ class AxisDriver:
         self.counts["line_errors"] += 1
         return [EndpointStatus(EndpointPhase.SILENT, why), Reopen(why)]
 
-    def _warn_once(self, word: str, text: str) -> list[Output[modbus.ModbusUnit]]:
+    def _warn_once(self, word: str, text: str) -> list[Output[ModbusUnit]]:
         if word in self._reported:
             return []
         self._reported.add(word)

@@ -1,4 +1,4 @@
-"""Driver of gpsd: publishes the fixes of the receiver that gpsd reads.
+"""gpsd: its reports, one JSON object a line (gpsd_json(5)), and the driver, which publishes its receiver's fixes.
 
 A TPV report is a fix. Its height `alt` is that above mean sea level in releases before 3.20, which have no other; later
 ones leave open what it is, and have `altHAE` and `altMSL`. The standard deviations are those of a GST report of the
@@ -9,22 +9,110 @@ the sigma.
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
 
 from modelserver.messages import NAN, FixType, GpsSample
-from msdrivers.devices.gps.fixes import course_from_track, to_covariance
-from msdrivers.devices.ranges import check_ranges
-from msdrivers.devices.stream_driver import SECOND_NS, StreamDriver, check_stream_settings
+from msdrivers.devices import check_ranges
+from msdrivers.devices.gps import course_from_track, to_covariance
+from msdrivers.devices.stream import (
+    NO_FRAME,
+    SECOND_NS,
+    FrameScanner,
+    ParsedFrame,
+    RejectedFrame,
+    StreamDriver,
+    StreamSettings,
+)
 from msdrivers.endpoint import HostTime, Output
-from msdrivers.protocol.gpsd import WATCH, GpsdReport, GpsdStream
+
+MAX_LINE: Final = 16_384
+"""A longer line is noise: a SKY report has 200 bytes for each satellite."""
+
+WATCH: Final = b'?WATCH={"enable":true,"json":true}\n'
+
+USED: Final = frozenset({"TPV", "SKY", "GST", "VERSION", "DEVICES", "WATCH", "ERROR"})
+
+_STATUS: Final = {2: FixType.DIFFERENTIAL, 3: FixType.RTK_FIXED, 4: FixType.RTK_FLOAT}
+_DEAD_RECKONING: Final = (5, 6)
+_NO_MEASUREMENT: Final = (7, 8)
+"""A surveyed position of a time receiver, and a simulation."""
 
 
 @dataclass(frozen=True, slots=True)
-class GpsdSettings:
+class GpsdReport:
+    """A report: its class, its fields, and the offset of its first byte in the stream."""
+
+    name: str
+    fields: Mapping[str, Any]
+    start: int
+
+    def get_number(self, key: str) -> float:
+        """Return a finite number; nan if it is missing or something else."""
+        value = self.fields.get(key)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        return float(value) if is_number and value is not None else NAN
+
+    @property
+    def utime(self) -> int:
+        """The instant of the report, microseconds of UTC; 0 if it has none."""
+        text = self.fields.get("time")
+        if not isinstance(text, str):
+            return 0
+        try:
+            when = datetime.fromisoformat(text)
+        except ValueError:
+            return 0
+        if when.tzinfo is None:
+            return 0
+        return max(0, (when - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1))
+
+    @property
+    def fix_type(self) -> FixType:
+        """The type of the fix of a TPV report."""
+        mode, status = self.fields.get("mode"), self.fields.get("status")
+        if mode not in (2, 3) or status in _NO_MEASUREMENT:
+            return FixType.NONE
+        if status in _DEAD_RECKONING:
+            return FixType.DEAD_RECKONING
+        plain = FixType.FIX_3D if mode == 3 else FixType.FIX_2D
+        return _STATUS.get(status, plain) if isinstance(status, int) else plain
+
+
+class GpsdFormat:
+    """A `FrameFormat` of gpsd's lines."""
+
+    start_bytes = b"{"
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[GpsdReport] | RejectedFrame | None:
+        end = buffer.find(b"\n", at, at + MAX_LINE)
+        if end < 0:
+            return None if len(buffer) - at < MAX_LINE else RejectedFrame("length")
+        try:
+            fields = json.loads(bytes(buffer[at:end]))
+        except (ValueError, RecursionError):
+            return RejectedFrame("json")
+        name = fields.get("class") if isinstance(fields, dict) else None
+        if not isinstance(name, str):
+            return NO_FRAME
+        report = GpsdReport(name, fields, start) if name in USED else None
+        return ParsedFrame(end + 1, f"gpsd.{name[:16]}", report)
+
+
+class GpsdStream(FrameScanner[GpsdReport]):
+    """Parses bytes to reports. Never raises; memory is bounded."""
+
+    formats = (GpsdFormat(),)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsdSettings(StreamSettings):
     """Settings of gpsd. Raises ValueError with the key for an invalid value."""
 
-    source: str
     receiver: str = ""
     """Path of the receiver at gpsd's machine, e.g. /dev/ttyACM0, where gpsd has several; empty: all."""
     hold: float = 0.02
@@ -41,13 +129,8 @@ class GpsdSettings:
     """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, hold=(0.0, 2.0))
-
-    @property
-    def bauds(self) -> tuple[int, ...]:
-        """None: gpsd owns the receiver's line."""
-        return ()
 
 
 class GpsdDriver(StreamDriver[GpsdReport]):

@@ -1,4 +1,7 @@
-"""Driver of u-blox receivers: configures the binary protocol UBX, publishes fixes with their covariance.
+"""u-blox receivers: UBX frames and messages on pyubx2, and the driver, which publishes fixes with their covariance.
+
+A frame is B5 62, class, identifier, length (2 bytes, least significant first), payload, and Fletcher's checksum of all
+after B5 62 (u-blox, ZED-F9P interface description, UBX-22008968, 3.2 and 3.4). pyubx2 knows the payloads.
 
 The receiver is asked for its version (MON-VER). Generation 9 and later is configured by CFG-VALSET, earlier ones by
 CFG-MSG and CFG-RATE, in volatile memory only; each message waits for its acknowledgement. An epoch is NAV-PVT with what
@@ -10,16 +13,218 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from modelserver.messages import NAN, GpsSample, SensorHeader
+from pyubx2 import (
+    GET,
+    SET,
+    UBX_CLASSES,
+    UBX_MSGIDS,
+    UBXMessage,
+    UBXMessageError,
+    UBXParseError,
+    UBXReader,
+    UBXTypeError,
+)
+
+from modelserver.messages import NAN, FixType, GpsSample, SensorHeader
 from modelserver.transforms.so3 import Matrix3
-from msdrivers.devices.gps.fixes import course_from_track
-from msdrivers.devices.ranges import check_ranges
-from msdrivers.devices.stream_driver import SECOND_NS, StreamDriver, check_stream_settings
+from msdrivers.devices import check_ranges
+from msdrivers.devices.gps import course_from_track
+from msdrivers.devices.stream import (
+    NO_FRAME,
+    SECOND_NS,
+    FrameScanner,
+    ParsedFrame,
+    RejectedFrame,
+    SetupStep,
+    StreamDriver,
+    StreamSettings,
+    compute_fletcher,
+)
 from msdrivers.endpoint import HostTime, Output
-from msdrivers.protocol import ublox
-from msdrivers.protocol.ublox import UbxMessage, UbxStream
+
+SYNC: Final = b"\xb5\x62"
+HEADER_BYTES: Final = 6
+CHECKSUM_BYTES: Final = 2
+
+MAX_PAYLOAD: Final = 4096
+"""A longer payload is noise: the longest message is RXM-RAWX, 16 + 32 for each of some 100 signals."""
+
+VALSET_VERSION: Final = 27.0
+"""First protocol version with CFG-VALSET: generation 9 (ZED-F9, M9, M10, X20)."""
+
+USED: Final = frozenset(
+    {
+        *("NAV-PVT", "NAV-COV", "NAV-HPPOSLLH", "NAV-DOP", "NAV-RELPOSNED", "NAV-EOE"),
+        *("RXM-RTCM", "MON-VER", "ACK-ACK", "ACK-NAK"),
+    }
+)
+"""Messages that are decoded; the others are counted."""
+
+REQUIRED_OUTPUT: Final = ("NAV_PVT",)
+OPTIONAL_OUTPUT: Final = ("NAV_EOE", "NAV_DOP", "NAV_COV", "NAV_HPPOSLLH", "NAV_RELPOSNED", "RXM_RTCM")
+"""Messages that a receiver is asked for. Not every product has the optional ones."""
+
+PORTS: Final = ("UART1", "USB")
+"""Ports of the receiver that messages are switched on at: which one this line is, the receiver does not state."""
+
+_RAM: Final = 1
+_NO_TRANSACTION: Final = 0
+
+
+@dataclass(frozen=True, slots=True)
+class UbxMessage:
+    """A decoded message: its name, pyubx2's attributes, and the offset of its first byte in the stream."""
+
+    name: str
+    values: Any
+    start: int
+
+
+class UbxFormat:
+    """A `FrameFormat` of UBX messages."""
+
+    start_bytes = SYNC[:1]
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[UbxMessage] | RejectedFrame | None:
+        if len(buffer) < at + HEADER_BYTES:
+            return None if buffer[at : at + 2] == SYNC[: len(buffer) - at] else NO_FRAME
+        if buffer[at : at + 2] != SYNC:
+            return NO_FRAME
+        size = int.from_bytes(buffer[at + 4 : at + 6], "little")
+        if size > MAX_PAYLOAD:
+            return RejectedFrame("ubx_length")
+        end = at + HEADER_BYTES + size + CHECKSUM_BYTES
+        if len(buffer) < end:
+            return None
+        frame = bytes(buffer[at:end])
+        if compute_fletcher(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
+            return RejectedFrame("checksum")
+        name = UBX_MSGIDS.get(frame[2:4], "") or f"{UBX_CLASSES.get(frame[2:3], 'UBX')}-{frame[2]:02X}{frame[3]:02X}"
+        if name not in USED:
+            return ParsedFrame(end, f"ubx.{name}", None)
+        try:
+            values = UBXReader.parse(frame, msgmode=GET)
+        except (UBXParseError, UBXMessageError, UBXTypeError, ValueError):
+            return RejectedFrame("ubx_payload")
+        return ParsedFrame(end, f"ubx.{name}", UbxMessage(name, values, start))
+
+
+class UbxStream(FrameScanner[UbxMessage]):
+    """Parses bytes to UBX messages. Never raises; memory is bounded."""
+
+    formats = (UbxFormat(),)
+
+
+# --- values of messages ---------------------------------------------------------------------------------------
+
+
+def get_fix_type(pvt: Any) -> FixType:
+    """Return the type of a fix in NAV-PVT (UBX-22008968, 3.15.13)."""
+    if not (pvt.gnssFixOk and has_place(pvt)):
+        return FixType.NONE
+    if pvt.fixType == 1:
+        return FixType.DEAD_RECKONING
+    if pvt.fixType == 2:
+        return FixType.FIX_2D
+    # 3: three-dimensional; 4: with the receiver's dead reckoning; 0 and 5: none, time only
+    if pvt.fixType not in (3, 4):
+        return FixType.NONE
+    if pvt.carrSoln in (1, 2):
+        return FixType.RTK_FLOAT if pvt.carrSoln == 1 else FixType.RTK_FIXED
+    return FixType.DIFFERENTIAL if pvt.diffSoln else FixType.FIX_3D
+
+
+def has_place(pvt: Any) -> bool:
+    """Return whether a NAV-PVT states a position; receivers before generation 8 have no flag for that."""
+    return not bool(vars(pvt).get("invalidLlh")) and pvt.fixType not in (0, 5)
+
+
+def get_utime(pvt: Any) -> int:
+    """Return the instant of a NAV-PVT, microseconds of UTC; 0 if the receiver does not know it well, or within a leap
+    second."""
+    if not (pvt.validDate and pvt.validTime and pvt.fullyResolved):
+        return 0
+    try:
+        when = datetime(pvt.year, pvt.month, pvt.day, pvt.hour, pvt.min, pvt.second, tzinfo=UTC)
+    except ValueError:
+        return 0
+    nanoseconds: int = pvt.nano
+    return (when - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) + round(nanoseconds * 1e-3)
+
+
+def get_protocol_version(version: Any) -> tuple[str, float]:
+    """Return the product and the protocol version in MON-VER; 0 if it states none (before generation 8)."""
+    texts = [
+        value.decode("ascii", "replace").strip("\x00 ") if isinstance(value, bytes) else str(value).strip("\x00 ")
+        for name, value in vars(version).items()
+        if name.startswith(("extension", "swVersion", "hwVersion"))
+    ]
+    protocol, product = 0.0, ""
+    for text in texts:
+        key, _, value = text.replace("=", " ").partition(" ")
+        if key == "PROTVER":
+            try:
+                protocol = float(value.split()[0])
+            except (ValueError, IndexError):
+                protocol = 0.0
+        elif key == "MOD":
+            product = value.strip()
+    return product or "u-blox receiver", protocol
+
+
+# --- configuration --------------------------------------------------------------------------------------------
+
+
+def make_version_poll() -> bytes:
+    return _encode(UBXMessage("MON", "MON-VER", 2))
+
+
+def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
+    """Return what sets a receiver of a protocol version up, in its volatile memory only."""
+    period_ms = round(1000.0 / rate_hz)
+    if protocol >= VALSET_VERSION:
+        return _make_valset(period_ms)
+    rate = UBXMessage("CFG", "CFG-RATE", SET, measRate=period_ms, navRate=1, timeRef=1)
+    return (
+        SetupStep(_encode(rate), f"a rate of {rate_hz:g} Hz"),
+        *(_make_message_rate(name, is_optional=False) for name in REQUIRED_OUTPUT),
+        *(_make_message_rate(name, is_optional=True) for name in OPTIONAL_OUTPUT),
+    )
+
+
+def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
+    def configure(values: list[tuple[str, int]], what: str, is_optional: bool = False) -> SetupStep:
+        return SetupStep(_encode(UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
+
+    setups = [
+        configure([("CFG_RATE_MEAS", period_ms), ("CFG_RATE_NAV", 1)], f"a rate of {1000.0 / period_ms:g} Hz"),
+        *(configure([(f"CFG_{port}OUTPROT_UBX", 1)], f"UBX at {port}", port == "USB") for port in PORTS),
+        *(configure([(f"CFG_{port}OUTPROT_NMEA", 0)], f"no NMEA at {port}", True) for port in PORTS),
+    ]
+    for name in (*REQUIRED_OUTPUT, *OPTIONAL_OUTPUT):
+        for port in PORTS:
+            is_optional = name in OPTIONAL_OUTPUT or port == "USB"
+            what = f"{name.replace('_', '-')} at {port}"
+            setups.append(configure([(f"CFG_MSGOUT_UBX_{name}_{port}", 1)], what, is_optional))
+    return tuple(setups)
+
+
+_CODES: Final = {name.replace("-", "_"): code for code, name in UBX_MSGIDS.items()}
+
+
+def _make_message_rate(name: str, *, is_optional: bool) -> SetupStep:
+    """Return the CFG-MSG that switches a message on at this port."""
+    frame = UBXMessage("CFG", "CFG-MSG", SET, payload=_CODES[name] + b"\x01")
+    return SetupStep(_encode(frame), name.replace("_", "-"), is_optional)
+
+
+def _encode(message: UBXMessage) -> bytes:
+    data: bytes = message.serialize()
+    return data
+
 
 FIXED: Final = 2
 """carrSoln: ambiguities fixed."""
@@ -28,21 +233,16 @@ MOVING: Final = 0.3
 """Speed over ground above which a vehicle moves, m/s."""
 
 
-@dataclass(frozen=True, slots=True)
-class UbloxSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UbloxSettings(StreamSettings):
     """Settings of a u-blox receiver. Raises ValueError with the key for an invalid value."""
 
-    source: str
     rate_hz: float = 5.0
     """Fixes per second, 0.1 to 25; what a product reaches depends on its constellations."""
     bauds: tuple[int, ...] = (38400, 9600, 115200, 460800)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
     silence: float = 2.0
     """Timeout for fixes, seconds, after which the setup is repeated."""
-    answer_timeout: float = 0.5
-    """Timeout for the answer to a configuration message, seconds."""
-    attempts: int = 3
-    """How often an unanswered message is sent."""
     hold: float = 0.1
     """How long a position waits for the other messages of its epoch, seconds."""
     delay: float = 0.0
@@ -51,7 +251,7 @@ class UbloxSettings:
     """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, rate_hz=(0.1, 25.0), hold=(0.0, 10.0))
         if self.silence < 1.5 / self.rate_hz:
             raise ValueError(f"silence is at least 1.5 periods, {1.5 / self.rate_hz:g} s, got {self.silence:g}")
@@ -67,8 +267,8 @@ class Epoch:
     def to_sample(self, header: SensorHeader) -> GpsSample:
         """Return the fix. The messages are in degrees, millimeters and millimeters per second."""
         pvt = self.parts["NAV-PVT"]
-        fix_type = ublox.get_fix_type(pvt)
-        has_place = ublox.has_place(pvt)
+        fix_type = get_fix_type(pvt)
+        is_placed = has_place(pvt)
         latitude, longitude, height, msl = pvt.lat, pvt.lon, pvt.height * 1e-3, pvt.hMSL * 1e-3
         precise = self.parts.get("NAV-HPPOSLLH")
         if precise is not None and not precise.invalidLlh:
@@ -80,21 +280,21 @@ class Epoch:
         return GpsSample(
             header,
             fix_type,
-            latitude if has_place else NAN,
-            longitude if has_place else NAN,
-            height_ellipsoidal=height if has_place else NAN,
-            height_msl=msl if has_place else NAN,
-            undulation=height - msl if has_place else NAN,
+            latitude if is_placed else NAN,
+            longitude if is_placed else NAN,
+            height_ellipsoidal=height if is_placed else NAN,
+            height_msl=msl if is_placed else NAN,
+            undulation=height - msl if is_placed else NAN,
             satellites=pvt.numSV,
             hdop=NAN if dop is None else dop.hDOP,
             vdop=NAN if dop is None else dop.vDOP,
             pdop=pvt.pDOP,
-            position_covariance=position if has_place else None,
-            velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if has_place else None,
-            velocity_covariance=velocity if has_place else None,
-            velocity_latency=0.0 if has_place else NAN,
-            speed=pvt.gSpeed * 1e-3 if has_place else NAN,
-            course=course_from_track(pvt.headMot) if has_place and pvt.gSpeed * 1e-3 > MOVING else NAN,
+            position_covariance=position if is_placed else None,
+            velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if is_placed else None,
+            velocity_covariance=velocity if is_placed else None,
+            velocity_latency=0.0 if is_placed else NAN,
+            speed=pvt.gSpeed * 1e-3 if is_placed else NAN,
+            course=course_from_track(pvt.headMot) if is_placed and pvt.gSpeed * 1e-3 > MOVING else NAN,
             baseline_yaw=yaw,
             baseline_yaw_sigma=yaw_sigma,
         )
@@ -152,7 +352,7 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         self._last_itow: int | None = None
 
     def _make_identification(self) -> bytes:
-        return ublox.make_version_poll()
+        return make_version_poll()
 
     def _on_start(self) -> None:
         self._epoch = None
@@ -165,8 +365,8 @@ class UbloxDriver(StreamDriver[UbxMessage]):
 
     def _on_message(self, message: UbxMessage, now: HostTime) -> list[Output[bytes]]:
         if message.name == "MON-VER":
-            product, protocol = ublox.get_protocol_version(message.values)
-            steps = ublox.make_setup(protocol, self._rate_hz)
+            product, protocol = get_protocol_version(message.values)
+            steps = make_setup(protocol, self._rate_hz)
             return self._on_identity(f"{product} (protocol {protocol:g})", steps, now)
         if message.name.startswith("ACK"):
             return self._on_command_answer(message, now)
@@ -206,5 +406,5 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         self._last_itow = epoch.itow
         if "NAV-PVT" not in epoch.parts:
             return []
-        header = self._make_header(epoch.host_utime, ublox.get_utime(epoch.parts["NAV-PVT"]))
+        header = self._make_header(epoch.host_utime, get_utime(epoch.parts["NAV-PVT"]))
         return self._publish(epoch.to_sample(header), now)

@@ -1,27 +1,224 @@
-"""Driver of the VectorNav VN-100: switches its binary output on and publishes its samples."""
+"""VectorNav VN-100: binary output, ASCII messages, commands; and the driver, which switches the binary output on.
+
+A binary message is FA, the groups (one bit each), a 16-bit field mask for each group, the fields in the order of their
+bits, little-endian, and CRC-16 (CCITT, initial 0), high byte first. It has no length: that follows from the masks. An
+ASCII message is `$VN`, text, `*`, the exclusive-or of the characters between, in hexadecimal. Source: VectorNav, VN-100
+user manual UM001, 4 and 5. Axes: x forward, y right, z down.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+import struct
+from binascii import crc_hqx
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import reduce
+from operator import xor
+from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
 from modelserver.transforms.so3 import Quaternion
-from msdrivers.devices.ranges import check_ranges
-from msdrivers.devices.stream_driver import StreamDriver, check_stream_settings
+from msdrivers.devices import check_ranges
+from msdrivers.devices.stream import (
+    NO_FRAME,
+    FrameScanner,
+    ParsedFrame,
+    RejectedFrame,
+    SetupStep,
+    StreamDriver,
+    StreamSettings,
+)
 from msdrivers.endpoint import HostTime, Output
-from msdrivers.protocol import vectornav as vn
-from msdrivers.protocol.vectornav import VnBinary, VnMessage, VnStream
+
+SYNC: Final = 0xFA
+
+FIELD_BYTES: Final[Mapping[int, tuple[int, ...]]] = {
+    1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
+    2: (8, 8, 8, 2, 8, 8, 8, 4, 4, 1),
+    3: (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12, 2),
+    5: (2, 12, 16, 36, 12, 12, 12, 12, 12),
+}
+"""Bytes of the fields of each group, by bit. Groups 4, 6 and 7 (GNSS, INS) do not exist on a VN-100."""
+
+TIME, QUATERNION = (1, 0), (1, 4)
+MAGNETIC, ACCELERATION, RATE, TEMPERATURE, SATURATION = (3, 1), (3, 2), (3, 3), (3, 4), (3, 11)
+COMPENSATED_RATE, COMPENSATED_ACCELERATION = (1, 5), (1, 8)
+
+WANTED: Final = (TIME, QUATERNION, MAGNETIC, ACCELERATION, RATE, TEMPERATURE)
+"""Fields that are asked for: those of the sensors without the corrections of the unit's own filter, whose estimate of
+the gyro bias would be a second one beside that of the localization."""
+
+BASE_RATE_HZ: Final = 800
+"""Rate of the unit, which is divided by a whole number."""
+
+MAX_TEXT: Final = 256
+
+GAUSS: Final = 1e-4
+"""Tesla."""
+
+_TEXT: Final = re.compile(rb"\$VN([^*\r\n$]{0,%d})\*([0-9A-Fa-f]{2})(?![0-9A-Fa-f])" % MAX_TEXT)
+
+
+@dataclass(frozen=True, slots=True)
+class VnBinary:
+    """A binary message: its fields' bytes by (group, bit), and the offset of its first byte in the stream."""
+
+    fields: Mapping[tuple[int, int], bytes]
+    start: int
+
+    def get_floats(self, key: tuple[int, int]) -> tuple[float, ...] | None:
+        """Return the numbers of a field of float32; None if the message does not have it."""
+        data = self.fields.get(key)
+        return None if data is None else struct.unpack(f"<{len(data) // 4}f", data)
+
+    @property
+    def time_ns(self) -> int | None:
+        """Nanoseconds since the unit started (TimeStartup); None if the message does not have it."""
+        data = self.fields.get(TIME)
+        return None if data is None else int.from_bytes(data, "little")
+
+
+@dataclass(frozen=True, slots=True)
+class VnText:
+    """An ASCII message without `$VN` and checksum, e.g. RRG,01,VN-100, split at its commas."""
+
+    words: tuple[str, ...]
+    start: int = field(default=0, compare=False)
+
+
+VnMessage: TypeAlias = VnBinary | VnText
+
+
+class VnBinaryFormat:
+    """A `FrameFormat` of binary messages."""
+
+    start_bytes = bytes((SYNC,))
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[VnMessage] | RejectedFrame | None:
+        if len(buffer) < at + 2:
+            return None
+        groups = [bit + 1 for bit in range(8) if buffer[at + 1] >> bit & 1]
+        if not groups or any(group not in FIELD_BYTES for group in groups):
+            return NO_FRAME
+        begin = at + 2 + 2 * len(groups)
+        if len(buffer) < begin:
+            return None
+        keys = []
+        for number, group in enumerate(groups):
+            mask = int.from_bytes(buffer[at + 2 + 2 * number : at + 4 + 2 * number], "little")
+            if mask == 0 or mask >> len(FIELD_BYTES[group]):
+                return NO_FRAME
+            keys += [(group, bit) for bit in range(len(FIELD_BYTES[group])) if mask >> bit & 1]
+        end = begin + sum(FIELD_BYTES[group][bit] for group, bit in keys) + 2
+        if len(buffer) < end:
+            return None
+        if crc_hqx(bytes(buffer[at + 1 : end]), 0):
+            return RejectedFrame("checksum")
+        fields = {}
+        for group, bit in keys:
+            size = FIELD_BYTES[group][bit]
+            fields[group, bit] = bytes(buffer[begin : begin + size])
+            begin += size
+        return ParsedFrame(end, "binary", VnBinary(fields, start))
+
+
+class VnTextFormat:
+    """A `FrameFormat` of ASCII messages."""
+
+    start_bytes = b"$"
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[VnMessage] | RejectedFrame | None:
+        head = bytes(buffer[at : at + 3])
+        if not b"$VN".startswith(head):
+            return NO_FRAME
+        found = _TEXT.match(buffer, at)
+        if found is None:
+            is_open = len(buffer) - at < MAX_TEXT and not any(each in buffer[at + 1 :] for each in b"\r\n$")
+            return None if is_open else RejectedFrame("text")
+        # a further digit would belong to a checksum of four
+        if found.end() == len(buffer):
+            return None
+        if reduce(xor, b"VN" + found[1], 0) != int(found[2], 16):
+            return RejectedFrame("checksum")
+        words = tuple(found[1].decode("latin-1").split(","))
+        return ParsedFrame(found.end(), f"text.{words[0][:3]}", VnText(words, start))
+
+
+class VnStream(FrameScanner[VnMessage]):
+    """Parses bytes to binary and ASCII messages. Never raises; memory is bounded."""
+
+    formats = (VnBinaryFormat(), VnTextFormat())
+
+
+def encode_text(text: str) -> bytes:
+    """Return an ASCII message, e.g. of RRG,01."""
+    body = f"VN{text}"
+    return f"${body}*{reduce(xor, body.encode('latin-1'), 0):02X}\r\n".encode("latin-1")
+
+
+def _make_masks(keys: Iterable[tuple[int, int]]) -> tuple[int, list[int]]:
+    """Return the byte of the groups, and the masks of their fields."""
+    masks: dict[int, int] = {}
+    for group, bit in keys:
+        masks[group] = masks.get(group, 0) | 1 << bit
+    return sum(1 << group - 1 for group in masks), [masks[group] for group in sorted(masks)]
+
+
+def encode_binary(fields: Mapping[tuple[int, int], bytes]) -> bytes:
+    """Return a binary message of fields' bytes by (group, bit)."""
+    groups, masks = _make_masks(fields)
+    body = bytes((groups,)) + b"".join(mask.to_bytes(2, "little") for mask in masks)
+    body += b"".join(fields[key] for key in sorted(fields))
+    return bytes((SYNC,)) + body + crc_hqx(body, 0).to_bytes(2, "big")
+
+
+def compute_size(keys: tuple[tuple[int, int], ...]) -> int:
+    """Return the bytes of a binary message with these fields."""
+    return 1 + 1 + 2 * len({group for group, _ in keys}) + sum(FIELD_BYTES[group][bit] for group, bit in keys) + 2
+
+
+def make_setup(rate_hz: float, port: int) -> tuple[SetupStep, ...]:
+    """Return what sets a unit up, in its volatile memory: ASCII output off on both ports, then the binary output.
+
+    The ASCII output must be off first: together they may exceed the baud rate (error 0C).
+    """
+    groups, masks = _make_masks(WANTED)
+    divisor = max(1, round(BASE_RATE_HZ / rate_hz))
+    words = ",".join(f"{mask:04X}" for mask in masks)
+    return (
+        *(SetupStep(encode_text(f"WRG,06,0,{each}"), f"no text on port {each}", is_optional=True) for each in (1, 2)),
+        SetupStep(
+            encode_text(f"WRG,75,{port},{divisor},{groups:02X},{words}"), f"{BASE_RATE_HZ / divisor:g} Hz binary output"
+        ),
+    )
+
+
+ERRORS: Final = {
+    0x01: "hard fault",
+    0x02: "its input buffer overflowed",
+    0x03: "wrong checksum",
+    0x04: "unknown command",
+    0x05: "too few parameters",
+    0x06: "too many parameters",
+    0x07: "wrong parameter",
+    0x08: "unknown register; is this a VN-100 with recent firmware?",
+    0x09: "no access",
+    0x0A: "watchdog",
+    0x0B: "its output buffer overflowed: a lower rate_hz, or a higher baud rate",
+    0x0C: "the baud rate is too low for this output: a lower rate_hz, or a higher baud rate of the unit (register 5)",
+}
+"""Meaning of the code in `$VNERR`."""
 
 MAX_RATE, MAX_ACCELERATION = 40.0, 400.0
 """Beyond the ranges of the unit, 2000 deg/s and 16 g, with room: rad/s, m/s2."""
 
 
-@dataclass(frozen=True, slots=True)
-class VectornavSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VectornavSettings(StreamSettings):
     """Settings of a VN-100. Raises ValueError with the key for an invalid value."""
 
-    source: str
     rate_hz: float = 100.0
     """Samples per second: 800 divided by a whole number. 115200 baud carry 140 Hz."""
     unit_port: int = 1
@@ -30,19 +227,11 @@ class VectornavSettings:
     """What the yaw of its orientation is measured against: `magnetic`, or `none` where its magnetometers are off."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    silence: float = 0.5
-    """Timeout for samples, seconds, after which the setup is repeated."""
     answer_timeout: float = 0.3
     """Timeout for an answer, seconds."""
-    attempts: int = 3
-    """How often an unanswered command is sent."""
-    delay: float = 0.0
-    """From the measurement to the instant that the unit states, seconds."""
-    delay_sigma: float = 0.0
-    """Its standard deviation, seconds."""
 
     def __post_init__(self) -> None:
-        check_stream_settings(self)
+        StreamSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
         if self.heading not in ("magnetic", "none"):
             raise ValueError(f"heading is magnetic or none, got '{self.heading}'")
@@ -65,7 +254,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
         self._last_ns: int | None = None
 
     def _make_identification(self) -> bytes:
-        return vn.encode_text("RRG,01")
+        return encode_text("RRG,01")
 
     def _on_start(self) -> None:
         self._last_ns = None
@@ -75,9 +264,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
             return self._on_binary(message, now)
         words, step = message.words, self._step
         if words[0] == "RRG" and len(words) > 2 and words[1].lstrip("0") == "1":
-            return self._on_identity(
-                words[2].strip() or "VectorNav unit", vn.make_setup(self._rate_hz, self._port), now
-            )
+            return self._on_identity(words[2].strip() or "VectorNav unit", make_setup(self._rate_hz, self._port), now)
         if words[0] == "ERR" and step is not None:
             return self._on_acknowledgement(now, _describe_error(words))
         if words[0] == "WRG" and step is not None and len(words) > 1 and words[1].isdecimal():
@@ -88,8 +275,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
 
     def _on_binary(self, message: VnBinary, now: HostTime) -> list[Output[bytes]]:
         time_ns = message.time_ns
-        rate = message.get_floats(vn.RATE) or message.get_floats(vn.COMPENSATED_RATE)
-        force = message.get_floats(vn.ACCELERATION) or message.get_floats(vn.COMPENSATED_ACCELERATION)
+        rate = message.get_floats(RATE) or message.get_floats(COMPENSATED_RATE)
+        force = message.get_floats(ACCELERATION) or message.get_floats(COMPENSATED_ACCELERATION)
         if rate is None and force is None:
             self._counts["without_rate"] += 1
             return []
@@ -100,15 +287,15 @@ class VectornavDriver(StreamDriver[VnMessage]):
             step = (time_ns - self._last_ns) * 1e-9 * self._rate_hz
             self._counts["lost"] += max(0, round(step) - 1) if step < 1000.0 else 0
         self._last_ns = time_ns
-        magnetic, celsius = message.get_floats(vn.MAGNETIC), message.get_floats(vn.TEMPERATURE)
-        orientation = _to_quaternion(message.get_floats(vn.QUATERNION))
+        magnetic, celsius = message.get_floats(MAGNETIC), message.get_floats(TEMPERATURE)
+        orientation = _to_quaternion(message.get_floats(QUATERNION))
         sample = ImuSample(
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
             ),
             angular_velocity=self._read_vector(rate, MAX_RATE),
             specific_force=self._read_vector(force, MAX_ACCELERATION),
-            magnetic_field=self._read_vector(magnetic, MAX_ACCELERATION, vn.GAUSS),
+            magnetic_field=self._read_vector(magnetic, MAX_ACCELERATION, GAUSS),
             orientation=orientation,
             orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.NED,
             yaw_source=YawSource.NONE if orientation is None else self._yaw_source,
@@ -131,4 +318,4 @@ def _describe_error(words: tuple[str, ...]) -> str:
         code = int(words[1], 16)
     except (IndexError, ValueError):
         return "error without a code"
-    return f"error {code:02X}, {vn.ERRORS.get(code, 'unknown')}"
+    return f"error {code:02X}, {ERRORS.get(code, 'unknown')}"

@@ -1,4 +1,4 @@
-"""Driver of the vehicle controller on a CAN bus: status, and commands with limits and a dead-man timer.
+"""The vehicle controller on a CAN bus: mapping of status and command, and the driver with limits and a dead-man timer.
 
 A valid command is clamped to the limits (or rejected) and sent to the controller at once and every `command_period`,
 for the shortest of its `valid_for`, `max_validity` since its `utime`, and `dead_man` since its arrival. Then the
@@ -16,18 +16,220 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
-from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices.can_driver import CanDriver
-from msdrivers.devices.ranges import check_ranges
-from msdrivers.endpoint import EndpointStatus, HostTime, MeasuredSample, Output, Send
-from msdrivers.protocol.can.database import CanDatabase, CanFrameSet
-from msdrivers.protocol.can.frame import CanFrame, FrameKey
-from msdrivers.protocol.can.mapping import STRICT, CommandMap, StatusMap
-from msdrivers.protocol.can.vehicle import NUMERIC_FIELDS, BoundCommand, bind_command, bind_status
+from modelserver.messages import NAN, SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
+from msdrivers.devices import STRICT, Strict, check_ranges
+from msdrivers.devices.can import (
+    BoundSignal,
+    CanDatabase,
+    CanDriver,
+    CanFrameSet,
+    SignalBinder,
+    SignalMap,
+    check_signal,
+)
+from msdrivers.endpoint import CanFrame, EndpointStatus, FrameKey, HostTime, MeasuredSample, Output, Send
+
+
+@dataclass(frozen=True, slots=True)
+class StatusMap(Strict):
+    """Signals of the vehicle controller's status; omitted ones are published as missing."""
+
+    mode: str = ""
+    """Message.Signal of the driving mode; empty: the controller has none."""
+    modes: Mapping[str, int] = field(default_factory=dict)
+    """The mode signal's number, without the DBC's scale, for each of manual, autonomous, emergency_stop, fault."""
+    forward_speed: SignalMap | None = None
+    """m/s, forward positive."""
+    steering_angle: SignalMap | None = None
+    """Radians, to the left positive."""
+    supply_voltage: SignalMap | None = None
+    """Volts."""
+    engine_speed: SignalMap | None = None
+    """rad/s; scale 0.10472 for revolutions a minute."""
+    fault_bits: str = ""
+    """Message.Signal of the controller's fault word, at most 32 bits."""
+    commands_rejected: str = ""
+    """Message.Signal of the controller's count of rejected commands."""
+
+    def __post_init__(self) -> None:
+        for key in ("mode", "fault_bits", "commands_rejected"):
+            if getattr(self, key):
+                check_signal(getattr(self, key), key)
+        known = ("manual", "autonomous", "emergency_stop", "fault")
+        for name in self.modes:
+            if name not in known:
+                raise ValueError(f"modes knows {', '.join(known)}, got {name!r}")
+        if bool(self.mode) != bool(self.modes):
+            raise ValueError("mode and modes are given together: the signal, and its number for each mode")
+        if len(set(self.modes.values())) < len(self.modes):
+            raise ValueError("modes has a number of its own for each mode")
+
+
+@dataclass(frozen=True, slots=True)
+class CommandMap(Strict):
+    """Signals of a command to the vehicle controller."""
+
+    forward_speed: SignalMap
+    """m/s, forward positive, is `scale` times the signal plus `offset`."""
+    steering_angle: SignalMap
+    """Radians, to the left positive; a signal of the same message."""
+    alive: str = ""
+    """Message.Signal of the alive counter, which wraps by its bits; empty: none."""
+    drive_signals: Mapping[str, float] = field(default_factory=dict)
+    """Other signals of the message while driving, by name without the message, in physical units: an enable bit, a
+    gear."""
+    stop_signals: Mapping[str, float] = field(default_factory=dict)
+    """The same in the stop command; omitted ones are as in `drive_signals`."""
+
+    def __post_init__(self) -> None:
+        message = self.message
+        others = [self.steering_angle.signal, *([self.alive] if self.alive else [])]
+        if self.alive:
+            check_signal(self.alive, "alive")
+        for other in others:
+            if other.partition(".")[0] != message:
+                raise ValueError(f"a command is one message, {message}; {other} is of another")
+
+    @property
+    def message(self) -> str:
+        """Name of the message in the DBC file."""
+        return self.forward_speed.signal.partition(".")[0]
+
+
+NUMERIC_FIELDS = ("forward_speed", "steering_angle", "supply_voltage", "engine_speed")
+"""Fields of a status that are physical quantities."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundStatus:
+    """Mapping and signals of the status, by field."""
+
+    map: StatusMap
+    signals: dict[str, BoundSignal]
+
+    def get_mode(self, instant: CanFrameSet) -> VehicleMode:
+        """Return the driving mode; UNKNOWN if it is missing or its number is not mapped."""
+        raw = instant.raw(self.signals.get("mode"))
+        numbers = {number: VehicleMode[name.upper()] for name, number in self.map.modes.items()}
+        return VehicleMode.UNKNOWN if raw is None else numbers.get(int(raw), VehicleMode.UNKNOWN)
+
+    def get_number(self, name: str, instant: CanFrameSet) -> float:
+        """Return one of `NUMERIC_FIELDS` in SI units; nan if it is missing."""
+        physical = instant.physical(self.signals.get(name))
+        mapped: SignalMap | None = getattr(self.map, name)
+        return NAN if physical is None or mapped is None else mapped.to_si(physical)
+
+    def get_word(self, name: str, instant: CanFrameSet) -> int | None:
+        """Return `fault_bits` or `commands_rejected`: 0 if not mapped, None if not received."""
+        if name not in self.signals:
+            return 0
+        raw = instant.raw(self.signals[name])
+        return None if raw is None else int(raw)
+
+
+def bind_status(status: StatusMap, database: CanDatabase, place: str) -> BoundStatus:
+    """Bind the status mapping. Raises ConfigError with every unknown or unsuitable signal."""
+    binder = SignalBinder(database, place)
+    signals: dict[str, BoundSignal] = {}
+    for name in ("mode", "fault_bits", "commands_rejected"):
+        path = getattr(status, name)
+        found = binder.bind_signal(path, name, whole=True, bits=32 if name == "fault_bits" else 63) if path else None
+        if found is not None:
+            signals[name] = found
+    for name in NUMERIC_FIELDS:
+        mapped: SignalMap | None = getattr(status, name)
+        found = binder.bind_signal(mapped.signal, name) if mapped is not None else None
+        if found is not None:
+            signals[name] = found
+    binder.finish()
+    return BoundStatus(status, signals)
+
+
+@dataclass(frozen=True, slots=True)
+class BoundCommand:
+    """Mapping and signals of the command, and the raw values of the other signals of its message."""
+
+    map: CommandMap
+    database: CanDatabase
+    forward_speed: BoundSignal
+    steering_angle: BoundSignal
+    alive: BoundSignal | None
+    drive_bits: dict[str, float]
+    stop_bits: dict[str, float]
+
+    def make_frame(
+        self, forward_speed: float, steering_angle: float, number: int, *, is_stop: bool = False
+    ) -> CanFrame:
+        """Encode a command, m/s and radians; `number` is the frame count for the alive counter."""
+        raw = dict(self.stop_bits if is_stop else self.drive_bits)
+        raw[self.forward_speed.name] = self.forward_speed.to_bits(self.map.forward_speed.from_si(forward_speed))
+        raw[self.steering_angle.name] = self.steering_angle.to_bits(self.map.steering_angle.from_si(steering_angle))
+        if self.alive is not None:
+            raw[self.alive.name] = number % (1 << self.alive.length)
+        return self.database.encode(self.map.message, raw)
+
+    def find_range_problem(self, forward_speed: float, steering_angle: float) -> str:
+        """Describe why the signals cannot represent a speed or an angle; empty if they can."""
+        for signal, mapped, value, unit in (
+            (self.forward_speed, self.map.forward_speed, forward_speed, "m/s"),
+            (self.steering_angle, self.map.steering_angle, steering_angle, "rad"),
+        ):
+            held = mapped.to_si(_round_trip(signal, mapped.from_si(value)))
+            if abs(held - value) > 1e-9 + abs(mapped.scale * signal.scale):
+                return f"{signal.message}.{signal.name} holds {held:g} {unit} at most, {value:g} is allowed"
+        return ""
+
+
+def bind_command(command: CommandMap, database: CanDatabase, place: str) -> BoundCommand:
+    """Bind the command mapping. Raises ConfigError with every missing, unknown or unsuitable signal."""
+    binder = SignalBinder(database, place)
+    speed = binder.bind_signal(command.forward_speed.signal, "forward_speed")
+    steering = binder.bind_signal(command.steering_angle.signal, "steering_angle")
+    alive = binder.bind_signal(command.alive, "alive", whole=True) if command.alive else None
+    drive_bits = _bind_constants(binder, command, "drive_signals")
+    stop_bits = drive_bits | _bind_constants(binder, command, "stop_signals")
+    if speed is not None:
+        mapped = command.forward_speed
+        held = mapped.to_si(_round_trip(speed, mapped.from_si(0.0)))
+        # a stop that would be a motion: 0 rounds to another value, and no other signal means stop
+        if abs(held) > 1e-9 and drive_bits == stop_bits:
+            text = f"{speed.message}.{speed.name} cannot represent 0: stop would be sent as {held:g} m/s"
+            fix = "set a signal in `stop_signals` that differs from `drive_signals`, or correct scale and offset"
+            binder.add_problem("forward_speed", text, fix)
+    if alive is not None and alive.is_signed:
+        binder.add_problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
+    if command.message in database.messages:
+        bound = {signal.name for signal in (speed, steering, alive) if signal is not None} | drive_bits.keys()
+        for name in database.bind_signals(command.message).keys() - bound:
+            fix = f"add {name}: 0, or what the controller expects there"
+            binder.add_problem(
+                "drive_signals", f"{command.message}.{name} is given no value, and the frame needs one", fix
+            )
+    binder.finish()
+    assert speed is not None
+    assert steering is not None
+    return BoundCommand(command, database, speed, steering, alive, drive_bits, stop_bits)
+
+
+def _bind_constants(binder: SignalBinder, command: CommandMap, key: str) -> dict[str, float]:
+    given = {}
+    for name, value in getattr(command, key).items():
+        signal = binder.bind_signal(f"{command.message}.{name}", f"{key}.{name}")
+        if signal is None:
+            continue
+        given[name] = signal.to_bits(value)
+        if abs(_round_trip(signal, value) - value) > 1e-9 + 0.5 * abs(signal.scale):
+            fix = f"{_round_trip(signal, value):g} is the nearest that it holds"
+            binder.add_problem(f"{key}.{name}", f"{command.message}.{name} cannot hold {value:g}", fix)
+    return given
+
+
+def _round_trip(signal: BoundSignal, physical: float) -> float:
+    return physical if signal.is_float else signal.to_raw(physical) * signal.scale + signal.offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +322,23 @@ class _ActiveCommand(NamedTuple):
     until_ns: int
 
 
-class CommandedDriver(CanDriver):
-    """Base of a driver that accepts commands and sends their frames, if the settings have any; see the module."""
+class VehicleDriver(CanDriver):
+    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings`.
 
-    def __init__(self, settings: VehicleSettings, database: CanDatabase, needed: Mapping[FrameKey, str]):
-        """Bind the signals of the command. Raises ConfigError for unknown or unsuitable ones."""
+    A status is published if its fault word and its count of rejections were received or are not mapped; missing
+    numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
+    """
+
+    def __init__(self, settings: VehicleSettings, database: CanDatabase):
+        """Bind the signals of status and command. Raises ConfigError for unknown or unsuitable ones."""
+        place = f"drivers.{settings.source}"
+        self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
+        signals = self._status.signals if self._status is not None else {}
+        needed = {signal.key: signal.message for signal in signals.values()}
         super().__init__(database, needed, settings.silence, settings.window)
+        self.max_silence = settings.silence if signals else math.inf
+        self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
+        self._mode: VehicleMode | None = None
         self.settings = settings
         self._signals: BoundCommand | None = None
         self._command_key: FrameKey | None = None
@@ -139,7 +352,7 @@ class CommandedDriver(CanDriver):
         self._warned_until_ns: dict[str, int] = {}
         if settings.command is None:
             return
-        place, limits = f"drivers.{settings.source}", settings.limits
+        limits = settings.limits
         self._signals = bind_command(settings.command, database, f"{place}.command")
         self._command_key = self._signals.forward_speed.key
         forward, backward = (
@@ -153,7 +366,7 @@ class CommandedDriver(CanDriver):
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start; discard the active command and send stop instead: no command survives a reconnect."""
         outputs = super().on_open(now)
-        self._active = None
+        self._active, self._mode = None, None
         return [*outputs, self._make_frame(now)] if self._is_transmitting else outputs
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
@@ -225,7 +438,6 @@ class CommandedDriver(CanDriver):
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
         is_sending = self._is_transmitting and not self.is_bus_off
         deadlines = (super().get_deadline(), self._next_ns if is_sending else None)
         until_ns = self._active.until_ns if self._active is not None and is_sending else None
@@ -289,7 +501,6 @@ class CommandedDriver(CanDriver):
         return replace(command, forward_speed=speed, steering_angle=angle), " and ".join(exceeded)
 
     def _make_frame(self, now: HostTime) -> Send[CanFrame]:
-        """Make the next frame of the active command, or of stop without one."""
         assert self._signals is not None
         is_stop = self._active is None
         self.counts["stops_sent"] += is_stop
@@ -304,29 +515,6 @@ class CommandedDriver(CanDriver):
             return []
         self._warned_until_ns[reason] = now.monotonic_ns + _WARNING_INTERVAL_NS
         return [EndpointStatus(self.phase, text, is_warning=True)]
-
-
-class VehicleDriver(CommandedDriver):
-    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings`.
-
-    A status is published if its fault word and its count of rejections were received or are not mapped; missing
-    numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
-    """
-
-    def __init__(self, settings: VehicleSettings, database: CanDatabase):
-        """Bind the signals. Raises ConfigError for unknown or unsuitable ones."""
-        place = f"drivers.{settings.source}.status"
-        self._status = bind_status(settings.status, database, place) if settings.status else None
-        signals = self._status.signals if self._status is not None else {}
-        super().__init__(settings, database, {signal.key: signal.message for signal in signals.values()})
-        self.max_silence = settings.silence if signals else math.inf
-        self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
-        self._mode: VehicleMode | None = None
-
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start; no command survives a reconnect, stop is sent instead."""
-        self._mode = None
-        return super().on_open(now)
 
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         status = self._status

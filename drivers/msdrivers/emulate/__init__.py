@@ -1,1 +1,306 @@
-"""Emulators of devices: each an `Endpoint` at the device's end of a line."""
+"""Emulators of devices: each an `Endpoint` at the device's end of a line. Here: faults, and what emulators share.
+
+Faults of emulated devices have texts, instants at which they are due, and effects on what the device sends.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+
+from modelserver.errors import find_nearest_names, quote
+from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
+from msdrivers.endpoint import (
+    CanFrame,
+    Endpoint,
+    EndpointPhase,
+    EndpointStatus,
+    HostTime,
+    Output,
+    Registers,
+    Send,
+    U,
+    make_bus_off_frame,
+)
+
+S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample)
+
+
+class InjectedFault(NamedTuple):
+    """A fault `at` seconds after the start; the meaning of `amount` depends on the kind."""
+
+    at: float
+    kind: str
+    amount: float = 1.0
+
+
+FAULT_AMOUNTS: Mapping[str, str] = {
+    "drop": "units that are lost",
+    "corrupt": "units that arrive damaged",
+    "stall": "seconds of silence",
+    "restart": "seconds that a restart takes",
+    "jump": "seconds by which its time jumps ahead",
+}
+"""Kinds of faults and the default meaning of their amounts."""
+
+
+def parse_fault(text: str, known: Mapping[str, str] = FAULT_AMOUNTS) -> InjectedFault:
+    """Return the fault of `KIND@SECONDS[:AMOUNT]`, one of the `known` kinds.
+
+    Raises ValueError for a malformed text.
+    """
+    kind, at_sign, when = text.partition("@")
+    if not at_sign:
+        raise ValueError(f"{quote(text, 40)} is not of the form KIND@SECONDS[:AMOUNT], e.g. stall@10:2")
+    if kind not in known:
+        near = find_nearest_names(kind, known)
+        kinds = "; ".join(f"{name}: {amount}" for name, amount in known.items())
+        hint = f"did you mean {near[0]}?" if near else f"there are, with their amounts: {kinds}"
+        raise ValueError(f"{quote(kind, 40)} is no fault; {hint}")
+    at, _, amount = when.partition(":")
+    try:
+        fault = InjectedFault(float(at), kind, float(amount) if amount else 1.0)
+    except ValueError:
+        raise ValueError(f"{quote(when, 40)} is not of the form SECONDS[:AMOUNT], e.g. 10:2") from None
+    if not (0.0 <= fault.at < 1e9 and 0.0 < fault.amount < 1e9):
+        raise ValueError(f"{quote(when, 40)}: seconds are 0 or more, an amount is above 0")
+    return fault
+
+
+@runtime_checkable
+class HasOwnFaults(Protocol):
+    """An emulator that applies some faults itself."""
+
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        """Apply a fault, if it is one of the device's own; return whether it is."""
+
+    def corrupt(self, unit: Any) -> Any:
+        """Return a damaged unit, as the line would."""
+
+
+class FaultInjector(Generic[U]):
+    """An `Endpoint` that wraps another and applies faults in the order of their times.
+
+    drop: `amount` units are lost. corrupt: `amount` units are damaged. stall, restart, bus_off: nothing passes for
+    `amount` seconds, then a restarted device is replaced by a new one; after bus_off the interface reports it. jump:
+    the device's clock is shifted. What a device applies itself (`HasOwnFaults`) is left to it. `make` returns the
+    device as after power-on.
+    """
+
+    def __init__(self, make: Callable[[], Endpoint[U]], faults: Iterable[InjectedFault]):
+        self._make = make
+        self._inner = make()
+        self._faults = deque(sorted(faults, key=lambda fault: fault.at))
+        self._started_ns: int | None = None
+        self._silent_until_ns = 0
+        self._pending: Counter[str] = Counter()
+        self._is_restarting = False
+        self._clock_jump_ns = 0
+        self._counts: Counter[str] = Counter()
+
+    def on_open(self, now: HostTime) -> Sequence[Output[U]]:
+        self._started_ns = now.monotonic_ns if self._started_ns is None else self._started_ns
+        return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
+
+    def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
+        """Pass on a received unit unless the device is silent."""
+        struck = self._apply_due_faults(now)
+        if now.monotonic_ns < self._silent_until_ns:
+            return struck
+        return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
+        """Apply due faults; fire the device's timer."""
+        outputs = self._apply_due_faults(now)
+        if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
+            self._is_restarting = False
+            self._inner = self._make()
+            outputs += self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
+        due = self._inner.get_deadline()
+        if not self._is_restarting and due is not None and now.monotonic_ns + self._clock_jump_ns >= due:
+            outputs += self._filter_outputs(self._inner.on_timer(self._to_device_time(now)), now)
+        return outputs
+
+    def get_deadline(self) -> int | None:
+        """Return when the device, or a fault, is due."""
+        inner = self._inner.get_deadline()
+        device = None if inner is None else inner - self._clock_jump_ns
+        dues = (self._silent_until_ns if self._is_restarting else device, self._get_fault_ns())
+        return min((due for due in dues if due is not None), default=None)
+
+    def on_close(self, now: HostTime) -> Sequence[Output[U]]:
+        return self._filter_outputs(self._inner.on_close(self._to_device_time(now)), now)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """The device's counters, and the units that were silenced, dropped and corrupted."""
+        return {**self._inner.counts, **self._counts}
+
+    def _to_device_time(self, now: HostTime) -> HostTime:
+        return HostTime(now.monotonic_ns + self._clock_jump_ns, now.utime + self._clock_jump_ns // 1000)
+
+    def _get_fault_ns(self) -> int | None:
+        if self._started_ns is None or not self._faults:
+            return None
+        return self._started_ns + round(self._faults[0].at * 1e9)
+
+    def _apply_due_faults(self, now: HostTime) -> list[Output[U]]:
+        outputs: list[Output[U]] = []
+        while (due := self._get_fault_ns()) is not None and due <= now.monotonic_ns:
+            fault = self._faults.popleft()
+            outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
+            if fault.kind == "bus_off":
+                outputs.append(cast(Send[U], Send(make_bus_off_frame())))
+            if fault.kind in ("stall", "restart", "bus_off"):
+                self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
+            self._pending[fault.kind] += round(fault.amount)
+            if isinstance(self._inner, HasOwnFaults) and self._inner.apply_fault(fault, now):
+                continue
+            self._is_restarting = self._is_restarting or fault.kind == "restart"
+            if fault.kind == "jump":
+                self._clock_jump_ns += round(fault.amount * 1e9)
+        return outputs
+
+    def _filter_outputs(self, outputs: Sequence[Output[U]], now: HostTime) -> list[Output[U]]:
+        """Return what passes, some units damaged."""
+        passed: list[Output[U]] = []
+        for output in outputs:
+            if not isinstance(output, Send):
+                passed.append(output)
+            elif now.monotonic_ns < self._silent_until_ns:
+                self._counts["fault.silenced"] += 1
+            elif self._pending["drop"] > 0:
+                self._pending["drop"] -= 1
+                self._counts["fault.dropped"] += 1
+            elif self._pending["corrupt"] > 0:
+                self._pending["corrupt"] -= 1
+                self._counts["fault.corrupted"] += 1
+                damage = self._inner.corrupt if isinstance(self._inner, HasOwnFaults) else corrupt_unit
+                passed.append(Send(damage(output.unit)))
+            else:
+                passed.append(output)
+        return passed
+
+
+def corrupt_unit(unit: Any) -> Any:
+    """Return a unit with one bit flipped in its middle; one without anything in it as it is."""
+    if isinstance(unit, bytes):
+        middle = len(unit) // 2
+        return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
+    if isinstance(unit, CanFrame):
+        return replace(unit, data=corrupt_unit(unit.data))
+    if isinstance(unit, Registers) and unit.values:
+        return replace(unit, values=(unit.values[0] ^ 0x10, *unit.values[1:]))
+    return unit
+
+
+class CanEmulator(ABC, Generic[S]):
+    """Base of an emulator on a CAN bus that sends samples at their stamps.
+
+    If the first stamp is in the past when the line is first opened, all are shifted equally. A corrupt frame lacks its
+    last byte.
+    """
+
+    def __init__(self, text: str, samples: Iterable[S]):
+        """`text` is the status when the line is opened."""
+        self._text = text
+        self._samples: Iterator[S] = iter(samples)
+        self._next: S | None = next(self._samples, None)
+        self._started: tuple[int, int] | None = None
+        self.counts: Counter[str] = Counter()
+
+    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Start at the first opening; later the device has continued."""
+        if self._started is None:
+            first = now.utime if self._next is None else self._next.header.utime
+            self._started = (now.monotonic_ns, min(now.utime, first))
+        return [EndpointStatus(EndpointPhase.STREAMING, self._text), *self.on_timer(now)]
+
+    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+        return []
+
+    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Send the frames that are due."""
+        outputs: list[Output[CanFrame]] = []
+        while (due := self.get_deadline()) is not None and due <= now.monotonic_ns:
+            sample = None
+            if self._get_sample_ns() == due:
+                sample, self._next = self._next, next(self._samples, None)
+            outputs += [Send(each) for each in self._make_frames(sample, due)]
+        return outputs
+
+    def get_deadline(self) -> int | None:
+        return self._get_sample_ns()
+
+    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
+        return []
+
+    def corrupt(self, unit: CanFrame) -> CanFrame:
+        return replace(unit, data=unit.data[:-1])
+
+    def _get_sample_ns(self) -> int | None:
+        if self._next is None or self._started is None:
+            return None
+        return self._started[0] + (self._next.header.utime - self._started[1]) * 1000
+
+    @abstractmethod
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        """Apply a fault, if it is one of the device's own; return whether it is."""
+
+    @abstractmethod
+    def _make_frames(self, sample: S | None, at_ns: int) -> Iterable[CanFrame]:
+        """Make the frames of an instant; `sample` is the one that is due, if any."""
+
+
+class SampleEmulator(ABC, Generic[S]):
+    """An `Endpoint` of bytes at the device's end of a line. `samples` are in the order of their stamps.
+
+    `latency` is the time from the instant of a sample to its first byte, seconds.
+    """
+
+    def __init__(self, samples: Iterable[S], latency: float = 0.0) -> None:
+        self._samples: Iterator[S] = iter(samples)
+        self._next: S | None = next(self._samples, None)
+        self._first_utime = 0 if self._next is None else self._next.header.utime
+        self._latency_us = round(latency * 1e6)
+        self._now: HostTime | None = None
+        self.counts: Counter[str] = Counter()
+        """What was sent and received, by kind."""
+
+    @abstractmethod
+    def _encode(self, sample: S) -> bytes:
+        """Return what the device sends for a sample; empty for nothing."""
+
+    def _answer(self, unit: bytes) -> Iterable[bytes]:
+        """Yield the answers to received bytes."""
+        return ()
+
+    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """The host's end of the line is open; a device does not notice."""
+        self._now = now
+        return []
+
+    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        self._now = now
+        return [Send(each) for each in self._answer(unit) if each]
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Send the samples up to now."""
+        self._now = now
+        out: list[Output[bytes]] = []
+        while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:
+            if data := self._encode(self._next):
+                out.append(Send(data))
+            self._next = next(self._samples, None)
+        return out
+
+    def get_deadline(self) -> int | None:
+        if self._now is None or self._next is None:
+            return None
+        return self._now.monotonic_ns + (self._next.header.utime + self._latency_us - self._now.utime) * 1000
+
+    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+        return []

@@ -1,21 +1,116 @@
-"""Emulator of a drive-by-wire controller on a CAN bus: commands with a dead-man timer in, status out.
+"""Emulators of what moves on a vehicle: wheel encoders and the drive-by-wire controller (CAN), a nodding axis, joints.
 
-Speed and steering approach the command, each at a limited rate.
+The controller takes commands with a dead-man timer and sends its status; speed and steering approach the command, each
+at a limited rate. The axis is a register map on Modbus/TCP: it turns at the commanded rate, reverses at the limits, and
+measures its angle in whole steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
-from modelserver.messages import VehicleMode, VehicleStatusSample
-from msdrivers.emulate.faults import CanEmulator, InjectedFault
-from msdrivers.endpoint import HostTime, Output
-from msdrivers.protocol.can.database import CanDatabase, FrameError
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.can.mapping import CommandMap, StatusMap
-from msdrivers.protocol.can.vehicle import NUMERIC_FIELDS, BoundCommand, bind_command, bind_status
+from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from msdrivers.devices.axis import AxisRegisters
+from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
+from msdrivers.devices.text import TextSettings, encode_line
+from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
+from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
+from msdrivers.emulate import CanEmulator, InjectedFault
+from msdrivers.endpoint import (
+    MAX_READ,
+    MAX_WRITE,
+    CanFrame,
+    EndpointPhase,
+    EndpointStatus,
+    FailureKind,
+    HostTime,
+    ModbusFailure,
+    ModbusUnit,
+    Output,
+    ReadRegisters,
+    Registers,
+    RegistersWritten,
+    RegisterTable,
+    Send,
+    WriteRegisters,
+    explain_exception,
+)
+
+
+class WheelsEmulator(CanEmulator[WheelsSample]):
+    """An `Endpoint` of CAN frames. Missing values of a sample keep the last one; signals that are not mapped are 0."""
+
+    def __init__(
+        self,
+        wheels: Mapping[str, WheelMap],
+        database: CanDatabase,
+        samples: Iterable[WheelsSample],
+        first_count: int = 0,
+    ):
+        """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
+        super().__init__(f"{len(wheels)} wheels emulated", samples)
+        self._database = database
+        self._wheels = bind_wheels(wheels, database, "wheels")
+        self._raw: dict[str, dict[str, float]] = {}
+        for wheel in self._wheels:
+            for signal in wheel.signals:
+                self._raw.setdefault(signal.message, dict.fromkeys(database.bind_signals(signal.message), 0))
+        self._offset = dict.fromkeys((wheel.name for wheel in self._wheels), first_count)
+        self._counted = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
+        self._rolled = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
+
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        for name in self._offset:
+            if fault.kind == "jump":
+                self._offset[name] += round(fault.amount)
+            elif fault.kind == "restart":
+                self._offset[name] = -self._counted[name]
+        return fault.kind in ("jump", "restart")
+
+    def _make_frames(self, sample: WheelsSample | None, at_ns: int) -> list[CanFrame]:
+        if sample is None:
+            return []
+        wheels = {wheel.name: wheel for wheel in sample.wheels}
+        for wheel in self._wheels:
+            if wheel.name in wheels:
+                self._set_wheel(wheel, wheels[wheel.name])
+        self.counts["frames"] += len(self._raw)
+        return [self._database.encode(message, raw) for message, raw in self._raw.items()]
+
+    def _set_wheel(self, wheel: BoundWheel, sample: WheelSample) -> None:
+        mapped = wheel.map
+        if wheel.count is not None and mapped.count is not None and math.isfinite(sample.travel):
+            rolled = round(sample.travel / mapped.count.meters_per_count)
+            step = rolled - self._rolled[wheel.name]
+            self._counted[wheel.name] += abs(step) if mapped.count.counts_up_only else step
+            self._rolled[wheel.name] = rolled
+            count = (self._counted[wheel.name] + self._offset[wheel.name]) % (
+                mapped.count.wrap or 1 << wheel.count.length
+            )
+            signed = wheel.count.is_signed and count >= 1 << (wheel.count.length - 1)
+            self._set_raw(wheel.count, count - (1 << wheel.count.length) if signed else count)
+        if wheel.speed is not None and mapped.speed is not None and math.isfinite(sample.speed):
+            speed = sample.speed / mapped.speed.scale
+            self._set_raw(wheel.speed, wheel.speed.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
+        if wheel.direction is not None and mapped.direction is not None:
+            numbers = {
+                Direction.STOPPED: mapped.direction.stopped,
+                Direction.FORWARD: mapped.direction.forward,
+                Direction.BACKWARD: mapped.direction.backward,
+            }
+            known = set(numbers.values())
+            unknown = next((each for each in range(1 << wheel.direction.length) if each not in known), 0)
+            self._set_raw(wheel.direction, numbers.get(sample.direction, unknown))
+        if wheel.steering is not None and mapped.steering is not None and math.isfinite(sample.steering):
+            self._set_raw(wheel.steering, wheel.steering.to_bits(mapped.steering.from_si(sample.steering)))
+
+    def _set_raw(self, signal: BoundSignal, raw: float) -> None:
+        self._raw[signal.message][signal.name] = raw
+
 
 MAX_REJECTED_COUNT = 255
 
@@ -49,10 +144,9 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         command: CommandMap | None = None,
         unit: VehicleUnit | None = None,
         samples: Iterable[VehicleStatusSample] = (),
-        faults: Iterable[InjectedFault] = (),
     ):
         """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
-        super().__init__("vehicle controller emulated", samples, faults)
+        super().__init__("vehicle controller emulated", samples)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
         """Driving mode; set it to press the emergency stop."""
@@ -77,11 +171,10 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         return super().on_open(now)
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Process a command."""
         outputs = self.on_timer(now)
         command = self._command
         is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
-        if command is None or not is_command or self._faults.is_silent(now.monotonic_ns):
+        if command is None or not is_command:
             return outputs
         try:
             self._on_command(command, self._database.decode(unit), now.monotonic_ns)
@@ -96,9 +189,11 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         other = super().get_deadline()
         return self._status_ns if other is None else min(self._status_ns, other)
 
-    def _on_fault(self, fault: InjectedFault) -> None:
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "restart":
             self.rejected, self._commanded_ns, self._alive = 0, None, None
+        # it has no counters that could jump
+        return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
         self._advance(at_ns)
@@ -164,7 +259,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
             message = raw.setdefault(signal.message, dict.fromkeys(self._database.bind_signals(signal.message), 0))
             if name in values:
                 mapped = getattr(status.map, name)
-                message[signal.name] = signal.to_bits((values[name] - mapped.offset) / mapped.scale)
+                message[signal.name] = signal.to_bits(mapped.from_si(values[name]))
             elif name == "mode":
                 message[signal.name] = status.map.modes.get(self.mode.name.lower(), 0)
             else:
@@ -172,3 +267,216 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
                     unit.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
                 )
         return [self._database.encode(message, bits) for message, bits in raw.items()]
+
+
+ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class AxisUnit:
+    """The axis as it is switched on. Degrees and degrees a second."""
+
+    lower_deg: float = -15.0
+    upper_deg: float = 15.0
+    rate_deg: float = 0.0
+    angle_deg: float = 0.0
+    lowest_deg: float = -90.0
+    """Lower limits are rejected."""
+    highest_deg: float = 90.0
+    slowest_deg: float = 2.0
+    """Lower rates except 0 are rejected."""
+    fastest_deg: float = 90.0
+    step_deg: float = 0.072
+    measure_hz: float = 500.0
+    """Measurements a second; a reading between two gives the last."""
+
+
+class AxisEmulator:
+    """An `Endpoint` of `ModbusUnit` that answers requests.
+
+    Faults of its own: a corrupt reply lacks a register. restart: it restarts with its first limits and rate. jump: its
+    angle jumps by `amount` degrees. exception: the next request gets exception code `amount`.
+    """
+
+    def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
+        self.unit = unit or AxisUnit()
+        self._registers = registers
+        self._started_ns: int | None = None
+        self._exceptions: deque[int] = deque()
+        self.counts: Counter[str] = Counter()
+        self._switch_on(0)
+
+    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Power on at the first opening; later the axis has continued."""
+        if self._started_ns is None:
+            self._started_ns = self._updated_ns = now.monotonic_ns
+        return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
+
+    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
+        if not isinstance(unit, ReadRegisters | WriteRegisters):
+            return []
+        self._advance(now.monotonic_ns)
+        code = self._exceptions.popleft() if self._exceptions else 0
+        reply = self._make_exception(unit, code) if code else self._answer(unit)
+        self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
+        return [Send(reply)]
+
+    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        return []
+
+    def get_deadline(self) -> int | None:
+        return None
+
+    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        return []
+
+    def _switch_on(self, at_ns: int) -> None:
+        unit = self.unit
+        self.commanded = {"lower_limit": unit.lower_deg, "upper_limit": unit.upper_deg, "nod_rate": unit.rate_deg}
+        """The limits and the rate that it nods by, degrees (a second)."""
+        self.degrees = self._measured_deg = unit.angle_deg
+        """True angle at the last request."""
+        self._direction, self._measured_rate = 1.0, 0.0
+        self._updated_ns, self._number = at_ns, 0
+
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
+        if fault.kind == "exception":
+            self._exceptions.append(round(fault.amount))
+        elif fault.kind == "jump":
+            self._advance(now.monotonic_ns)
+            self.degrees += fault.amount
+        elif fault.kind == "restart":
+            self._switch_on(now.monotonic_ns + round(fault.amount * 1e9))
+        return fault.kind in ("exception", "jump", "restart")
+
+    def corrupt(self, unit: ModbusUnit) -> ModbusUnit:
+        return replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
+
+    def _advance(self, at_ns: int) -> None:
+        """Turn on to an instant, and measure at the last instant of its own before."""
+        tick_ns = round(1e9 / self.unit.measure_hz)
+        ticks = (at_ns - (self._started_ns or 0)) // tick_ns
+        measured_ns = (self._started_ns or 0) + ticks * tick_ns
+        if measured_ns > self._updated_ns:
+            self._number = ticks & 0xFFFF
+            turned = self._rotate((measured_ns - self._updated_ns) * 1e-9)
+            self._updated_ns = measured_ns
+            self._measured_deg = round(self.degrees / self.unit.step_deg) * self.unit.step_deg
+            self._measured_rate = turned
+
+    def _rotate(self, seconds: float) -> float:
+        """Rotate for a time; return the signed rate at its end."""
+        lower, upper, rate = self.commanded["lower_limit"], self.commanded["upper_limit"], self.commanded["nod_rate"]
+        if rate == 0.0:
+            return 0.0
+        left = rate * seconds
+        if not lower <= self.degrees <= upper:
+            # the limits were moved, or it was pushed: back between them first
+            near = min(max(self.degrees, lower), upper)
+            self._direction = 1.0 if near > self.degrees else -1.0
+            way = min(left, abs(near - self.degrees))
+            self.degrees += self._direction * way
+            left -= way
+        if left > 0.0:
+            # unfolded, the nodding motion is periodic in twice the span
+            span = upper - lower
+            phase = self.degrees - lower if self._direction > 0.0 else 2.0 * span - (self.degrees - lower)
+            phase = (phase + left) % (2.0 * span)
+            self._direction = 1.0 if phase < span else -1.0
+            self.degrees = lower + (phase if phase < span else 2.0 * span - phase)
+        return self._direction * rate
+
+    def _answer(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
+        if isinstance(unit, WriteRegisters):
+            return self._write(unit)
+        table = self._make_table(unit.table)
+        wanted = range(unit.address, unit.address + unit.count)
+        # between its registers it has others, which are 0
+        if not 0 < unit.count <= MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
+            return self._make_exception(unit, ILLEGAL_ADDRESS)
+        return Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
+
+    def _make_table(self, table: RegisterTable) -> dict[int, int]:
+        registers = self._registers
+        words: dict[int, int] = {}
+        if table is RegisterTable(registers.table):
+            values = {"angle": self._measured_deg, "rate": self._measured_rate}
+            for name, mapped in registers.measured.items():
+                found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
+                words |= {mapped.address + index: word for index, word in enumerate(found)}
+        if table is RegisterTable.HOLDING:
+            for name, mapped in registers.commanded.items():
+                found = mapped.from_degrees(self.commanded[name])
+                words |= {mapped.address + index: word for index, word in enumerate(found)}
+        return words
+
+    def _write(self, unit: WriteRegisters) -> ModbusUnit:
+        places = {(mapped.address, mapped.registers): name for name, mapped in self._registers.commanded.items()}
+        name = places.get((unit.address, len(unit.values)))
+        if name is None or len(unit.values) > MAX_WRITE:
+            return self._make_exception(unit, ILLEGAL_ADDRESS)
+        after = self.commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
+        axis, rate = self.unit, after["nod_rate"]
+        slack = 0.5 * axis.step_deg
+        fits = axis.lowest_deg - slack <= after["lower_limit"] < after["upper_limit"] <= axis.highest_deg + slack and (
+            rate == 0.0 or axis.slowest_deg - slack <= rate <= axis.fastest_deg + slack
+        )
+        if not fits:
+            return self._make_exception(unit, ILLEGAL_VALUE)
+        self.commanded = after
+        return RegistersWritten(unit.address, len(unit.values), unit.transaction)
+
+    def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
+        return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, unit.transaction)
+
+
+PERIOD_US: Final = 20_000
+"""Microseconds between lines."""
+
+AMPLITUDE: Final = 0.5
+"""Radians or meters to either side."""
+
+SWEEP_S: Final = 8.0
+"""Period of the first joint, seconds; that of each further one is a third shorter."""
+
+
+class TextJointsEmulator:
+    """An `Endpoint` of bytes that sends a line every `PERIOD_US`."""
+
+    def __init__(self, settings: TextSettings) -> None:
+        self._settings = settings
+        self._first: HostTime | None = None
+        self._sent = 0
+        self.counts: Counter[str] = Counter()
+        """Lines sent."""
+
+    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
+        self._first = self._first or now
+        return []
+
+    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        return []
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Send the lines that are due, the newest only after a pause."""
+        assert self._first is not None
+        due = (now.monotonic_ns - self._first.monotonic_ns) // (1000 * PERIOD_US)
+        if due < self._sent:
+            return []
+        self._sent = due + 1
+        self.counts["lines"] += 1
+        return [Send(encode_line(self._settings, self.get_values(due * PERIOD_US * 1e-6)))]
+
+    def get_deadline(self) -> int | None:
+        return None if self._first is None else self._first.monotonic_ns + self._sent * PERIOD_US * 1000
+
+    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+        return []
+
+    def get_values(self, seconds: float) -> dict[str, float]:
+        """Return the fields of a line, `seconds` after the first."""
+        values = {}
+        for number, name in enumerate(self._settings.mapped):
+            period = SWEEP_S * (2.0 / 3.0) ** number
+            values[name] = 1.0 + seconds if name == "time" else AMPLITUDE * math.sin(math.tau * seconds / period)
+        return values

@@ -14,9 +14,9 @@ from typing import Any
 
 import can
 
-from msdrivers.line_settings import MULTICAST, find_channel_problem, find_interface_problem, split_group
+from msdrivers.endpoint import CanFrame
 from msdrivers.links import LinkError
-from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.registry import MULTICAST, find_channel_problem, find_interface_problem, split_group
 
 MAX_FRAMES_PER_POLL = 64
 """Frames taken at a time at most."""
@@ -78,7 +78,6 @@ class CanLink:
             raise self._explain_error(error) from None
 
     def close(self) -> None:
-        """Close the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
             with contextlib.suppress(Exception):
@@ -106,7 +105,6 @@ class CanLink:
         return frames
 
     def send(self, unit: CanFrame) -> None:
-        """Send a frame. Raises LinkError."""
         message = can.Message(
             arbitration_id=unit.arbitration_id,
             data=unit.data,

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Generic, TypeVar
+from typing import Generic
 
-from msdrivers.endpoint import HostTime
+from msdrivers.endpoint import HostTime, U
 from msdrivers.links import LinkError
-
-U = TypeVar("U")
 
 
 class FakeTimeSource:
@@ -46,7 +44,6 @@ class FakeLink(Generic[U]):
         self.is_open = False
 
     def open(self, baud: int | None = None) -> None:
-        """Open it, where it is not away."""
         self._check()
         self.baud = baud or self.baud
         self.opened_bauds.append(baud)

@@ -24,9 +24,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from msdrivers.links import Link, LinkError, LinkWrapper
-from msdrivers.links.tcp import TcpServerLink
-from msdrivers.protocol.modbus.registers import (
+from msdrivers.endpoint import (
     FailureKind,
     ModbusFailure,
     ModbusUnit,
@@ -37,6 +35,7 @@ from msdrivers.protocol.modbus.registers import (
     WriteRegisters,
     explain_exception,
 )
+from msdrivers.links import Link, LinkError, LinkWrapper, TcpServerLink
 
 _HEADER = struct.Struct(">HHHB")
 
@@ -107,7 +106,6 @@ class ModbusLink(LinkWrapper[bytes]):
         return f"modbus {self._link.description.removeprefix('tcp ')} unit {self._unit_id}"
 
     def open(self, baud: int | None = None) -> None:
-        """Connect. Raises LinkError."""
         self._framer.clear()
         self._pending.clear()
         super().open(baud)

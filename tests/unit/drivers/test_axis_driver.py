@@ -12,23 +12,25 @@ import pytest
 from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis_settings
 
 from modelserver.messages import DriverHealth, DriverPhase, JointsSample
-from msdrivers.devices.axis import AxisDriver, AxisSettings, NodSettings
-from msdrivers.emulate.axis import AxisEmulator, AxisUnit
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.endpoint import EndpointPhase, HostTime, MeasuredSample, Reopen, Send
-from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.modbus.registers import (
-    AxisRegisters,
+from msdrivers.devices.axis import AxisDriver, AxisRegisters, AxisSettings, NodSettings, RegisterMap
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.vehicle import AxisEmulator, AxisUnit
+from msdrivers.endpoint import (
+    EndpointPhase,
     FailureKind,
+    HostTime,
+    MeasuredSample,
     ModbusFailure,
     ModbusUnit,
     ReadRegisters,
-    RegisterMap,
     Registers,
     RegistersWritten,
     RegisterTable,
+    Reopen,
+    Send,
     WriteRegisters,
 )
+from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.runner import Runner, RunnerSettings
 
 STEP = 0.072 * DEG
@@ -39,8 +41,8 @@ def connect(
 ) -> tuple[Wire[ModbusUnit], AxisDriver, AxisEmulator]:
     settings = settings or axis_settings()
     driver = AxisDriver(settings)
-    emulator = AxisEmulator(settings.registers, unit, faults)
-    return Wire(driver, emulator, flight_s=flight_s), driver, emulator
+    emulator = AxisEmulator(settings.registers, unit)
+    return Wire(driver, FaultInjector(lambda: emulator, faults), flight_s=flight_s), driver, emulator
 
 
 def joints(wire: Wire[ModbusUnit], begin: float = 0.0) -> list[JointsSample]:

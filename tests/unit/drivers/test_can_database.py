@@ -9,20 +9,10 @@ import pytest
 from support_vehicle_bus import DBC, METERS_PER_COUNT, RAPTOR_COMMAND, RAPTOR_STATUS, raptor_dbc, wheel
 
 from modelserver.errors import ConfigError, Severity
-from msdrivers.protocol.can.database import CanDatabase, FrameError
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.frame import CanFrame, FrameKey, make_bus_off_frame
-from msdrivers.protocol.can.mapping import (
-    CommandMap,
-    CountMap,
-    DirectionMap,
-    SignalMap,
-    SpeedMap,
-    StatusMap,
-    WheelMap,
-)
-from msdrivers.protocol.can.vehicle import bind_command, bind_status
-from msdrivers.protocol.can.wheels import bind_wheels
+from msdrivers.devices.can import CanDatabase, FrameError, SignalMap, parse_dbc
+from msdrivers.devices.vehicle import CommandMap, StatusMap, bind_command, bind_status
+from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, bind_wheels
+from msdrivers.endpoint import CanFrame, FrameKey, make_bus_off_frame
 
 MIXED = """VERSION ""
 NS_ :

@@ -13,11 +13,10 @@ from support_vehicle_bus import START_UTIME, at, raptor_dbc, wheels_settings
 
 from modelserver.messages import WheelsSample
 from msdrivers.devices.wheels import WheelsDriver
-from msdrivers.endpoint import MeasuredSample
+from msdrivers.endpoint import CanFrame, MeasuredSample
 from msdrivers.links import LinkError
 from msdrivers.links import can_bus as can_module
 from msdrivers.links.can_bus import CanLink
-from msdrivers.protocol.can.frame import CanFrame
 
 
 def pair(n: int, t: float) -> list[CanFrame]:

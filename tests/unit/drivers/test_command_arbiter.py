@@ -10,12 +10,9 @@ from support_vehicle_bus import START_UTIME, at, raptor_dbc, vehicle_settings
 
 from modelserver.errors import ConfigError
 from modelserver.messages import VehicleCommand
-from msdrivers.devices.vehicle import CommandLimits, VehicleDriver
-from msdrivers.endpoint import EndpointStatus, Output, Reopen, Send
-from msdrivers.protocol.can.database import CanDatabase
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.frame import CanFrame, make_bus_off_frame
-from msdrivers.protocol.can.mapping import CommandMap, SignalMap
+from msdrivers.devices.can import CanDatabase, SignalMap, parse_dbc
+from msdrivers.devices.vehicle import CommandLimits, CommandMap, VehicleDriver
+from msdrivers.endpoint import CanFrame, EndpointStatus, Output, Reopen, Send, make_bus_off_frame
 
 DATABASE = raptor_dbc()
 

@@ -16,12 +16,20 @@ from hypothesis import strategies as st
 from pyrtcm import RTCMMessage
 from support_gps import drive, split_randomly
 
-from msdrivers.corrections import MAX_WAITING, CorrectionsClient
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from msdrivers.corrections import (
+    MAX_WAITING,
+    CorrectionsClient,
+    NtripError,
+    NtripSession,
+    RtcmStream,
+    compute_crc,
+    encode_request,
+    make_gga,
+)
 from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
-from msdrivers.line_settings import NtripSettings
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.ntrip import NtripError, NtripRequest, NtripSession, make_gga
-from msdrivers.protocol.rtcm import RtcmStream, compute_crc
+from msdrivers.registry import NtripSettings
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
 
@@ -37,7 +45,7 @@ def make_frame(number: int, station: int = 1234, size: int = 20) -> bytes:
 
 FRAMES = [make_frame(number) for number in (1005, 1077, 1087, 4072)]
 STREAM = b"".join(FRAMES)
-REQUEST = NtripRequest("caster.example", "MOUNT", "me", "secret")
+SETTINGS = NtripSettings("caster.example:2101", "MOUNT", "me", "secret")
 
 
 def test_given_a_frame_of_another_encoder_then_its_number_is_read() -> None:
@@ -82,7 +90,7 @@ ANSWERS = {
 @pytest.mark.parametrize("name", ANSWERS)
 @given(seed=st.integers(0, 1000))
 def test_given_an_answer_of_a_caster_then_its_frames_are_found_whatever_the_pieces(name: str, seed: int) -> None:
-    session = NtripSession(REQUEST)
+    session = NtripSession("MOUNT")
     found = [frame for piece in split_randomly(ANSWERS[name], seed) for frame in session.feed(piece)]
     assert [frame.data for frame in found] == FRAMES
     assert session.is_answered
@@ -104,15 +112,16 @@ def test_given_an_answer_of_a_caster_then_its_frames_are_found_whatever_the_piec
 )
 def test_given_another_answer_then_the_error_has_what_to_do(answer: bytes, words: str) -> None:
     with pytest.raises(NtripError, match=words):
-        NtripSession(REQUEST).feed(answer)
+        NtripSession("MOUNT").feed(answer)
 
 
 def test_given_a_request_and_a_position_then_they_are_written_as_casters_read_them() -> None:
-    text = REQUEST.encode().decode()
+    text = encode_request(SETTINGS).decode()
     assert text.startswith("GET /MOUNT HTTP/1.1\r\nHost: caster.example\r\nNtrip-Version: Ntrip/2.0\r\n")
     assert "Authorization: Basic bWU6c2VjcmV0\r\n" in text
     assert text.endswith("\r\n\r\n")
-    gga = make_gga(50.27, -111.18, 717.5, 12, 8 * 3600 * 1_000_000).decode()
+    fix = GpsSample(SensorHeader(0, "gps", 0), FixType.FIX_3D, 50.27, -111.18, height_msl=717.5, satellites=12)
+    gga = make_gga(fix, 8 * 3600 * 1_000_000).decode()
     assert gga.startswith("$GPGGA,080000.000,5016.2000000,N,11110.8000000,W,1,12,1.0,717.50,M,0.0,M,,*")
 
 

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault, corrupt_unit, parse_fault
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.modbus.registers import ReadRegisters, Registers
+from msdrivers.emulate import FAULT_AMOUNTS, FaultInjector, InjectedFault, corrupt_unit, parse_fault
+from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, HostTime, Output, ReadRegisters, Registers, Send
 
 TENTH_NS = 100_000_000
 

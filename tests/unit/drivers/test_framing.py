@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msdrivers.protocol.framing import FrameScanner, ParsedFrame, RejectedFrame
+from msdrivers.devices.stream import FrameScanner, ParsedFrame, RejectedFrame
 
 
 class Failing:

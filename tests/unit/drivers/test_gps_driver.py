@@ -9,23 +9,22 @@ import pytest
 from support_gps import SECOND, START, Line, add_noise, drive, now_at, split_in_half
 
 from modelserver.messages import FixType, SensorHeader
-from msdrivers.devices.gps.driver import GpsDriver, SetupDialogue, SetupProgress
-from msdrivers.devices.gps.fixes import sample_from_novatel
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.emulate.faults import FaultInjector, InjectedFault
-from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.protocol.nmea.fields import encode as nmea
-from msdrivers.protocol.novatel import (
-    CommandResponse,
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings, sample_from_novatel
+from msdrivers.devices.gps.nmea import encode as nmea
+from msdrivers.devices.gps.novatel import (
     HeadingLog,
     LogHeader,
     NovatelLog,
     Position,
     PositionType,
     TimeStatus,
+    crc32,
+    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32, encode
+from msdrivers.devices.stream import RequestStep, Script, ScriptRunner
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.gps import GpsEmulator, GpsUnit
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
 
 NMEA_UNIT = GpsUnit(
     saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), is_answering=False
@@ -444,30 +443,35 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
     late_s: float, first_is_lost: bool
 ):
     commands = tuple(f"command {n}" for n in range(6))
-    dialogue = SetupDialogue(commands, S, 3)
-    coming: list[tuple[int, str]] = []
     answered: list[tuple[str, str]] = []
+
+    def ask() -> Script:
+        for command in commands:
+            error = yield RequestStep(command.encode(), 1.0, 3)
+            answered.extend([(command, error)] if error else [])
+
+    dialogue = ScriptRunner()
+    coming: list[tuple[int, str]] = []
     now, sent = 0, 0
 
-    def send(data: bytes) -> None:
+    def send(outputs: list[Output[bytes]]) -> None:
         nonlocal sent
-        for each in data.decode().split("\r\n"):
-            if each and not (first_is_lost and sent == 0):
-                coming.append((now + round(late_s * S), each))
-            sent += bool(each)
+        for each in outputs:
+            assert isinstance(each, Send)
+            if not (first_is_lost and sent == 0):
+                coming.append((now + round(late_s * S), each.unit.decode()))
+            sent += 1
 
-    send(dialogue.start(now))
-    while dialogue.progress is SetupProgress.RUNNING:
+    send(dialogue.start(ask(), HostTime(now, 0)))
+    while dialogue.is_running:
         due = dialogue.deadline_ns
         assert due is not None
         if coming and coming[0][0] <= due:
             now, command = coming.pop(0)
             # every second command is refused, and expected which it was
             error = command if int(command[-1]) % 2 else ""
-            send(dialogue.on_response(CommandResponse(0, error), now))
+            send(dialogue.on_reply(error, HostTime(now, 0)))
         else:
             now = due
-            send(dialogue.on_timer(now))
-    answered = dialogue.rejected
-    assert dialogue.progress is SetupProgress.DONE
+            send(dialogue.on_timer(HostTime(now, 0)))
     assert answered == [(each, each) for each in commands if int(each[-1]) % 2]

@@ -9,10 +9,15 @@ from datetime import UTC, datetime
 import pytest
 
 from modelserver.messages import FixType
-from msdrivers.protocol.gps_stream import GpsStream
-from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.nmea.fields import encode, format_angle, format_number, format_time_of_day
-from msdrivers.protocol.nmea.sentences import parse_sentence
+from msdrivers.devices.gps.driver import GpsStream
+from msdrivers.devices.gps.nmea import (
+    NmeaEpoch,
+    encode,
+    format_angle,
+    format_number,
+    format_time_of_day,
+    parse_sentence,
+)
 
 KNOT = 1852.0 / 3600.0
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from msdrivers.protocol.gps_stream import GpsStream
-from msdrivers.protocol.novatel import (
+from msdrivers.devices.gps.driver import GpsStream
+from msdrivers.devices.gps.novatel import (
     CommandResponse,
     HeadingLog,
     LogHeader,
@@ -18,8 +18,9 @@ from msdrivers.protocol.novatel import (
     SolutionStatus,
     TimeStatus,
     Velocity,
+    crc32,
+    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32, encode
 
 BESTPOSB = bytes.fromhex(
     "aa44121c2a0000204800000096b45608f0c7331e20000402f6b100800000000010000000d34bee8b419349405c017abff6815cc0"

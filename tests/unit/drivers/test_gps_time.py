@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msdrivers.protocol.gps_time import (
+from msdrivers.devices.gps import (
     DAY,
     GPS_EPOCH,
     ROLLOVER,

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from support_gps import START, Line, drive, split_in_half, split_randomly
 
 from modelserver.messages import FixType
-from msdrivers.devices.gpsd import GpsdDriver, GpsdSettings
-from msdrivers.emulate.gpsd import GpsdEmulator
+from msdrivers.devices.gpsd import GpsdDriver, GpsdSettings, GpsdStream
+from msdrivers.emulate.gps import GpsdEmulator
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.protocol.gpsd import GpsdStream
 
 
 def connect(seconds: float = 30.0, has_gst: bool = True, **more: object) -> Line:

@@ -11,12 +11,12 @@ from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, ro
 
 from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.transforms import so3
-from msdrivers.devices.gx1.driver import Gx1Driver, TickRateCheck
-from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
+from msdrivers.devices import gx1 as requests
+from msdrivers.devices.gx1 import CommandByte, EepromAddress, Gains
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings, HeadingSource, TickRateCheck
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.imu import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, requests
 
 
 def imu_samples(line: Line) -> list[ImuSample]:
@@ -171,8 +171,8 @@ def test_given_a_capture_that_does_not_end_then_it_is_reported_and_the_device_is
 
 
 def test_given_a_restart_after_biases_were_captured_then_they_are_not_captured_on_the_move():
-    unit = Gx1Unit(faults=(InjectedFault(8.0, "restart"),))
-    line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), Gx1Emulator(rotating_samples(), unit=unit))
+    device = FaultInjector(lambda: Gx1Emulator(rotating_samples()), (InjectedFault(8.0, "restart"),))
+    line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), device)
     line.run(14.0)
     assert line.sent.count(requests.make_poll(CommandByte.CAPTURE_BIAS)) == 1
     assert any("not captured again, since the vehicle may be moving" in text for text in line.status_texts())

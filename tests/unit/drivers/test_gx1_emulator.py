@@ -14,12 +14,12 @@ from modelserver.simulation.imu import MagnetometerModel, simulate_imu
 from modelserver.simulation.noise import Run
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit, SampleInterpolator
+from msdrivers.devices import gx1 as requests
+from msdrivers.devices.gx1 import LAYOUTS, CommandByte, EepromAddress, Gx1Packet, Gx1Parser
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings, HeadingSource
+from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.imu import Eeprom, Gx1Emulator, Gx1Unit, SampleInterpolator
 from msdrivers.endpoint import HostTime, Send
-from msdrivers.protocol.gx1 import LAYOUTS, CommandByte, EepromAddress, Gx1Packet, Gx1Parser, requests
 
 S = 1_000_000_000
 

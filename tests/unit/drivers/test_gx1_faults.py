@@ -8,12 +8,12 @@ import random
 import pytest
 from support_gx1 import Line, RepeatingDevice, rotating_samples
 
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
+from msdrivers.devices import gx1 as requests
+from msdrivers.devices.gx1 import CommandByte, EepromAddress, Gains, Gx1Packet
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.imu import Eeprom, Gx1Emulator
 from msdrivers.endpoint import EndpointPhase, HostTime, Send
-from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, Gx1Packet, requests
 
 
 def device_times(line: Line) -> list[int]:
@@ -21,7 +21,8 @@ def device_times(line: Line) -> list[int]:
 
 
 def line_with(*faults: InjectedFault, settings: Gx1Settings | None = None, **more: object) -> Line:
-    device = Gx1Emulator(rotating_samples(), unit=Gx1Unit(faults=faults))
+    samples = rotating_samples()
+    device = FaultInjector(lambda: Gx1Emulator(samples), faults) if faults else Gx1Emulator(samples)
     return Line(Gx1Driver(settings or Gx1Settings("imu")), device, **more)  # type: ignore[arg-type]
 
 

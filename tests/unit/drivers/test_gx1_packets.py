@@ -8,17 +8,18 @@ import pytest
 from support_gx1 import DOCUMENTED_REPLIES
 
 from modelserver.transforms import so3
-from msdrivers.protocol.gx1 import (
+from msdrivers.devices import gx1 as requests
+from msdrivers.devices import gx1 as scaling
+from msdrivers.devices.gx1 import (
     LENGTHS,
     MEASUREMENTS,
     CommandByte,
     Gx1Packet,
     Gx1Parser,
+    Gx1Request,
+    RequestParser,
     append_checksum,
-    requests,
-    scaling,
 )
-from msdrivers.protocol.gx1.requests import Gx1Request, RequestParser
 
 
 def only(data: bytes) -> Gx1Packet:

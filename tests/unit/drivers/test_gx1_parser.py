@@ -9,7 +9,7 @@ import tracemalloc
 import pytest
 from support_gx1 import DOCUMENTED_REPLIES
 
-from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
+from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
 
 EULER_VECTORS, TEMPERATURE = DOCUMENTED_REPLIES[0x31], DOCUMENTED_REPLIES[0x07]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from msdrivers.devices.gx1 import TickUnwrapper
 from msdrivers.devices.gx1.driver import NEVER, PollSchedule, TickRateCheck
-from msdrivers.protocol.gx1 import TickUnwrapper
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -19,8 +19,8 @@ from modelserver.messages import (
     WheelsSample,
 )
 from modelserver.wire.codec import decode
-from msdrivers.health import DriverPublisher
 from msdrivers.registry import CHANNELS
+from msdrivers.runner import DriverPublisher
 
 HEADER = SensorHeader(1_700_000_000_000_000, "some", 7, 1_700_000_000_000_100, utime_sigma=0.001)
 

@@ -16,18 +16,14 @@ from support_gps import START, Line, add_noise, split_in_half, split_randomly
 
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
-from msdrivers.devices.stream_driver import StreamDriver
-from msdrivers.devices.vectornav import VectornavDriver, VectornavSettings
-from msdrivers.devices.xsens import SampleTimeUnwrapper, XsensDriver, XsensSettings
-from msdrivers.emulate.faults import FaultInjector, parse_fault
-from msdrivers.emulate.vectornav import VectornavEmulator, VectornavUnit
-from msdrivers.emulate.xsens import XsensEmulator, XsensUnit
+from msdrivers.devices import vectornav as vn
+from msdrivers.devices import xsens
+from msdrivers.devices.stream import StreamDriver, recognize
+from msdrivers.devices.vectornav import VectornavDriver, VectornavSettings, VnBinary, VnStream, VnText
+from msdrivers.devices.xsens import ItemId, MtData, SampleTimeUnwrapper, XbusStream, XsensDriver, XsensSettings
+from msdrivers.emulate import FaultInjector, parse_fault
+from msdrivers.emulate.imu import VectornavEmulator, XsensEmulator
 from msdrivers.endpoint import Endpoint, EndpointPhase
-from msdrivers.protocol import vectornav as vn
-from msdrivers.protocol import xsens
-from msdrivers.protocol.recognition import recognize
-from msdrivers.protocol.vectornav import VnBinary, VnStream, VnText
-from msdrivers.protocol.xsens import ItemId, MtData, XbusStream
 
 
 def turn(seconds: float, rate_hz: float = 200.0) -> Iterator[ImuSample]:
@@ -43,13 +39,13 @@ def turn(seconds: float, rate_hz: float = 200.0) -> Iterator[ImuSample]:
         )
 
 
-def connect_vectornav(seconds: float = 20.0, unit: VectornavUnit | None = None, **more: object) -> Line:
-    device = VectornavEmulator(turn(seconds), unit)
+def connect_vectornav(seconds: float = 20.0, unit_baud: int = 115200, **more: object) -> Line:
+    device = VectornavEmulator(turn(seconds), unit_baud)
     return Line(VectornavDriver(VectornavSettings("imu")), device, **more)  # type: ignore[arg-type]
 
 
-def connect_xsens(seconds: float = 20.0, unit: XsensUnit | None = None, **more: object) -> Line:
-    device = XsensEmulator(turn(seconds), unit)
+def connect_xsens(seconds: float = 20.0, unit_baud: int = 921600, has_orientation: bool = True, **more: object) -> Line:
+    device = XsensEmulator(turn(seconds), unit_baud, has_orientation)
     return Line(XsensDriver(XsensSettings("imu", field_strength=5e-5)), device, **more)  # type: ignore[arg-type]
 
 
@@ -222,16 +218,16 @@ def test_given_a_restarted_unit_then_it_is_set_up_again(connect: Callable[..., L
 
 
 def test_given_too_much_for_the_baud_rate_then_the_error_of_the_unit_is_reported_with_what_to_do() -> None:
-    line = connect_vectornav(unit=VectornavUnit(baud=38400)).open().run(5.0)
+    line = connect_vectornav(unit_baud=38400).open().run(5.0)
     assert "rejected 100 Hz binary output: error 0C, the baud rate is too low for this output" in line.status_text
-    line = connect_xsens(unit=XsensUnit(baud=19200)).open().run(5.0)
+    line = connect_xsens(unit_baud=19200).open().run(5.0)
     assert "rejected 100 Hz of acceleration and rate of turn: error 29, the data exceed the baud rate" in (
         line.status_text
     )
 
 
 def test_given_an_mti_without_orientation_then_the_rest_is_published() -> None:
-    line = connect_xsens(unit=XsensUnit(has_orientation=False)).open().run(10.0)
+    line = connect_xsens(has_orientation=False).open().run(10.0)
     assert len(line.samples) > 900
     assert all(each.orientation is None for each in line.samples)
     assert line.driver.counts["optional_rejected"] == 1
@@ -302,7 +298,7 @@ def test_given_its_bytes_then_the_device_is_recognized(connect: Callable[..., Li
     found = recognize(bytes(received[-4096:]))
     assert found is not None
     assert isinstance(line.driver, StreamDriver)
-    assert found.devices == (line.driver.device,)
+    assert found.device == line.driver.device
 
 
 def test_given_an_endpoint_then_the_drivers_are_some() -> None:

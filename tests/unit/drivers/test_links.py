@@ -14,17 +14,8 @@ from typing import Any
 import pytest
 import serial
 
-from msdrivers.links import Link, LinkError
-from msdrivers.links import can_bus as can_module
-from msdrivers.links import serial_port as ports
-from msdrivers.links import serial_port as serial_module
-from msdrivers.links.can_bus import CanLink
-from msdrivers.links.modbus import REPLY_TIMEOUT_S, ModbusLink, ModbusServerLink
-from msdrivers.links.pty import PtyLink
-from msdrivers.links.serial_port import SerialLink
-from msdrivers.links.tcp import TcpLink, TcpServerLink
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.modbus.registers import (
+from msdrivers.endpoint import (
+    CanFrame,
     FailureKind,
     ModbusFailure,
     ModbusUnit,
@@ -34,6 +25,13 @@ from msdrivers.protocol.modbus.registers import (
     RegisterTable,
     WriteRegisters,
 )
+from msdrivers.links import Link, LinkError, TcpLink, TcpServerLink
+from msdrivers.links import can_bus as can_module
+from msdrivers.links import serial_port as ports
+from msdrivers.links import serial_port as serial_module
+from msdrivers.links.can_bus import CanLink
+from msdrivers.links.modbus import REPLY_TIMEOUT_S, ModbusLink, ModbusServerLink
+from msdrivers.links.serial_port import PtyLink, SerialLink
 
 TIMEOUT_S = 10.0
 

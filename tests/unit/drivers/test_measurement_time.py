@@ -11,12 +11,10 @@ import pytest
 from support_gx1 import START_UTIME, rotating_samples
 
 from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader
-from msdrivers.devices.gps.driver import GpsDriver
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-from msdrivers.emulate.gx1 import Gx1Emulator, Gx1Unit
+from msdrivers.emulate.imu import Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import Endpoint, Output, Send
 from msdrivers.links.fake import FakeTimeSource
 from msdrivers.runner import Runner, RunnerSettings

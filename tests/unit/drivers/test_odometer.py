@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from msdrivers.protocol.can.database import CanFrameAssembler
-from msdrivers.protocol.can.frame import FrameKey
-from msdrivers.protocol.can.odometer import Odometer
+from msdrivers.devices.can import CanFrameAssembler
+from msdrivers.devices.wheels import Odometer
+from msdrivers.endpoint import FrameKey
 
 S = 1_000_000_000
 

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.messages import DriverPhase, Sample, SensorHeader, WheelSample, WheelsSample
-from msdrivers.emulate.faults import InjectedFault
+from msdrivers.devices.stream import FrameScanner
+from msdrivers.emulate import InjectedFault
 from msdrivers.endpoint import HostTime, Send
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.framing import FrameScanner
 from msdrivers.registry import KINDS, EmulatorInputs, make_registry
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver

@@ -11,12 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import RecordingError
-from msdrivers.endpoint import HostTime
-from msdrivers.factory import CAN_CODEC, MODBUS_CODEC
+from msdrivers.endpoint import CanFrame, FailureKind, HostTime, ModbusFailure, ReadRegisters, Registers, RegisterTable
 from msdrivers.links import EndOfRecordingError, LinkError
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, RegisterTable
 from msdrivers.raw_log import (
     BYTES_CODEC,
     RawReader,
@@ -27,6 +24,7 @@ from msdrivers.raw_log import (
     open_for_reading,
     open_for_writing,
 )
+from msdrivers.settings import CAN_CODEC, MODBUS_CODEC
 
 
 def make_recording(limit: int = 1 << 20) -> tuple[str, RawWriter]:

@@ -14,8 +14,7 @@ from test_runner import PERIOD_S, Bench, Echo
 
 from modelserver.messages import DriverPhase, VehicleCommand
 from msdrivers.devices.axis import AxisDriver
-from msdrivers.devices.gps.driver import GpsDriver
-from msdrivers.devices.gps.settings import GpsSettings
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
 from msdrivers.devices.wheels import WheelsDriver
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HasMaxSilence, HostTime, Output, Reopen, Send
 from msdrivers.links import LinkError

@@ -15,11 +15,19 @@ from hypothesis import strategies as st
 from modelserver.config.vehicle_file import load_config, read_config_lines
 from modelserver.errors import ConfigError, Location, Problem, Severity
 from modelserver.messages import ImuSample
-from msdrivers.emulate.faults import InjectedFault, parse_fault
-from msdrivers.factory import choose_first_baud
-from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_group
-from msdrivers.registry import CHANNELS, KINDS, DeviceKind, DeviceModules
-from msdrivers.settings import DriverSettings, SourceMap, read_driver, read_drivers
+from msdrivers.emulate import InjectedFault, parse_fault
+from msdrivers.registry import (
+    CHANNELS,
+    KINDS,
+    CanSettings,
+    DeviceKind,
+    DeviceModules,
+    ModbusSettings,
+    SerialSettings,
+    TcpSettings,
+    split_group,
+)
+from msdrivers.settings import DriverSettings, SourceMap, choose_first_baud, read_driver, read_drivers
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,7 @@ from modelserver.signing import Key, sign
 from modelserver.wire.codec import encode
 from modelserver.wire.provider import handle_message
 from msdrivers.endpoint import HostTime
-from msdrivers.runner import SystemTimeSource
-from msdrivers.signed_commands import CommandDeniedError, DriveVerifier
+from msdrivers.runner import CommandDeniedError, DriveVerifier, SystemTimeSource
 from mstools.commands.driver import subscribe_commands
 
 KEY = Key("key-1", b"0123456789abcdef")

@@ -9,9 +9,8 @@ from support_gx1 import Line, stationary_samples
 
 from modelserver.messages import ImuSample, SensorHeader
 from msdrivers.device_clock import DeviceClock, Stamper
-from msdrivers.devices.gx1.driver import Gx1Driver
-from msdrivers.devices.gx1.settings import Gx1Settings
-from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator
+from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
+from msdrivers.emulate.imu import Eeprom, Gx1Emulator
 from msdrivers.endpoint import HostTime, MeasuredSample
 
 UTIME = 1_700_000_000_000_000

@@ -12,14 +12,18 @@ from hypothesis import strategies as st
 from support_gps import START, Line, split_in_half, split_randomly
 
 from modelserver.errors import ConfigError
-from msdrivers.devices.text_imu import TextImuDriver, TextImuSettings
-from msdrivers.devices.text_joints import TextJointsDriver, TextJointsSettings
-from msdrivers.emulate.text_imu import TextImuEmulator
-from msdrivers.emulate.text_joints import TextJointsEmulator
+from msdrivers.devices.text import (
+    MAX_LINE,
+    ColumnMap,
+    TextImuDriver,
+    TextImuSettings,
+    TextJointsDriver,
+    TextJointsSettings,
+)
+from msdrivers.emulate.imu import TextImuEmulator
+from msdrivers.emulate.vehicle import TextJointsEmulator
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.factory import find_unknown_joint
-from msdrivers.protocol.text_lines import MAX_LINE, ColumnMap, LineReader
-from msdrivers.settings import read_driver
+from msdrivers.settings import find_unknown_joint, read_driver
 from tests.unit.drivers.test_imu_units import turn
 
 G, DEGREE = 9.80665, math.pi / 180.0
@@ -198,8 +202,12 @@ def test_given_wrong_joints_then_the_error_names_them() -> None:
         read_driver("head", {key: value for key, value in section.items() if key != "joints"})
 
 
-def test_given_a_reader_that_is_cleared_then_the_rest_of_a_line_is_not_used() -> None:
-    reader = LineReader()
-    assert reader.feed(b"3,4\n5,6\n7,", 1) == [(b"5,6", 1)]
-    reader.clear()
-    assert reader.feed(b"8\n9,10\n", 2) == [(b"9,10", 2)]
+def test_given_a_line_that_is_opened_again_then_the_rest_of_a_line_is_not_used() -> None:
+    settings = make_settings(fields={"angular_velocity_z": ColumnMap(0)}, columns=2)
+    line = Line(TextImuDriver(settings), TextImuEmulator((), settings)).open()
+    line.deliver(b"3,4\n5,6\n7,")
+    line.open()
+    line.run(0.5)
+    line.deliver(b"8\n9,10\n")
+    found = [(each.angular_velocity[2], each.header.host_utime - START) for each in line.samples]
+    assert found == [(5.0, 0), (9.0, 500_000)]

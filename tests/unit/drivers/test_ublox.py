@@ -14,15 +14,12 @@ from pyubx2 import GET, UBXMessage
 from support_gps import SECOND, START, Line, add_noise, drive, split_in_half, split_randomly
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.devices.gps.driver import GpsDriver
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
-from msdrivers.emulate.faults import FaultInjector, parse_fault
-from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-from msdrivers.emulate.ublox import ORDER, UbloxEmulator, UbloxUnit, encode_sample
+from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
+from msdrivers.devices.stream import compute_fletcher, recognize, recognize_line
+from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxStream
+from msdrivers.emulate import FaultInjector, parse_fault
+from msdrivers.emulate.gps import ORDER, GpsEmulator, GpsUnit, UbloxEmulator, UbloxUnit, encode_ubx
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.protocol.recognition import recognize, recognize_line
-from msdrivers.protocol.ublox import UbxStream, compute_checksum
 
 GENERATION_9 = UbloxUnit()
 GENERATION_8 = UbloxUnit(18.0, "NEO-M8N", frozenset({"NAV-COV", "NAV-RELPOSNED", "RXM-RTCM"}))
@@ -77,7 +74,7 @@ def test_given_covariances_and_a_moving_base_then_they_are_along_east_north_up()
     line = Line(driver, UbloxEmulator(()))
     line.open()
     for name in ORDER:
-        line.deliver(encode_sample(name, sample))
+        line.deliver(encode_ubx(name, sample))
     (found,) = line.samples
     assert found.position_covariance == pytest.approx(sample.position_covariance, rel=1e-6)
     assert found.velocity_covariance == pytest.approx(ALL.velocity_covariance, rel=1e-6)
@@ -95,28 +92,28 @@ def test_given_a_type_of_fix_then_it_is_published(fix_type: FixType) -> None:
 
 
 def test_given_a_time_that_the_receiver_is_not_sure_of_then_it_is_not_used() -> None:
-    pvt = bytearray(encode_sample("NAV-PVT", ALL))
+    pvt = bytearray(encode_ubx("NAV-PVT", ALL))
     pvt[6 + 11] &= ~0x04  # fullyResolved
-    pvt[-2:] = compute_checksum(bytes(pvt[2:-2]))
+    pvt[-2:] = compute_fletcher(bytes(pvt[2:-2]))
     line = Line(UbloxDriver(UbloxSettings("gps")), UbloxEmulator(()))
     line.open()
-    line.deliver(bytes(pvt) + encode_sample("NAV-EOE", ALL))
+    line.deliver(bytes(pvt) + encode_ubx("NAV-EOE", ALL))
     assert line.samples[0].header.device_utime == 0
 
 
 def test_given_no_end_of_the_epoch_then_it_is_published_after_the_hold_or_with_the_next_one() -> None:
     line = Line(UbloxDriver(UbloxSettings("gps", hold=0.05)), UbloxEmulator(()))
     line.open()
-    line.deliver(encode_sample("NAV-PVT", ALL))
+    line.deliver(encode_ubx("NAV-PVT", ALL))
     assert not line.samples
     line.run(0.06)
     assert len(line.samples) == 1
-    line.deliver(encode_sample("NAV-PVT", ALL))  # once more: the same instant
+    line.deliver(encode_ubx("NAV-PVT", ALL))  # once more: the same instant
     line.run(0.1)
     assert len(line.samples) == 1
     for n in (1, 2):
         later = replace(ALL, header=replace(ALL.header, utime=START + n * 200_000))
-        line.deliver(encode_sample("NAV-PVT", later))
+        line.deliver(encode_ubx("NAV-PVT", later))
     assert len(line.samples) == 2
     assert line.driver.counts["repeated"] == 1
 
@@ -164,7 +161,7 @@ def test_given_a_line_that_cannot_send_then_what_the_receiver_sends_unasked_is_u
     line.open()
     for n in range(40):
         later = replace(ALL, header=replace(ALL.header, utime=START + n * 200_000))
-        line.deliver(encode_sample("NAV-PVT", later) + encode_sample("NAV-EOE", later))
+        line.deliver(encode_ubx("NAV-PVT", later) + encode_ubx("NAV-EOE", later))
         line.run(0.2)
     assert len(line.samples) == 40
     assert "sends NAV-PVT but answers nothing" in line.status_text
@@ -197,7 +194,7 @@ def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
     noise: bytes, at: int, chance: random.Random
 ) -> None:
     noise = noise.replace(b"\xb5\x62", b"")
-    frame = encode_sample("NAV-PVT", ALL)
+    frame = encode_ubx("NAV-PVT", ALL)
     data = noise[:at] + frame + noise[at:]
     whole = UbxStream().feed(data)
     stream = UbxStream()
@@ -216,9 +213,9 @@ def test_given_damaged_lengths_or_payloads_then_they_are_counted() -> None:
     stream = UbxStream()
     stream.feed(b"\xb5\x62\x01\x07\xff\xff" + bytes(20))
     short = b"\x01\x07\x04\x00\x00\x00\x00\x00"
-    stream.feed(b"\xb5\x62" + short + compute_checksum(short))
+    stream.feed(b"\xb5\x62" + short + compute_fletcher(short))
     assert stream.counts["rejected.ubx_length"] == 1
-    frame = bytearray(encode_sample("NAV-PVT", ALL))
+    frame = bytearray(encode_ubx("NAV-PVT", ALL))
     frame[20] ^= 1
     stream.feed(bytes(frame))
     assert stream.counts["rejected.checksum"] >= 1
@@ -226,12 +223,14 @@ def test_given_damaged_lengths_or_payloads_then_they_are_counted() -> None:
 
 # --- another device on the line -------------------------------------------------------------------------------
 
-UBX_BYTES = b"".join(encode_sample(name, ALL) for name in ORDER) * 3
+UBX_BYTES = b"".join(encode_ubx(name, ALL) for name in ORDER) * 3
 
 
 def collect_nmea() -> bytes:
     saved = tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gprmc"))
-    line = Line(GpsDriver(GpsSettings("gps", "nmea")), GpsEmulator(drive(5.0), GpsUnit(saved, is_answering=False)))
+    line = Line(
+        GpsDriver(GpsSettings("gps", protocol="nmea")), GpsEmulator(drive(5.0), GpsUnit(saved, is_answering=False))
+    )
     data = bytearray()
     line.to_host = lambda chunk: [data.extend(chunk) or chunk]  # type: ignore[func-returns-value]
     line.open().run(4.0)
@@ -240,7 +239,7 @@ def collect_nmea() -> bytes:
 
 def test_given_ubx_bytes_on_the_line_of_another_driver_then_its_status_names_the_device_to_write() -> None:
     for protocol in ("nmea", "novatel"):
-        line = Line(GpsDriver(GpsSettings("gps", protocol)), UbloxEmulator(()))
+        line = Line(GpsDriver(GpsSettings("gps", protocol=protocol)), UbloxEmulator(()))
         line.open()
         for _ in range(40):
             line.deliver(UBX_BYTES)

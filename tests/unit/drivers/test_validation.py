@@ -10,15 +10,17 @@ import pytest
 from support_vehicle_bus import DBC
 
 from modelserver.errors import ConfigError, Severity
-from msdrivers.factory import (
+from msdrivers.settings import (
+    DriverSettings,
+    SourceMap,
     find_shared_lines,
     find_unbuildable_drivers,
     find_unknown_joint,
     find_unknown_wheels,
     make_driver,
     make_emulator,
+    read_driver,
 )
-from msdrivers.settings import DriverSettings, SourceMap, read_driver
 
 LINES = {("drivers", "wheels"): 5, ("drivers", "wheels", "dbc"): 8, ("drivers", "wheels", "wheels", "front_left"): 10}
 PLACE = SourceMap("v.yaml", LINES)

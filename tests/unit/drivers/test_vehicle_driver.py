@@ -21,12 +21,11 @@ from support_vehicle_bus import (
 
 from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices.vehicle import CommandLimits, VehicleDriver, VehicleSettings
-from msdrivers.emulate.faults import InjectedFault
+from msdrivers.devices.can import SignalMap
+from msdrivers.devices.vehicle import CommandLimits, StatusMap, VehicleDriver, VehicleSettings
+from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.can.mapping import SignalMap, StatusMap
+from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Send
 
 DATABASE = raptor_dbc()
 
@@ -35,8 +34,8 @@ def connect(
     *faults: InjectedFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
 ) -> tuple[Wire[CanFrame], VehicleDriver, VehicleEmulator]:
     driver = VehicleDriver(settings or vehicle_settings(), DATABASE)
-    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit, faults=faults)
-    return Wire(driver, emulator), driver, emulator
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit)
+    return Wire(driver, FaultInjector(lambda: emulator, faults)), driver, emulator
 
 
 def make_command(
@@ -107,7 +106,7 @@ def test_given_the_message_of_faults_lost_then_nothing_is_published() -> None:
 
 def test_given_a_fault_word_of_32_bits_then_the_highest_is_the_sign() -> None:
     text = 'BO_ 1 S: 8 A\n SG_ F : 0|32@1+ (1,0) [0|0] "" A\n SG_ M : 32|8@1+ (1,0) [0|0] "" A\n'
-    from msdrivers.protocol.can.dbc_file import parse_dbc
+    from msdrivers.devices.can import parse_dbc
 
     settings = vehicle_settings(status=StatusMap("S.M", {"fault": 9}, fault_bits="S.F"), command=None)
     driver = VehicleDriver(settings, parse_dbc(text, "s.dbc"))

@@ -29,13 +29,11 @@ from modelserver.earth.geodesy import origin_at
 from modelserver.errors import ConfigError
 from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
-from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
-from msdrivers.emulate.faults import InjectedFault
-from msdrivers.emulate.wheels import WheelsEmulator
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
-from msdrivers.protocol.can.dbc_file import parse_dbc
-from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
+from msdrivers.devices.can import SignalMap, parse_dbc
+from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, WheelsDriver, WheelsSettings
+from msdrivers.emulate import FaultInjector, InjectedFault
+from msdrivers.emulate.vehicle import WheelsEmulator
+from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
 
 BOTH = ("front_left", "front_right")
 
@@ -50,8 +48,8 @@ def connect(
 ) -> Wire[CanFrame]:
     database = raptor_dbc()
     settings = settings or wheels_settings()
-    emulator = WheelsEmulator(settings.wheels, database, rolling_samples(seconds, speed, hz, BOTH), faults, first_count)
-    return Wire(WheelsDriver(settings, database), emulator)
+    emulator = WheelsEmulator(settings.wheels, database, rolling_samples(seconds, speed, hz, BOTH), first_count)
+    return Wire(WheelsDriver(settings, database), FaultInjector(lambda: emulator, faults))
 
 
 def oscillate(t: float) -> float:
@@ -445,7 +443,7 @@ def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_o
     )
     truths = [sample for sample in run.events(40.0) if isinstance(sample, WheelsSample)]
     wire = Wire(
-        WheelsDriver(settings, raptor_dbc()), WheelsEmulator(settings.wheels, raptor_dbc(), truths, (), 65_000)
+        WheelsDriver(settings, raptor_dbc()), WheelsEmulator(settings.wheels, raptor_dbc(), truths, 65_000)
     ).run(40.5)
     samples = wheels_of(wire)
     assert len(samples) == len(truths)

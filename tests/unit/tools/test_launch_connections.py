@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.config.vehicle_file import load_config
-from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
+from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_drivers
 from mstools.launch import connections

@@ -8,9 +8,9 @@ import pytest
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, WheelsSample
-from msdrivers.emulate.wheels import WheelsEmulator
+from msdrivers.devices.can import parse_dbc
+from msdrivers.emulate.vehicle import WheelsEmulator
 from msdrivers.endpoint import HostTime
-from msdrivers.protocol.can.dbc_file import parse_dbc
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_driver
 from mstools.launch.drive import make_simulation

@@ -15,8 +15,7 @@ from modelserver import load_model
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Severity
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
-from msdrivers.line_settings import SerialSettings
-from msdrivers.registry import KINDS
+from msdrivers.registry import KINDS, SerialSettings
 from mstools import cli
 from mstools.commands.check import check_vehicle
 from mstools.launch.drive import make_simulation

@@ -210,9 +210,9 @@ def _make_link(
     stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
 ) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
-    from msdrivers.factory import make_codec, make_link
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
     from msdrivers.runner import SystemTimeSource
+    from msdrivers.settings import make_codec, make_link
 
     codec = make_codec(settings)
     if play is not None:
@@ -236,9 +236,8 @@ def run(
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.server.supervision.systemd import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
-    from msdrivers.factory import make_driver
-    from msdrivers.health import DriverPublisher
-    from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.settings import make_driver
 
     kind = settings.kind
     with start.wait_on_error():
@@ -293,7 +292,7 @@ def subscribe_commands(
     from modelserver.wire.channels import DRIVE_SIGNED, to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.provider import handle_message
-    from msdrivers.signed_commands import COMMAND_TYPE, CommandDeniedError, DriveVerifier
+    from msdrivers.runner import COMMAND_TYPE, CommandDeniedError, DriveVerifier
 
     prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
     plain = f"{prefix}{channel}"

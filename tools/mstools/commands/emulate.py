@@ -192,7 +192,7 @@ def command(
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
       modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
     """
-    from msdrivers.emulate.faults import parse_fault
+    from msdrivers.emulate import parse_fault
 
     choose_name(scenario, SCENARIOS, "scenario", "--scenario")
     if (pty, tcp is not None, bool(can)).count(True) != 1:
@@ -213,8 +213,8 @@ def command(
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
-    from msdrivers.factory import make_emulator
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from msdrivers.settings import make_emulator
 
     station = make_emulator(settings, config.parent, samples, wanted)
     options = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen_timeout=math.inf)
@@ -229,9 +229,9 @@ def command(
 
 def _make_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str, interface: str) -> Link[Any]:
     """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
-    from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
-    from msdrivers.links.pty import PtyLink
-    from msdrivers.links.tcp import TcpServerLink
+    from msdrivers.links import TcpServerLink
+    from msdrivers.links.serial_port import PtyLink
+    from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings
 
     kinds = settings.kind.lines
     if can:

@@ -216,7 +216,7 @@ class CheckedVehicle:
 
     def hosts_of(self, names: Iterable[str]) -> list[str]:
         """Return the hosts of the named drivers' network devices."""
-        from msdrivers.line_settings import MULTICAST, split_address, split_group
+        from msdrivers.registry import MULTICAST, split_address, split_group
 
         found = []
         for name in names:

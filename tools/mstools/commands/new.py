@@ -14,8 +14,7 @@ from modelserver.errors import ModelServerError, find_nearest_names, quote
 from modelserver.formats import check_file, save_model
 from modelserver.geometry import Model
 from modelserver.messages import GpsSample, ImuSample
-from msdrivers.line_settings import SerialSettings
-from msdrivers.registry import KINDS, DeviceKind
+from msdrivers.registry import KINDS, DeviceKind, SerialSettings
 from mstools.commands.check import check_vehicle
 from mstools.scaffold.files import (
     DBC_FILE,

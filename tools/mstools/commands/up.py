@@ -146,7 +146,7 @@ def assign_faults(
     faults: Iterable[str], vehicle: VehicleConfig, config: Path, *, emulate: bool
 ) -> dict[str, tuple[str, ...]]:
     """Return the options of the emulators for `NAME:KIND@SECONDS[:AMOUNT]`. Raises typer.BadParameter."""
-    from msdrivers.emulate.faults import parse_fault
+    from msdrivers.emulate import parse_fault
 
     options: dict[str, tuple[str, ...]] = {}
     for each in faults:

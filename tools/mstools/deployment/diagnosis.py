@@ -58,8 +58,7 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
-    from msdrivers.settings import SourceMap, read_drivers
+    from msdrivers.settings import SourceMap, find_shared_lines, find_unbuildable_drivers, read_drivers
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
     drivers = found.values()
@@ -71,7 +70,7 @@ def find_misnamed(
     vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
+    from msdrivers.settings import find_backward_counters, find_unknown_joint, find_unknown_wheels
 
     wheels = vehicle.sensors.wheels
     for driver in drivers:
@@ -271,7 +270,7 @@ def diagnose_connections(
     drivers: Iterable[DriverSettings], networks: Iterable[NetworkInterface]
 ) -> Iterator[Diagnosis]:
     """Yield the findings on the drivers' connections; `networks` are the network interfaces of this machine."""
-    from msdrivers.line_settings import CanSettings, SerialSettings
+    from msdrivers.registry import CanSettings, SerialSettings
 
     are_up = {each.name: each.up for each in networks}
     for driver in drivers:

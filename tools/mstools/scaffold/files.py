@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.messages import GpsSample, ImuSample
-from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
-from msdrivers.registry import DeviceKind
+from msdrivers.registry import CanSettings, DeviceKind, ModbusSettings, SerialSettings, TcpSettings
 from mstools.scaffold.guesses import FrameChoices, Mount
 from mstools.scaffold.templates import Place, VehicleTemplate
 

@@ -1,30 +1,427 @@
-"""Driver of a satellite receiver: configures it, publishes its fixes, diagnoses errors.
+"""Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
 
-A NovAtel receiver is configured by commands (`SetupDialogue`); without an answer the next baud rate is tried. Without
+Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
+(`FixAssembler`); NMEA epochs are used only while the position log is missing. Missing values stay nan.
+
+A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
 read.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from enum import Enum
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
-from modelserver.messages import SensorHeader
-from msdrivers.devices.gps.fixes import FixAssembler, GpsFix
-from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
-from msdrivers.protocol.nmea.epochs import POSITION_KINDS
-from msdrivers.protocol.novatel import CommandResponse, NovatelLog, Prompt
-from msdrivers.protocol.recognition import recognize
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from modelserver.messages.flags import NAN
+from modelserver.transforms.so3 import Vector3
+from msdrivers.devices.gps import (
+    DAY,
+    WEEK,
+    course_from_track,
+    is_in_leap_second,
+    resolve_rollover,
+    to_covariance,
+    utime_of,
+)
+from msdrivers.devices.gps.nmea import POSITION_KINDS, EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
+from msdrivers.devices.gps.novatel import (
+    AsciiFormat,
+    BinaryFormat,
+    CommandResponse,
+    HeadingLog,
+    LogHeader,
+    NovatelLog,
+    Position,
+    PositionType,
+    Prompt,
+    PromptFormat,
+    SolutionStatus,
+    TextFormat,
+    TimeStatus,
+    Velocity,
+)
+from msdrivers.devices.stream import (
+    EXAMINED_BYTES,
+    SECOND_NS,
+    FrameScanner,
+    Script,
+    SetupStep,
+    StreamDriver,
+    StreamSettings,
+    recognize,
+)
+from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
+
+PROTOCOLS = ("novatel", "nmea")
+FORMATS = ("binary", "ascii")
+POSITION_LOGS = ("BESTPOS", "RTKPOS", "PSRPOS")
+HEADING_LOGS = ("", "HEADING", "HEADING2")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsSettings(StreamSettings):
+    """Settings of the receiver. Seconds; raises ValueError with the key for an invalid value.
+
+    protocol: "novatel" configures the receiver by commands; "nmea" only sends `commands` and reads.
+    rate_hz: of the logs that a NovAtel receiver is asked for, 0.1 to 20. log_format: "binary" or "ascii".
+    position_log: source of the position; NMEA positions are used only while it is missing.
+    heading_log: of a dual-antenna receiver, empty for none. device_port: the receiver's port, as its commands name it.
+    commands: lines sent before the logs are asked for, e.g. "fix none"; with "nmea" they are not acknowledged.
+    bauds: the rates to try; the line is opened at the first. Empty: the line has none, or one that is right.
+    silence: timeout for fixes, after which the setup is repeated.
+    answer_timeout: for the response to a command, which is sent `attempts` times.
+    hold: how long a position waits for the velocity of its instant. gap: pause of the line after which the sentences of
+    an instant are complete.
+    delay: shortest time from a fix to the first byte of its log, mostly the receiver's processing; it cannot be
+    distinguished from the offset of the clocks. delay_sigma: its standard deviation.
+    restore_on_exit: stop the logs that were asked for when the driver leaves.
+    """
+
+    protocol: str = "novatel"
+    rate_hz: float = 4.0
+    log_format: str = "binary"
+    position_log: str = "BESTPOS"
+    heading_log: str = ""
+    device_port: str = "thisport"
+    commands: tuple[str, ...] = ()
+    bauds: tuple[int, ...] = ()
+    silence: float = 2.0
+    answer_timeout: float = 1.0
+    hold: float = 0.1
+    gap: float = 0.04
+    restore_on_exit: bool = True
+    delay: float = 0.0
+    delay_sigma: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("protocol", self.protocol, PROTOCOLS),
+            ("log_format", self.log_format, FORMATS),
+            ("position_log", self.position_log, POSITION_LOGS),
+            ("heading_log", self.heading_log, HEADING_LOGS),
+        ):
+            if value not in known:
+                raise ValueError(f"{name}: must be one of {', '.join(filter(None, known))}, got '{value}'")
+        if not 0.1 <= self.rate_hz <= 20.0:
+            raise ValueError(f"rate_hz: must be 0.1 to 20 Hz, got {self.rate_hz:g}")
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds: must be above 0, got {self.bauds}")
+        if self.attempts < 1:
+            raise ValueError(f"attempts: must be at least 1, got {self.attempts}")
+        for command in self.commands:
+            if not command.strip() or not command.isprintable() or not command.isascii():
+                raise ValueError(f"commands: {command!r} is no line of text")
+        for name, seconds, least in (
+            ("silence", self.silence, 0.1),
+            ("answer_timeout", self.answer_timeout, 0.05),
+            ("hold", self.hold, 0.0),
+            ("gap", self.gap, 0.001),
+            ("delay", self.delay, 0.0),
+            ("delay_sigma", self.delay_sigma, 0.0),
+        ):
+            if not least <= seconds <= 3600.0:
+                raise ValueError(f"{name}: must be {least:g} to 3600 s, got {seconds:g}")
+        if self.silence < 1.5 / self.rate_hz:
+            raise ValueError(
+                f"silence: {self.silence:g} s is less than one and a half periods at {self.rate_hz:g} Hz; make it "
+                f"{2.0 / self.rate_hz:g} s or more"
+            )
+
+    @property
+    def logs(self) -> tuple[str, ...]:
+        """The names of the logs that a NovAtel receiver is asked for."""
+        if self.protocol != "novatel":
+            return ()
+        return (self.position_log, "BESTVEL", *((self.heading_log,) if self.heading_log else ()))
+
+    def make_setup_commands(self) -> tuple[str, ...]:
+        """Return the commands that set the receiver up, in order."""
+        if self.protocol != "novatel":
+            return self.commands
+        wanted = (f"log {self.device_port} {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._list_log_names())
+        return (f"unlogall {self.device_port}", *self.commands, *wanted)
+
+    def make_undo_commands(self) -> tuple[str, ...]:
+        """Return the commands that stop the logs again."""
+        return tuple(f"unlog {self.device_port} {log}" for log in self._list_log_names())
+
+    def _list_log_names(self) -> tuple[str, ...]:
+        return tuple(log.lower() + ("b" if self.log_format == "binary" else "a") for log in self.logs)
+
+
+GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
+"""Each has `start`: offset of its first byte in the stream, to find its receive time."""
+
+
+class GpsStream(FrameScanner[Any]):
+    """Parses bytes to messages in the order of their completion. Never raises; memory is bounded.
+
+    The messages do not depend on how the bytes are split, except for calls of `flush`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__((SentenceFormat(), BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat()))
+        self._epochs = EpochAssembler()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
+
+    def feed(self, data: bytes) -> list[GpsMessage]:
+        messages: list[GpsMessage] = []
+        for each in super().feed(data):
+            messages += self._epochs.add(each) if isinstance(each, NmeaSentence) else [each]
+        return messages
+
+    def flush(self) -> list[NmeaEpoch]:
+        """Return the pending epoch: the line has been silent long enough for it to be complete."""
+        return self._epochs.flush()
+
+    def clear(self) -> None:
+        """Discard what is incomplete after the line was closed; counters and offsets continue."""
+        super().clear()
+        self._epochs.clear()
+
+
+USABLE_TIME = frozenset(TimeStatus) - {
+    TimeStatus.UNKNOWN,
+    TimeStatus.APPROXIMATE,
+    TimeStatus.COARSEADJUSTING,
+    TimeStatus.SATTIME,
+}
+"""With the other statuses the header's time may be wrong by seconds or years."""
+
+FIX_TYPES: dict[int, FixType] = {
+    PositionType[name]: fix_type
+    for fix_type, names in {
+        FixType.FIX_2D: "FIXEDHEIGHT",
+        FixType.FIX_3D: "SINGLE INS_PSRSP",
+        FixType.DEAD_RECKONING: "PROPAGATED",
+        FixType.DIFFERENTIAL: "PSRDIFF WAAS OMNISTAR INS_SBAS INS_PSRDIFF OMNISTAR_HP OMNISTAR_XP CDGPS PPP_CONVERGING "
+        "PPP INS_PPP_CONVERGING INS_PPP PPP_BASIC_CONVERGING PPP_BASIC INS_PPP_BASIC_CONVERGING INS_PPP_BASIC",
+        FixType.RTK_FLOAT: "FLOATCONV L1_FLOAT IONOFREE_FLOAT NARROW_FLOAT INS_RTKFLOAT",
+        FixType.RTK_FIXED: "WIDELANE NARROWLANE L1_INT WIDE_INT NARROW_INT RTK_DIRECT_INS INS_RTKFIXED",
+    }.items()
+    for name in names.split()
+}
+"""The others are no satellite positions: none, entered by hand (FIXEDPOS), velocity only, or unknown."""
+
+
+def sample_from_nmea(header: SensorHeader, epoch: NmeaEpoch) -> GpsSample:
+    return GpsSample(
+        header,
+        epoch.fix_type,
+        epoch.latitude,
+        epoch.longitude,
+        height_ellipsoidal=epoch.height_msl + epoch.undulation,
+        height_msl=epoch.height_msl,
+        undulation=epoch.undulation,
+        satellites=epoch.satellites,
+        hdop=epoch.hdop,
+        vdop=epoch.vdop,
+        pdop=epoch.pdop,
+        position_covariance=to_covariance(epoch.sigma_longitude, epoch.sigma_latitude, epoch.sigma_height),
+        speed=epoch.speed,
+        course=course_from_track(epoch.track),
+        baseline_yaw=course_from_track(epoch.heading),
+    )
+
+
+def sample_from_novatel(
+    header: SensorHeader, position: Position, velocity: Velocity | None = None, heading: HeadingLog | None = None
+) -> GpsSample:
+    """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
+    # without a solution the receiver sends zeros
+    empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
+    height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
+    velocity = velocity if velocity is not None and _is_solved(velocity) else None
+    heading = heading if heading is not None and _is_solved(heading) else None
+    return GpsSample(
+        header,
+        FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
+        NAN if empty else position.latitude,
+        NAN if empty else math.remainder(position.longitude, 360.0),
+        height_ellipsoidal=height + undulation,
+        height_msl=height,
+        undulation=undulation,
+        satellites=position.used,
+        position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
+        velocity=_to_enu(velocity) if velocity else None,
+        velocity_latency=max(0.0, velocity.latency - position.solution_age) if velocity else NAN,
+        speed=velocity.horizontal if velocity else NAN,
+        course=course_from_track(velocity.track) if velocity else NAN,
+        baseline_yaw=course_from_track(heading.heading) if heading else NAN,
+        baseline_yaw_sigma=math.radians(heading.sigma_heading) if heading and heading.sigma_heading > 0.0 else NAN,
+    )
+
+
+def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
+    return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
+
+
+def _to_enu(velocity: Velocity) -> Vector3:
+    track = math.radians(velocity.track)
+    return velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical
+
+
+WGS84_DATUM = 61
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
+    than that. origin: name of the log, or NMEA."""
+
+    host_utime: int
+    device_utime: int
+    origin: str
+    solution: NmeaEpoch | Position
+    velocity: Velocity | None = None
+    heading: HeadingLog | None = None
+    delay: float = 0.0
+
+    def to_sample(self, header: SensorHeader) -> GpsSample:
+        if isinstance(self.solution, NmeaEpoch):
+            return sample_from_nmea(header, self.solution)
+        return sample_from_novatel(header, self.solution, self.velocity, self.heading)
+
+
+class FixAssembler:
+    """Assembles logs and epochs to fixes, each instant once.
+
+    logs: the names of the position log and of what belongs to it; empty for NMEA only.
+    """
+
+    def __init__(self, logs: Sequence[str], hold_ns: int, silence_ns: int) -> None:
+        self._logs, self._hold_ns, self._silence_ns = tuple(logs), hold_ns, silence_ns
+        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
+        self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
+        self._last_log: tuple[int, int] | None = None
+        self._last_log_ns: int | None = None
+        self._last_epoch: tuple[int, int | None] | None = None
+        self._last_solution = -1
+        self._problems: list[str] = []
+        self._reported: set[str] = set()
+        self.counts: Counter[str] = Counter()
+        """`repeated`: duplicate instants. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
+        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
+        `unknown_type`: fixes published as none for their type."""
+
+    def clear(self) -> None:
+        """Discard pending data: the line was closed, or the receiver has restarted."""
+        self._parts.clear()
+        self._waiting = None
+        self._last_log_ns = None
+
+    def pop_problems(self) -> list[str]:
+        found, self._problems = self._problems, []
+        return found
+
+    def _add_problem(self, text: str) -> None:
+        if text not in self._reported:
+            self._reported.add(text)
+            self._problems.append(text)
+
+    def get_deadline(self) -> int | None:
+        return self._waiting[2] if self._waiting else None
+
+    def on_timer(self, now: HostTime) -> list[GpsFix]:
+        """Release a position whose hold time has passed."""
+        return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
+
+    def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process an NMEA epoch whose first byte was received at `host_utime`."""
+        if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
+            self.counts["superseded"] += 1
+            return []
+        instant = (epoch.utime, epoch.time_of_day)
+        if epoch.time_of_day is not None and instant == self._last_epoch:
+            self.counts["repeated"] += 1
+            return []
+        self._last_epoch = instant
+        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), "NMEA", epoch)]
+
+    def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process a log whose first byte was received at `host_utime`."""
+        if log.header.name not in self._logs or log.body is None:
+            return []
+        if log.header.is_secondary:
+            self.counts["rejected.secondary_antenna"] += 1
+            self._add_problem(
+                f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
+            )
+            return []
+        instant = (log.header.week, log.header.milliseconds)
+        if not isinstance(log.body, Position):
+            assert isinstance(log.body, (Velocity, HeadingLog))
+            self._parts[log.header.name] = (instant, log.body)
+            return self._release_if_complete(instant)
+        solution = instant[0] * WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
+        if instant == self._last_log or (log.body.solution_age > 0.0 and solution == self._last_solution):
+            self.counts["repeated"] += 1
+            return []
+        self._last_solution = solution
+        if log.body.datum != WGS84_DATUM:
+            self.counts["rejected.datum"] += 1
+            self._add_problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
+            return []
+        if log.body.type not in PositionType.__members__.values():
+            self.counts["unknown_type"] += 1
+            self._add_problem(
+                "the receiver names a position type that is not known here: its fixes are published as none"
+            )
+        fixes = self._release()
+        self._last_log, self._last_log_ns = instant, now.monotonic_ns
+        device = get_log_utime(log.header, now.utime)
+        fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
+        self._waiting = (fix, instant, now.monotonic_ns + self._hold_ns)
+        return fixes + self._release_if_complete(instant)
+
+    def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
+        """Release the pending position if its velocity and heading are complete."""
+        if self._waiting is None or self._waiting[1] != instant:
+            return []
+        here = {name for name, (when, _) in self._parts.items() if when == instant}
+        return self._release() if here.issuperset(self._logs[1:]) else []
+
+    def _release(self) -> list[GpsFix]:
+        if self._waiting is None:
+            return []
+        fix, instant, _ = self._waiting
+        self._waiting = None
+        for when, part in self._parts.values():
+            if when == instant:
+                fix = replace(fix, velocity=part) if isinstance(part, Velocity) else replace(fix, heading=part)
+        return [fix]
+
+
+def get_log_utime(header: LogHeader, pivot: int) -> int:
+    """Return the utime of a log; 0 if the receiver's time is not usable or within a leap second."""
+    microseconds = header.milliseconds * 1000
+    if header.time_status not in USABLE_TIME or is_in_leap_second(header.week, microseconds, pivot):
+        return 0
+    return utime_of(header.week, microseconds, pivot)
+
+
+def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
+    if epoch.time_of_day is None or epoch.is_leap_second:
+        return 0
+    if epoch.utime:
+        return resolve_rollover(epoch.utime, pivot)
+    # without a date: the day that is nearest to the host's clock
+    days = round((pivot - epoch.time_of_day) / DAY)
+    return max(0, days * DAY + epoch.time_of_day)
+
 
 QUOTED_BYTES = 24
 """Quoted bytes of the beginning."""
-EXAMINED_BYTES = 4096
-"""Bytes of the beginning by which another device is recognized."""
+
 MAX_NAMES = 6
 MIN_FLAWED_SENTENCES = 2
 """Fewer flawed sentences may be chance."""
@@ -52,7 +449,6 @@ class LineMonitor:
         self._counts_at_reset = dict(counts)
 
     def add(self, data: bytes) -> None:
-        """Record received data."""
         self._bytes_received += len(data)
         if len(self._first_bytes) < EXAMINED_BYTES:
             self._first_bytes = (self._first_bytes + data)[:EXAMINED_BYTES]
@@ -89,7 +485,6 @@ class LineMonitor:
         return f"{text}; {_REMEDIES[flaw]}" if flaw else text
 
     def describe(self, counts: Mapping[str, int]) -> str:
-        """Describe the received data."""
         if not self._bytes_received:
             return "nothing"
         kinds, names = self.list_valid_kinds(counts), ", ".join(sorted(self._names))
@@ -105,232 +500,81 @@ class LineMonitor:
             if kind.startswith("rejected.")
         )
         if (protocol := recognize(self._first_bytes)) is not None:
-            return f"{protocol.name}: write device: {protocol.devices[0]}"
+            return f"{protocol.name}: write device: {protocol.device}"
         broken = f" ({rejected} damaged ones)" if rejected else ""
         text = f"{self._bytes_received} bytes that are neither NovAtel logs nor NMEA sentences"
         return f"{text}{broken}, beginning {self._first_bytes[:QUOTED_BYTES]!r}"
 
 
-def explain_missing_receiver(wanted: str, attempts: Sequence[tuple[int | None, str]]) -> str:
-    """Explain that no receiver was found: attempts, received data, remedy."""
-    tried = "; ".join(f"{f'at {baud} baud ' if baud else ''}received {what}" for baud, what in attempts)
-    if all(what == "nothing" for _, what in attempts):
-        advice = "check the receiver's power, the cable, and that the port is the right one"
-    elif any("write device: " in what for _, what in attempts):
-        advice = "another device is on this port"
-    elif all("bytes that are neither" in what or what == "nothing" for _, what in attempts):
-        advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
-    else:
-        advice = (
-            "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
-            "(else set protocol: nmea), and `device_port`"
-        )
-    return f"no {wanted} on this line: {tried}; {advice}"
+class GpsDriver(StreamDriver[GpsMessage]):
+    """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`.
 
-
-class SetupProgress(Enum):
-    """State of the dialogue."""
-
-    IDLE = "idle"
-    RUNNING = "asking"
-    DONE = "done"
-    TIMED_OUT = "unanswered"
-
-
-class SetupDialogue:
-    """Sends commands and awaits their responses, one at a time. Times are monotonic nanoseconds.
-
-    After a retry more than one response may arrive. Before the next command the dialogue waits for them, so that none
-    is taken for the response to that command.
+    Further counts: what was left out and why, `restarts`.
     """
 
-    def __init__(self, commands: Sequence[str], answer_ns: int, attempts: int) -> None:
-        self._commands, self._timeout_ns, self._attempts = tuple(commands), answer_ns, attempts
-        self._index = self._attempt = 0
-        self._is_settling = False
-        """A command was sent more than once; further responses may arrive."""
-        self.deadline_ns: int | None = None
-        self._last_answer_ns: int | None = None
-        self.progress = SetupProgress.IDLE
-        self.rejected: list[tuple[str, str]] = []
-        """Rejected commands and the receiver's error texts."""
-
-    def start(self, now_ns: int) -> bytes:
-        """Start from the first command; return the bytes to send, with an end of line first to flush partial input."""
-        self._index = self._attempt = 0
-        self._is_settling = False
-        self.rejected = []
-        self._last_answer_ns = None
-        return b"\r\n" + self._send_command(now_ns)
-
-    def stop(self) -> None:
-        self.progress, self.deadline_ns = SetupProgress.IDLE, None
-
-    def on_response(self, answer: CommandResponse, now_ns: int) -> bytes:
-        """Process a response; return the next bytes to send, or none."""
-        self._last_answer_ns = now_ns
-        if self.progress is not SetupProgress.RUNNING or self._is_settling:
-            return b""
-        if not answer.is_ok:
-            self.rejected.append((self._commands[self._index], answer.error))
-        self._index += 1
-        tries, self._attempt = self._attempt, 0
-        if self._index == len(self._commands):
-            self.progress, self.deadline_ns = SetupProgress.DONE, None
-            return b""
-        if tries > 1:
-            # each as late as this one; they would pass for answers to the next command
-            self._is_settling = True
-            self.deadline_ns = now_ns + tries * self._timeout_ns
-            return b""
-        return self._send_command(now_ns)
-
-    def on_timer(self, now_ns: int) -> bytes:
-        """Repeat the command after a timeout; stop after the last attempt."""
-        if self.deadline_ns is None or now_ns < self.deadline_ns:
-            return b""
-        self._is_settling = False
-        if self._attempt >= self._attempts:
-            self.progress, self.deadline_ns = SetupProgress.TIMED_OUT, None
-            return b""
-        return self._send_command(now_ns)
-
-    def expects_prompt(self, now_ns: int) -> bool:
-        """Return whether a prompt belongs to a response, and is not that of a restarted receiver."""
-        return self.progress is SetupProgress.RUNNING or (
-            self._last_answer_ns is not None and now_ns - self._last_answer_ns < self._timeout_ns
-        )
-
-    def _send_command(self, now_ns: int) -> bytes:
-        self.progress = SetupProgress.RUNNING
-        self._attempt += 1
-        self.deadline_ns = now_ns + self._timeout_ns
-        return self._commands[self._index].encode("ascii") + b"\r\n"
-
-
-_SECOND_NS = 1_000_000_000
-_WARNING_INTERVAL_NS = 60 * _SECOND_NS
-"""Rate limit of the warning that no receiver was found."""
-_MAX_ARRIVALS = 4096
-"""Number of chunks whose receive times are stored: more than an epoch has bytes."""
-
-
-class GpsDriver:
-    """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`."""
+    _settings: GpsSettings
+    _stream: GpsStream
 
     def __init__(self, settings: GpsSettings) -> None:
-        self._settings = settings
-        self.max_silence = settings.silence
-        self._novatel = settings.protocol == "novatel"
-        self._stream = GpsStream()
-        self._fixes = FixAssembler(settings.logs, round(settings.hold * _SECOND_NS), self._silence_ns)
-        self._setup = SetupDialogue(
-            settings.make_setup_commands(), round(settings.answer_timeout * _SECOND_NS), settings.attempts
-        )
+        super().__init__(settings, GpsStream())
+        self._is_novatel = settings.protocol == "novatel"
+        self.device = settings.protocol
+        self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
+        self.awaited = settings.position_log
+        self._fixes = FixAssembler(settings.logs, round(settings.hold * SECOND_NS), round(settings.silence * SECOND_NS))
         self._monitor = LineMonitor()
-        self._attempts: list[tuple[int | None, str]] = []
-        self._baud_index = 0
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
-        self._phase = EndpointPhase.WAITING
-        self._reported = ""
-        self._origin = ""
-        self._sequence = 0
         self._last_byte_ns: int | None = None
-        self._timeout_ns = 0
-        self._samples_before = 0
-        self._next_warning_ns = 0
-        self._counts: Counter[str] = Counter()
+        self._answered_ns: int | None = None
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Frames by kind, `rejected.<reason>`, bytes `skipped`, `samples`, and what was left out and why."""
-        return {**self._stream.counts, **self._counts, **self._fixes.counts}
+        return {**super().counts, **self._fixes.counts}
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Discard incomplete data and set the receiver up."""
-        self._stream.clear()
+    def _make_identification(self) -> bytes:
+        # an end of line first, to flush partial input
+        return b"\r\n" + _encode_command(self._settings.make_setup_commands()[0])
+
+    def _on_start(self) -> None:
         self._fixes.clear()
-        self._arrivals.clear()
         self._last_byte_ns = None
         self._monitor.reset(self._stream.counts)
-        # no new status within a search over the baud rates
-        searching = self._attempts or (self._phase is EndpointPhase.SILENT and len(self._settings.bauds) > 1)
-        at = f" at {self._current_baud} baud" if self._current_baud else ""
-        status = [] if searching else self._set_status(EndpointPhase.WAITING, f"waiting for a receiver{at}")
-        return [*status, *self._start_setup(now)]
+
+    def _describe_wait(self) -> str:
+        bauds = self._settings.bauds
+        return "waiting for a receiver" + (f" at {bauds[self._baud_index]} baud" if bauds else "")
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        """Process received bytes."""
-        self._arrivals.append((self._stream.offset, now.utime))
         self._monitor.add(unit)
         self._last_byte_ns = now.monotonic_ns
-        return [output for message in self._stream.feed(unit) for output in self._on_message(message, now)]
+        return super().on_receive(unit, now)
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Do what is due."""
+    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Stop the requested logs if the settings demand it."""
+        self._setup.stop()
+        commands = self._settings.make_undo_commands() if self._settings.restore_on_exit else ()
+        return [Send(_encode_command(each)) for each in commands]
+
+    def _get_extra_deadline(self) -> int | None:
+        return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)
+
+    def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         if self._gap_ns is not None and now.monotonic_ns >= self._gap_ns:
             self._last_byte_ns = None
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
-        out += self._publish_fixes(self._fixes.on_timer(now), now)
-        if again := self._setup.on_timer(now.monotonic_ns):
-            out.append(Send(again))
-        elif self._setup.progress is SetupProgress.TIMED_OUT:
-            out += self._on_setup_timeout(now)
-        elif self._setup.progress is not SetupProgress.RUNNING and now.monotonic_ns >= self._timeout_ns:
-            out += self._on_data_timeout(now)
-        return out
-
-    def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
-        asking = self._setup.progress is SetupProgress.RUNNING
-        timeout = None if asking else self._timeout_ns
-        times = (self._gap_ns, self._fixes.get_deadline(), self._setup.deadline_ns, timeout)
-        return min((each for each in times if each is not None), default=None)
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Stop the requested logs if the settings demand it."""
-        self._setup.stop()
-        if not self._settings.restore_on_exit:
-            return []
-        return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.make_undo_commands()]
-
-    @property
-    def _current_baud(self) -> int | None:
-        return self._settings.bauds[self._baud_index] if self._settings.bauds else None
-
-    @property
-    def _silence_ns(self) -> int:
-        return round(self._settings.silence * _SECOND_NS)
+        return out + self._publish_fixes(self._fixes.on_timer(now), now)
 
     @property
     def _gap_ns(self) -> int | None:
-        return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * _SECOND_NS)
-
-    def _set_status(self, phase: EndpointPhase, text: str, *, is_warning: bool = False) -> list[Output[bytes]]:
-        """Report a status unless it is unchanged."""
-        if (phase, text) == (self._phase, self._reported):
-            return []
-        self._phase, self._reported = phase, text
-        return [EndpointStatus(phase, text, is_warning)]
-
-    def _start_setup(self, now: HostTime) -> list[Output[bytes]]:
-        """Start the setup; a plain NMEA receiver only gets the commands of the settings."""
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        self._samples_before = self._counts["samples"]
-        if self._novatel:
-            return [Send(self._setup.start(now.monotonic_ns))]
-        return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.commands]
+        return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * SECOND_NS)
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
             return self._on_command_response(message, now)
         if isinstance(message, Prompt):
             return self._on_prompt(message, now)
-        # the receive time of the message's first byte
-        start = message.start
-        arrival = next((utime for offset, utime in reversed(self._arrivals) if offset <= start), self._arrivals[0][1])
+        arrival = self._find_arrival(message.start, now)
         if isinstance(message, NovatelLog):
             return self._publish_fixes(self._fixes.add_log(message, arrival, now), now)
         return self._publish_fixes(self._fixes.add_epoch(message, arrival, now), now)
@@ -338,95 +582,83 @@ class GpsDriver:
     def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         for fix in fixes:
-            header = SensorHeader(0, self._settings.source, self._sequence, fix.host_utime, fix.device_utime)
-            self._sequence += 1
-            self._counts["samples"] += 1
-            self._timeout_ns = now.monotonic_ns + self._silence_ns
             self._monitor.reset(self._stream.counts)
-            self._attempts = []
-            delay = self._settings.delay + fix.delay
-            out.append(MeasuredSample(fix.to_sample(header), delay, self._settings.delay_sigma))
-            present = (self._phase, self._origin)
-            if self._setup.progress is not SetupProgress.RUNNING and present != (EndpointPhase.STREAMING, fix.origin):
+            if self._phase is EndpointPhase.STREAMING and fix.origin != self.awaited:
                 out += self._set_status(EndpointPhase.STREAMING, f"receiving {fix.origin}")
-            self._origin = fix.origin
+            self.awaited = fix.origin
+            header = self._make_header(fix.host_utime, fix.device_utime)
+            out += self._publish(fix.to_sample(header), now, delay=fix.delay)
         for problem in self._fixes.pop_problems():
             out += self._set_status(self._phase, problem)
         return out
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
-        asked = self._setup.progress is SetupProgress.RUNNING
-        rejected = len(self._setup.rejected)
-        following = self._setup.on_response(answer, now.monotonic_ns)
-        if not asked:
-            return []
-        out: list[Output[bytes]] = []
-        if self._phase is not EndpointPhase.CONFIGURING:
-            out += self._set_status(EndpointPhase.CONFIGURING, "a NovAtel receiver answers, setting it up")
-        if len(self._setup.rejected) > rejected:
-            command, words = self._setup.rejected[-1]
-            fix = "check the settings `commands`, `device_port` and the logs"
-            text = f"the receiver rejected '{command}': {words}; {fix}"
-            out += self._set_status(EndpointPhase.CONFIGURING, text, is_warning=True)
-        if following:
-            return [*out, Send(following)]
-        if self._setup.progress is SetupProgress.RUNNING:
-            return out
-        # set up: from now on its logs must come
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        if not self._setup.rejected:
-            out += self._set_status(EndpointPhase.CONFIGURING, f"set up, waiting for {self._settings.position_log}")
-        return out
+        self._answered_ns = now.monotonic_ns
+        if self._setup_step is None:
+            commands = self._settings.make_setup_commands()[1:]
+            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
+            return self._on_identity("a NovAtel receiver", steps, now)
+        fix = "check the settings `commands`, `device_port` and the logs"
+        return self._on_acknowledgement(now, f"{answer.error}; {fix}" if answer.error else "")
 
     def _on_prompt(self, prompt: Prompt, now: HostTime) -> list[Output[bytes]]:
-        if not self._novatel or self._setup.expects_prompt(now.monotonic_ns):
+        """Set up again after a restart: a prompt that belongs to no response."""
+        answered_ns, timeout_ns = self._answered_ns, round(self._settings.answer_timeout * SECOND_NS)
+        is_expected = answered_ns is not None and now.monotonic_ns - answered_ns < timeout_ns
+        if not self._is_novatel or self._setup.is_running or is_expected:
             return []
         self._counts["restarts"] += 1
         self._fixes.clear()
         text = f"the receiver has restarted (prompt [{prompt.port}] without a command), setting it up again"
-        return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._start_setup(now)]
+        return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._setup.start(self._run_setup(), now)]
 
-    def _on_setup_timeout(self, now: HostTime) -> list[Output[bytes]]:
-        """Use a receiver that sends fixes without answering commands, else try the next baud rate."""
-        self._setup.stop()
-        if self._counts["samples"] > self._samples_before:
-            return self._set_status(
-                EndpointPhase.STREAMING,
-                "the receiver sends fixes but does not answer commands: using what it sends unasked; "
-                "check that the line can send to it",
-            )
-        return self._try_next_baud(now)
+    def _run_setup(self) -> Script:
+        """Configure the receiver; a plain NMEA receiver only gets the commands of the settings."""
+        if self._is_novatel:
+            yield from super()._run_setup()
+            return
+        for command in self._settings.commands:
+            yield Send(_encode_command(command))
+        self._restart_silence_timer()
 
-    def _on_data_timeout(self, now: HostTime) -> list[Output[bytes]]:
+    def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
         """Repeat the setup if data arrives (a restart loses the logs), else try the next baud rate."""
-        counts, monitor = self._stream.counts, self._monitor
+        counts, monitor, seconds = self._stream.counts, self._monitor, self._settings.silence
         is_streaming = self._phase is EndpointPhase.STREAMING
         if not (is_streaming or monitor.list_valid_kinds(counts) or monitor.find_flaw(counts)):
-            return self._try_next_baud(now)
-        if self._novatel:
-            missing = f"no {self._settings.position_log} for {self._settings.silence:g} s"
-            text = f"{missing}, received {monitor.describe(counts)} since, setting the receiver up again"
+            return self._setup.start(self._run_search(), now)
+        if self._is_novatel:
+            received = f"received {monitor.describe(counts)} since"
+            text = f"no {self._settings.position_log} for {seconds:g} s, {received}, setting the receiver up again"
         else:
-            text = monitor.explain_missing_fix(counts, self._settings.silence)
-        out = self._set_status(EndpointPhase.SILENT, text)
+            text = monitor.explain_missing_fix(counts, seconds)
         monitor.reset(counts)
-        return [*out, *self._start_setup(now)]
+        return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
-    def _try_next_baud(self, now: HostTime) -> list[Output[bytes]]:
+    def _run_search(self) -> Script:
+        yield from self._try_next_baud()
+        yield from self._run_setup()
+
+    def _describe_input(self) -> str:
         received = self._monitor.describe(self._stream.counts)
-        self._timeout_ns = now.monotonic_ns + self._silence_ns
-        self._attempts.append((self._current_baud, received))
-        out: list[Output[bytes]] = []
-        if len(self._attempts) >= max(1, len(self._settings.bauds)):
-            wanted = "NovAtel receiver" if self._novatel else "NMEA receiver"
-            # the text differs with the noise: rate limit
-            if self._phase is not EndpointPhase.SILENT or now.monotonic_ns >= self._next_warning_ns:
-                self._next_warning_ns = now.monotonic_ns + _WARNING_INTERVAL_NS
-                out += self._set_status(EndpointPhase.SILENT, explain_missing_receiver(wanted, self._attempts))
-            self._attempts = []
         self._monitor.reset(self._stream.counts)
-        if len(self._settings.bauds) < 2:
-            return [*out, *self._start_setup(now)]
-        before = self._current_baud
-        self._baud_index = (self._baud_index + 1) % len(self._settings.bauds)
-        return [*out, Reopen(f"no receiver at {before} baud, received {received}", self._current_baud)]
+        return f"received {received}"
+
+    def _explain_absence(self) -> str:
+        tried = self._tried
+        if all("received nothing" in each for each in tried):
+            advice = "check the receiver's power, the cable, and that the port is the right one"
+        elif any("write device: " in each for each in tried):
+            advice = "another device is on this port"
+        elif all("bytes that are neither" in each or "received nothing" in each for each in tried):
+            advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
+        else:
+            advice = (
+                "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
+                "(else set protocol: nmea), and `device_port`"
+            )
+        return f"no {self.description} on this line: {'; '.join(tried)}; {advice}"
+
+
+def _encode_command(command: str) -> bytes:
+    return command.encode("ascii") + b"\r\n"

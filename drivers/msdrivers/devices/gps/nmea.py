@@ -1,7 +1,11 @@
-"""Assemble the NMEA sentences of one instant to an epoch.
+"""NMEA 0183: the fields of a sentence, sentences of any talker, and epochs of the sentences of one instant.
 
-An epoch is complete when a sentence of another instant arrives, when the caller reports silence (`flush`), or, once the
-cycles of sentences were equal for a second, when the sentence that ended the last cycle arrives again; so the last
+Fields: an empty one is missing: nan or None, never zero. ValueError, with the field's text, for what no receiver should
+write. pynmea2 computes the checksum and names the fields; its own conversions are not used: they give 0 for a missing
+hemisphere, cut microseconds, reject 23:59:60 and return the text where they fail.
+
+Epochs: one is complete when a sentence of another instant arrives, when the caller reports silence (`flush`), or, once
+the cycles of sentences were equal for a second, when the sentence that ended the last cycle arrives again; so the last
 fix does not wait for the next instant. Sentences without a time (VTG, GSA, HDT) belong to the epoch that they follow or
 precede; the order is learned from the pauses of the line. Motion of unknown order is left out, because it could be
 that of the next instant.
@@ -13,14 +17,292 @@ counts only, flags nothing, and the GSA with the best fix counts.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import date
+from functools import partial
+from math import inf
+from typing import Any
+
+import pynmea2
 
 from modelserver.messages import FixType
 from modelserver.messages.flags import NAN
-from msdrivers.protocol.gps_time import DAY, SECOND
-from msdrivers.protocol.nmea.sentences import NmeaSentence, NmeaValues
+from msdrivers.devices.gps import DAY, SECOND
+from msdrivers.devices.stream import NO_FRAME, ParsedFrame, RejectedFrame
+
+KNOT = 1852.0 / 3600.0
+"""Meters per second."""
+KMH = 1.0 / 3.6
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
+_CLOCK = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
+_ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
+_UNIX_DAY = date(1970, 1, 1).toordinal()
+
+
+def parse_number(text: str, least: float = -inf, most: float = inf) -> float:
+    """Return a decimal number within bounds; nan for an empty field."""
+    if not text:
+        return NAN
+    if not _NUMBER.fullmatch(text) or not least <= float(text) <= most:
+        raise ValueError(f"'{text}' is no number from {least:g} to {most:g}")
+    return float(text)
+
+
+def parse_integer(text: str, least: int = 0, most: int = 1_000_000) -> int | None:
+    """Return an integer within bounds; None for an empty field."""
+    if not text:
+        return None
+    if not text.isdecimal() or not least <= int(text) <= most:
+        raise ValueError(f"'{text}' is no integer from {least} to {most}")
+    return int(text)
+
+
+def parse_time_of_day(text: str) -> int | None:
+    """Return microseconds since midnight of `hhmmss.ss`, up to 86401 s for 23:59:60.99; None for an empty field."""
+    if not text:
+        return None
+    parts = _CLOCK.fullmatch(text)
+    hours, minutes, seconds = (int(each) for each in parts.groups()[:3]) if parts else (24, 0, 0)
+    leap = seconds == 60 and (hours, minutes) == (23, 59)
+    if parts is None or hours > 23 or minutes > 59 or (seconds > 59 and not leap):
+        raise ValueError(f"'{text}' is no time of day")
+    return (hours * 3600 + minutes * 60 + seconds) * SECOND + int((parts[4] or "")[:6].ljust(6, "0"))
+
+
+def to_unix_days(day: int, month: int, year: int) -> int:
+    """Return days since 1970-01-01. ValueError for a day that does not exist."""
+    return date(year, month, day).toordinal() - _UNIX_DAY
+
+
+def parse_date(text: str) -> int | None:
+    """Return days since 1970 of `ddmmyy`, years from 1980 on; None for an empty field."""
+    if not text:
+        return None
+    if len(text) != 6 or not text.isdecimal():
+        raise ValueError(f"'{text}' is no date")
+    year = int(text[4:])
+    return to_unix_days(int(text[:2]), int(text[2:4]), year + (1900 if year >= 80 else 2000))
+
+
+def parse_angle(text: str, side: str, sides: str, most: float) -> float:
+    """Return signed degrees of `dddmm.mmmm` and its hemisphere; nan where both are empty.
+
+    sides: the letters of the positive and the negative hemisphere. most: the largest angle, degrees.
+    """
+    if not text and not side:
+        return NAN
+    parts = _ANGLE.fullmatch(text)
+    minutes = float(parts[2]) if parts else 60.0
+    if parts is None or len(side) != 1 or side not in sides or minutes >= 60.0:
+        raise ValueError(f"'{text},{side}' is no angle")
+    degrees = int(parts[1]) + minutes / 60.0
+    if degrees > most:
+        raise ValueError(f"'{text},{side}' is over {most:g} degrees")
+    return degrees if side == sides[0] else -degrees
+
+
+def encode(talker: str, kind: str, fields: Sequence[str]) -> bytes:
+    """Return a sentence with its checksum and end of line."""
+    return str(pynmea2.TalkerSentence(talker, kind, fields)).encode("ascii") + b"\r\n"
+
+
+def format_angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
+    """Return `dddmm.mmmmmmm` with as many digits of whole degrees, and the hemisphere's letter; empty for nan."""
+    if degrees != degrees:
+        return "", ""
+    # whole ten-millionths of a minute, so that no 60 minutes come out of rounding
+    whole, part = divmod(round(abs(degrees) * 60e7), 60 * 10_000_000)
+    text = f"{whole:0{digits}d}{part // 10_000_000:02d}.{part % 10_000_000:07d}"
+    return text, sides[0] if degrees >= 0.0 else sides[1]
+
+
+def format_time_of_day(microseconds: int) -> str:
+    """Return `hhmmss.sss`, up to 23:59:60.999."""
+    seconds, fraction = divmod(microseconds, 1_000_000)
+    leap = max(0, seconds - 86_399)
+    hours, rest = divmod(seconds - leap, 3600)
+    return f"{hours:02d}{rest // 60:02d}{rest % 60 + leap:02d}.{fraction // 1000:03d}"
+
+
+def format_number(value: float, digits: int) -> str:
+    """Return a decimal; empty for nan."""
+    return "" if value != value else f"{value:.{digits}f}"
+
+
+MAX_SENTENCE_BYTES = 164
+"""Characters from '$' to the checksum. The standard allows 82 with the end of line; receivers send more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NmeaValues:
+    """Measured values; nan where missing.
+
+    latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: meters. speed: m/s.
+    track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and track are
+    nan where the sentence flags them invalid. sigma_*: standard deviations along latitude, longitude, height, meters.
+    """
+
+    latitude: float = NAN
+    longitude: float = NAN
+    height_msl: float = NAN
+    undulation: float = NAN
+    hdop: float = NAN
+    vdop: float = NAN
+    pdop: float = NAN
+    speed: float = NAN
+    track: float = NAN
+    heading: float = NAN
+    sigma_latitude: float = NAN
+    sigma_longitude: float = NAN
+    sigma_height: float = NAN
+
+
+@dataclass(frozen=True, slots=True)
+class NmeaSentence(NmeaValues):
+    """Content of a sentence; None or "" where missing.
+
+    talker, kind: e.g. "GP" and "GGA". start: bytes from the beginning of the stream to its '$'.
+    time_of_day: microseconds of UTC's day, 86,400 s and more inside a leap second. day: days since 1970-01-01.
+    quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
+    per satellite system for GNS. dimension: 1 none, 2, 3, of GSA. satellites: the number in use, of GGA and GNS.
+    listed: how many GSA names as in use.
+    """
+
+    talker: str
+    kind: str
+    start: int
+    time_of_day: int | None = None
+    day: int | None = None
+    quality: int | None = None
+    status: str = ""
+    mode: str = ""
+    dimension: int | None = None
+    satellites: int | None = None
+    listed: int = 0
+
+    @property
+    def has_position(self) -> bool:
+        """Whether there are coordinates, valid or not."""
+        return self.latitude == self.latitude and self.longitude == self.longitude
+
+
+class SentenceFormat:
+    """`$`, address, fields, `*` and two hexadecimal digits. Sentences without checksum are rejected."""
+
+    start_bytes = b"$"
+    _body = re.compile(rb"\$[ -#%-)+-~]*")
+    _sum = re.compile("[0-9A-Fa-f]{2}")
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[NmeaSentence] | RejectedFrame | None:
+        body = self._body.match(buffer, at, at + MAX_SENTENCE_BYTES)
+        assert body is not None
+        end = body.end()
+        if end - at >= MAX_SENTENCE_BYTES:
+            return RejectedFrame("nmea_length")
+        if len(buffer) < end + 3 and (end == len(buffer) or buffer[end] == 0x2A):
+            return None
+        if buffer[end] != 0x2A or end - at < 6:
+            return RejectedFrame("nmea_incomplete") if buffer[end] in b"\r\n" and end - at > 6 else NO_FRAME
+        text = buffer[at : end + 3].decode("latin-1")
+        if not self._sum.fullmatch(text, end + 1 - at):
+            return RejectedFrame("nmea_checksum")
+        try:
+            sentence = parse_sentence(text, start)
+        except pynmea2.ChecksumError:
+            return RejectedFrame("nmea_checksum")
+        except ValueError:
+            return RejectedFrame("nmea_field")
+        return ParsedFrame(
+            end + 3, f"nmea.{text[1:-3].partition(',')[0]}" if sentence else "nmea.unsupported", sentence
+        )
+
+
+def parse_sentence(text: str, start: int = 0) -> NmeaSentence | None:
+    """Parse `$...*hh`; None for a sentence that is not supported.
+
+    Raises:
+        ValueError: a field is not what it should be, or the checksum is wrong.
+    """
+    if int(text[-2:], 16) != pynmea2.NMEASentence.checksum(text[1:-3]):
+        raise pynmea2.ChecksumError("wrong checksum", text)
+    talker, kind = text[1:3], text[3:6]
+    if kind not in KINDS or text[6] != "," or not talker.isalnum() or talker[0] == "P":
+        return None
+    raw = defaultdict(str, zip(getattr(pynmea2, kind).name_to_idx, text[7:-3].split(","), strict=False))
+    values: dict[str, Any] = {}
+    for field, content in raw.items():
+        if field in _FIELDS:
+            name, parse = _FIELDS[field]
+            values[name] = parse(content)
+    status, mode = values.get("status", "A"), values.get("mode", "")
+    if "lat" in raw:
+        try:
+            values["latitude"] = parse_angle(raw["lat"], raw["lat_dir"], "NS", 90.0)
+            values["longitude"] = parse_angle(raw["lon"], raw["lon_dir"], "EW", 180.0)
+        except ValueError:
+            # where there is no fix, receivers fill in what cannot be
+            if status != "V" and values.get("quality") != 0 and (kind != "GNS" or mode.strip("N")):
+                raise
+            values["latitude"] = values["longitude"] = NAN
+    if kind == "VTG":
+        kmh = _parse_nonnegative(raw["spd_over_grnd_kmph"]) * KMH
+        values["speed"] = speed if (speed := values.get("speed", NAN)) == speed else kmh
+    elif kind == "GSA":
+        values["listed"] = sum(name.startswith("sv_id") and text != "" for name, text in raw.items())
+    elif kind == "ZDA":
+        day = parse_integer(raw["day"], 1, 31)
+        month = parse_integer(raw["month"], 1, 12)
+        year = parse_integer(raw["year"], 1980, 9999)
+        values["day"] = to_unix_days(day, month, year) if day and month and year else None
+    if not ((status == "A" and (not mode or mode in MODES)) or mode == "E"):
+        values |= {"speed": NAN, "track": NAN}
+    return NmeaSentence(talker, kind, start, **values)
+
+
+KINDS = frozenset({"GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "HDT", "ZDA"})
+"""The sentences that are read."""
+
+MODES = frozenset("APDRFE")
+"""Letters of the mode indicator, which NMEA 2.3 added, for measured data. M is manual input, S simulated, N invalid."""
+
+_parse_nonnegative = partial(parse_number, least=0.0)
+
+_parse_direction = partial(parse_number, least=0.0, most=360.0)
+
+
+def _parse_knots(text: str) -> float:
+    return _parse_nonnegative(text) * KNOT
+
+
+_FIELDS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "timestamp": ("time_of_day", parse_time_of_day),
+    "datestamp": ("day", parse_date),
+    "status": ("status", str),
+    "mode_indicator": ("mode", str),
+    "faa_mode": ("mode", str),
+    "gps_qual": ("quality", partial(parse_integer, most=9)),
+    "num_sats": ("satellites", partial(parse_integer, most=999)),
+    "mode_fix_type": ("dimension", partial(parse_integer, least=1, most=3)),
+    "horizontal_dil": ("hdop", _parse_nonnegative),
+    "hdop": ("hdop", _parse_nonnegative),
+    "vdop": ("vdop", _parse_nonnegative),
+    "pdop": ("pdop", _parse_nonnegative),
+    "altitude": ("height_msl", parse_number),
+    "geo_sep": ("undulation", parse_number),
+    "spd_over_grnd": ("speed", _parse_knots),
+    "spd_over_grnd_kts": ("speed", _parse_knots),
+    "true_course": ("track", _parse_direction),
+    "true_track": ("track", _parse_direction),
+    "heading": ("heading", _parse_direction),
+    "std_dev_latitude": ("sigma_latitude", _parse_nonnegative),
+    "std_dev_longitude": ("sigma_longitude", _parse_nonnegative),
+    "std_dev_altitude": ("sigma_height", _parse_nonnegative),
+}
+"""pynmea2's name of a field -> the name here, and how its text is parsed."""
 
 _QUALITY = {
     1: FixType.FIX_3D,

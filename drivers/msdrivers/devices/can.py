@@ -1,0 +1,685 @@
+"""Devices on a CAN bus: DBC databases (by cantools), instants of several frames, and the common part of the drivers.
+
+Mapping: what another vehicle configures instead of coding. A signal is named `Message.Signal` as in the DBC. Its value
+is the DBC's physical one, with the DBC's own scale and offset; `scale` in the settings brings it to SI units and our
+signs, e.g. 0.2778 for km/h, -1 for a sign that is the other way.
+
+Database: the range that a DBC gives a signal is no authority: in public files every ninth is of raw values, of the
+other sign or made up. It bounds what is sent, and a received value outside it is used. Only what the file or J1939
+reserves for "not available" or "error" is no value. cantools reads a whole file or nothing. So a file that it rejects
+is split into its statements, and each message is read by itself with what belongs to it: those that can be read may be
+mapped, and the others are problems of the file.
+
+Driver (`CanDriver`): decoding, assembly of instants, silence, malformed frames, bus-off.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import inf, isfinite
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from modelserver.errors import (
+    ConfigError,
+    Location,
+    ModelServerError,
+    Problem,
+    Severity,
+    Suggestion,
+    quote,
+    suggest_name,
+)
+from msdrivers.devices import Strict, check_factor
+from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey, HostTime, Output, Reopen
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message, Signal
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+
+def check_signal(signal: str, key: str = "signal") -> None:
+    """Raise ValueError unless the text is a signal path."""
+    message, dot, name = signal.partition(".")
+    if not (message and dot and name) or "." in name:
+        raise ValueError(f"{key} is written Message.Signal as the DBC file names them, got {signal!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class SignalMap(Strict):
+    """A number: `signal` times `scale` plus `offset`, in SI units and radians."""
+
+    signal: str
+    """Message.Signal in the DBC file."""
+    scale: float = 1.0
+    """Factor of the signal's physical value."""
+    offset: float = 0.0
+    """Offset after scaling."""
+
+    def __post_init__(self) -> None:
+        check_signal(self.signal)
+        check_factor(self.scale, "scale")
+        if not math.isfinite(self.offset):
+            raise ValueError(f"offset is a number, got {self.offset:g}")
+
+    def to_si(self, physical: float) -> float:
+        return physical * self.scale + self.offset
+
+    def from_si(self, value: float) -> float:
+        return (value - self.offset) / self.scale
+
+
+_UNUSED_FIX = "correct it, or leave it: the other messages can be used"
+
+_NO_VALUE = re.compile(
+    r"not? ?(?:available|avail|valid|defined|data|signal)|invalid|\b(?:sna|na|n/a|error|fault|failure|undefined)\b",
+    re.IGNORECASE,
+)
+"""Names in a value table that stand for no measurement."""
+
+_J1939_NAMES = {0xFF: "not available", 0xFE: "error"}
+"""By the highest byte of a number of a byte and more: SAE J1939-71, 5.1.4."""
+
+
+class FrameError(ModelServerError, ValueError):
+    """A frame that does not match the DBC; `reason` is the counter's name, `summary` what is wrong in a few words."""
+
+    def __init__(self, reason: str, message: str, summary: str = ""):
+        self.reason, self.summary = reason, summary
+        super().__init__(message)
+
+
+@dataclass(frozen=True, slots=True)
+class BoundSignal:
+    """A signal of the database; `minimum` and `maximum` are physical values, infinite without limits.
+
+    names: of raw values, by the file's value table. is_j1939: the file states that protocol for the frame.
+    """
+
+    key: FrameKey
+    message: str
+    name: str
+    length: int
+    is_signed: bool
+    is_float: bool
+    scale: float
+    offset: float
+    minimum: float
+    maximum: float
+    unit: str = ""
+    names: Mapping[int, str] = field(default_factory=dict)
+    is_j1939: bool = False
+
+    @property
+    def path(self) -> str:
+        return f"{self.message}.{self.name}"
+
+    def to_physical(self, raw: float) -> float | None:
+        """Return the physical value of raw bits; None (missing) if it is not finite, or reserved."""
+        value = raw * self.scale + self.offset
+        return value if isfinite(value) and not self.find_reserved(raw) else None
+
+    def is_outside(self, raw: float) -> bool:
+        """Return whether the physical value of raw bits is outside the file's range."""
+        value, slack = raw * self.scale + self.offset, 1e-6 * abs(self.scale)
+        return not self.minimum - slack <= value <= self.maximum + slack
+
+    def find_reserved(self, raw: float) -> str:
+        """Return what raw bits stand for if that is no value, by the file's value table or by J1939; else nothing.
+
+        A file seldom states the protocol: frames with 29-bit identifiers are J1939's where the value is outside the
+        range, too.
+        """
+        if self.is_float or not isfinite(raw):
+            return ""
+        name = self.names.get(int(raw), "")
+        if name and (self.is_outside(raw) or _NO_VALUE.search(name)):
+            return name
+        if self.length < 8 or self.is_signed or not (self.is_j1939 or (self.key.is_extended and self.is_outside(raw))):
+            return ""
+        reserved = _J1939_NAMES.get(int(raw) >> (self.length - 8))
+        return f"{reserved} in J1939" if reserved else ""
+
+    def to_raw(self, physical: float) -> int:
+        """Return the raw bits nearest to a physical value, clamped to the signal's length and the DBC's range."""
+        physical = min(max(physical, self.minimum), self.maximum)
+        low = -(1 << (self.length - 1)) if self.is_signed else 0
+        return min(max(round((physical - self.offset) / self.scale), low), low + (1 << self.length) - 1)
+
+    def to_bits(self, physical: float) -> float:
+        """Return the input of `CanDatabase.encode` for a physical value: raw bits, or a float for a float signal."""
+        return (physical - self.offset) / self.scale if self.is_float else self.to_raw(physical)
+
+
+@dataclass(frozen=True, slots=True)
+class CanDatabase:
+    """The messages of a DBC file called `name`.
+
+    flaws: what is wrong with the messages that cannot be used, by name, as errors; with anything else, as warnings
+    under "".
+    """
+
+    name: str
+    messages: Mapping[str, Message] = field(repr=False)
+    by_key: Mapping[FrameKey, Message] = field(repr=False)
+    flaws: Mapping[str, tuple[Problem, ...]] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """What is wrong with the file, none of which affects a signal that could be bound."""
+        found = dict.fromkeys(each for several in self.flaws.values() for each in several)
+        return tuple(replace(each, severity=Severity.WARNING, fix=_UNUSED_FIX) for each in found)
+
+    def decode(self, frame: CanFrame) -> dict[str, float]:
+        """Decode a frame to the raw value of each signal by name.
+
+        Raises FrameError with the reason `unknown` (identifier), `length`, `multiplexer` or `bits`.
+        """
+        message = self.by_key.get(frame.key)
+        if message is None:
+            raise FrameError("unknown", f"{self.name} has no message {frame.key}")
+        if len(frame.data) != message.length:
+            raise FrameError(
+                "length",
+                f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
+                f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
+                f"identifier",
+                f"with {len(frame.data)} bytes instead of {message.length}",
+            )
+        from cantools.database.errors import Error
+
+        try:
+            values = message.decode_simple(
+                frame.data, decode_choices=False, scaling=False, allow_truncated=False, allow_excess=False
+            )
+        except Error as error:
+            raise FrameError(
+                "multiplexer", f"frame {frame.key} ({message.name}): {error}", "with an unknown multiplexer"
+            ) from None
+        except (ValueError, KeyError, OverflowError) as error:
+            raise FrameError(
+                "bits", f"frame {frame.key} ({message.name}): {error}", "with bits that are no number"
+            ) from None
+        return {name: value for name, value in values.items() if isinstance(value, int | float)}
+
+    def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:
+        """Encode a message; `raw` has the raw value of each of its signals."""
+        found = self.messages[message]
+        data = found.encode(dict(raw), scaling=False, strict=False)
+        return CanFrame(found.frame_id, bytes(data), found.is_extended_frame)
+
+    def bind_signals(self, message: str) -> dict[str, BoundSignal]:
+        """Return the signals of a message by name. Raises KeyError for an unknown message."""
+        found = self.messages[message]
+        return {signal.name: _bind_signal(found, signal) for signal in found.signals}
+
+
+class SignalBinder:
+    """Looks up mapped signals and collects every problem, so that all are reported at once."""
+
+    def __init__(self, database: CanDatabase, place: str):
+        """`place` is the mapping's key path in the settings, e.g. `drivers.wheels`."""
+        self._database = database
+        self._place = place
+        self.problems: list[Problem] = []
+
+    def bind_signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
+        """Return the signal `Message.Signal` of the setting `key`; add a problem and return None if it is unknown.
+
+        `whole`: it must be an integer of at most `bits` bits.
+        """
+        message_name, _, name = path.partition(".")
+        if message_name in self._database.flaws:
+            self.problems += self._database.flaws[message_name]
+            return None
+        message = self._database.messages.get(message_name)
+        if message is None:
+            form = f"{{}}.{name}" if name else "{}"
+            self._add_missing(key, "there is no message", message_name, list(self._database.messages), form)
+            return None
+        signal = next((each for each in message.signals if each.name == name), None)
+        if signal is None:
+            known = [each.name for each in message.signals]
+            # a key with the signal's own name has no message name in its value
+            form = "{}" if key.endswith(f".{name}") else f"{message_name}.{{}}"
+            self._add_missing(key, f"message {message_name} has no signal", name, known, form)
+            return None
+        if whole and (signal.is_float or signal.length > bits):
+            kind = "a floating-point number" if signal.is_float else f"{signal.length} bits long"
+            self.add_problem(
+                key, f"{path} is {kind}; a whole number of at most {bits} bits is needed", "map another signal"
+            )
+            return None
+        return _bind_signal(message, signal)
+
+    def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
+        source = Location(element=f"{self._place}.{key}")
+        self.problems.append(Problem(Severity.ERROR, f"{self._database.name}: {message}", source, fix, nearest))
+
+    def finish(self) -> None:
+        """Raise ConfigError if there were problems."""
+        if self.problems:
+            raise ConfigError(self.problems)
+
+    def _add_missing(self, key: str, what: str, name: str, known: list[str], form: str) -> None:
+        near = Suggestion.of(
+            form.replace("{}", name), *(form.replace("{}", each) for each in suggest_name(name, known))
+        )
+        listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
+        fix = f"write {near[0]}" if near else f"known there: {listed or 'nothing'}"
+        self.add_problem(key, f"{what} {quote(name)}", fix, near)
+
+
+def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
+    return BoundSignal(
+        FrameKey(message.frame_id, message.is_extended_frame),
+        message.name,
+        signal.name,
+        signal.length,
+        signal.is_signed,
+        signal.is_float,
+        float(signal.scale),
+        float(signal.offset),
+        -inf if signal.minimum is None else float(signal.minimum),
+        inf if signal.maximum is None else float(signal.maximum),
+        signal.unit or "",
+        {int(number): str(name) for number, name in (signal.choices or {}).items()},
+        message.protocol == "j1939",
+    )
+
+
+class CanFrameSet(NamedTuple):
+    """Raw signal values of the frames of one instant, by frame and name, with the first frame's receive time."""
+
+    monotonic_ns: int
+    utime: int
+    values: dict[FrameKey, dict[str, float]]
+    is_complete: bool
+
+    def raw(self, signal: BoundSignal | None) -> float | None:
+        """Return the raw value of a signal; None if it was not received."""
+        return None if signal is None else self.values.get(signal.key, {}).get(signal.name)
+
+    def physical(self, signal: BoundSignal | None) -> float | None:
+        """Return the physical value of a signal; None if it is missing."""
+        raw = self.raw(signal)
+        return None if raw is None or signal is None else signal.to_physical(raw)
+
+
+class CanFrameAssembler:
+    """Collects the frames of one instant, for at most `window_ns` after the first.
+
+    A repeated frame starts the next instant: the missing frames of the last one were lost.
+    """
+
+    def __init__(self, needed: frozenset[FrameKey], window_ns: int):
+        """`needed` are the kinds of frame that make an instant."""
+        self._needed = needed
+        self._window_ns = window_ns
+        self.clear()
+
+    def clear(self) -> None:
+        self._pending: dict[FrameKey, dict[str, float]] = {}
+        self._started_ns = self._utime = 0
+
+    def add(self, key: FrameKey, values: dict[str, float], monotonic_ns: int, utime: int) -> list[CanFrameSet]:
+        """Add a frame's values; return the instants that it completes or ends."""
+        ended = self.pop_expired(monotonic_ns)
+        if key in self._pending:
+            ended.append(self._finish_set(False))
+        if not self._pending:
+            self._started_ns, self._utime = monotonic_ns, utime
+        self._pending[key] = values
+        if self._pending.keys() >= self._needed:
+            ended.append(self._finish_set(True))
+        return ended
+
+    def pop_expired(self, monotonic_ns: int) -> list[CanFrameSet]:
+        """Return the incomplete instant whose window has passed, if any."""
+        due = self.get_deadline()
+        return [self._finish_set(False)] if due is not None and monotonic_ns >= due else []
+
+    def get_deadline(self) -> int | None:
+        """Return when the window of the incomplete instant ends, monotonic nanoseconds; None without one."""
+        return self._started_ns + self._window_ns if self._pending else None
+
+    def _finish_set(self, is_complete: bool) -> CanFrameSet:
+        ended = CanFrameSet(self._started_ns, self._utime, self._pending, is_complete)
+        self._pending = {}
+        return ended
+
+
+MAX_DBC_CHARS: Final = 8 << 20
+"""Largest DBC file in characters."""
+
+_WRONG_FILE_FIX = "is this the DBC file of the vehicle, saved as plain text?"
+_FIX = "correct it there"
+_BYTE_ORDER_MARKS = ("\ufeff", "\u00ef\u00bb\u00bf")
+"""As text, and read as Latin-1."""
+
+_KEYWORD = re.compile(r"\s*(BO_|SG_|[A-Z][A-Z_]*_)\b")
+_MESSAGE = re.compile(r"\s*BO_\s+(\d+)\s+(\w+)\s*:")
+_OF_MESSAGE = re.compile(r"\s*(VAL_|SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\b|\s*BA_\s+\"VFrameFormat\"\s+BO_\s+(\d+)\b")
+_FRAME_FORMAT = re.compile(r"\s*BA_DEF_(DEF_)?\s+(BO_\s+)?\"VFrameFormat\"")
+_PLACE = re.compile(r"at line (\d+)")
+_HEAD: Final = 'VERSION ""\nNS_ :\nBS_:\nBU_:\n'
+
+
+@dataclass(frozen=True, slots=True)
+class _Statement:
+    """A statement of the file and the number of its first line."""
+
+    line: int
+    text: str
+
+
+def parse_dbc(text: str, name: str) -> CanDatabase:
+    """Parse the text of a DBC file called `name`. Raises ConfigError with the line for a file that has no message."""
+    if len(text) > MAX_DBC_CHARS:
+        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Location(name), _WRONG_FILE_FIX)])
+    for mark in _BYTE_ORDER_MARKS:
+        text = text.removeprefix(mark)
+    flaws: dict[str, tuple[Problem, ...]] = {}
+    try:
+        messages = _load(text)
+    except _RejectedError as error:
+        messages, flaws = _load_each(text, name, str(error), error.line)
+        if not messages and not any(flaws):
+            message = f"not a DBC file that can be read: {quote(str(error), 100)}"
+            raise ConfigError([Problem(Severity.ERROR, message, Location(name, error.line), _WRONG_FILE_FIX)]) from None
+    by_key: dict[FrameKey, Message] = {}
+    for found in messages:
+        key = FrameKey(found.frame_id, found.is_extended_frame)
+        other = by_key.setdefault(key, found)
+        if other is not found:
+            what = f"messages {other.name} and {found.name} have one identifier, {key}"
+            problem = Problem(Severity.ERROR, what, Location(name), "keep the one that the controller uses")
+            flaws |= {other.name: (problem,), found.name: (problem,)}
+    return CanDatabase(
+        name,
+        {each.name: each for each in messages if each.name not in flaws},
+        {key: each for key, each in by_key.items() if each.name not in flaws},
+        flaws,
+    )
+
+
+class _RejectedError(Exception):
+    """What cantools rejects a text with; `line` is 0 where it has none."""
+
+    def __init__(self, message: str):
+        place = _PLACE.search(message)
+        self.line = int(place[1]) if place else 0
+        super().__init__(" ".join(message.split()))
+
+
+def _load(text: str) -> Sequence[Message]:
+    from cantools.database import load_string
+    from cantools.database.can import Database
+    from cantools.database.errors import Error, UnsupportedDatabaseFormatError
+
+    try:
+        database = load_string(text, "dbc")
+    except UnsupportedDatabaseFormatError as error:
+        raise _RejectedError(str(error.e_dbc or error)) from None
+    except (Error, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        # what its reader does not expect
+        raise _RejectedError(f"{type(error).__name__}: {error}") from None
+    assert isinstance(database, Database)
+    return database.messages
+
+
+def _split(text: str) -> Iterator[_Statement]:
+    """Yield the statements: each begins with its keyword on a line of its own, a message has its signals."""
+    lines: list[str] = []
+    begin, is_quoted = 1, False
+    for number, line in enumerate(text.splitlines(), 1):
+        keyword = None if is_quoted else _KEYWORD.match(line)
+        if keyword and keyword[1] != "SG_" and lines:
+            yield _Statement(begin, "\n".join(lines))
+            lines = []
+        if not lines:
+            begin = number
+        lines.append(line)
+        is_quoted ^= line.replace('\\"', "").count('"') % 2 == 1
+    if lines:
+        yield _Statement(begin, "\n".join(lines))
+
+
+def _load_each(text: str, name: str, why: str, line: int) -> tuple[list[Message], dict[str, tuple[Problem, ...]]]:
+    """Return the messages that can be read by themselves, and what is wrong with the others and the rest."""
+    statements = list(_split(text))
+    formats = "\n".join(each.text for each in statements if _FRAME_FORMAT.match(each.text))
+    parts: dict[str, list[_Statement]] = {}
+    for each in statements:
+        if found := _OF_MESSAGE.match(each.text):
+            parts.setdefault(found[2] or found[3], []).append(each)
+    messages: list[Message] = []
+    flaws: dict[str, tuple[Problem, ...]] = {}
+    rest: list[Problem] = []
+    known = set()
+    for each in statements:
+        if (named := _MESSAGE.match(each.text)) is None:
+            continue
+        known.add(named[1])
+        own = parts.get(named[1], [])
+        # a table of names is not needed
+        needed = [part for part in own if not part.text.lstrip().startswith("VAL_")]
+        try:
+            messages += _load_message(each, own, formats)
+        except _RejectedError as error:
+            try:
+                messages += _load_message(each, needed, formats)
+                rest += [_describe(error, part, name) for part in own if part not in needed]
+            except _RejectedError as inner:
+                flaws[named[2]] = (_describe(inner, each, name),)
+    for number in parts.keys() - known:
+        first = parts[number][0]
+        what = f"{quote(first.text.strip(), 60)} is of message {number}, which is not there"
+        rest.append(Problem(Severity.ERROR, what, Location(name, first.line), _FIX))
+    if not (rest or flaws):
+        rest = [Problem(Severity.ERROR, f"a part of it cannot be read: {quote(why, 100)}", Location(name, line), _FIX)]
+    if rest:
+        flaws[""] = tuple(rest)
+    return messages, flaws
+
+
+def _load_message(message: _Statement, own: Sequence[_Statement], formats: str) -> Sequence[Message]:
+    return _load(_HEAD + "\n".join((message.text, formats, *(each.text for each in own), "")))
+
+
+def _describe(error: _RejectedError, statement: _Statement, name: str) -> Problem:
+    """Return the problem of a statement, at the signal that it names, else at its own place."""
+    words = re.findall(r"\w+", str(error))
+    lines = statement.text.splitlines()
+    signals = [(n, found[1]) for n, line in enumerate(lines) if (found := re.match(r"\s*SG_\s+(\w+)", line))]
+    at = min(max(error.line - 1 - _HEAD.count("\n"), 0), len(lines) - 1)
+    offset = next((n for n, signal in signals if signal in words), at)
+    return Problem(Severity.ERROR, quote(str(error), 160), Location(name, statement.line + offset), _FIX)
+
+
+MAX_SEEN = 8
+"""Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
+
+MAX_FLAWS = 3
+"""Warnings about the DBC file at a start: `modelserver check` has all."""
+
+
+def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
+    """Return the receive time of a frame that is read `now`: its own stamp if it has one."""
+    if not 0 < frame.utime <= now.utime:
+        return now
+    return HostTime(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
+
+
+class CanDriver(ABC):
+    """Base of an `Endpoint` of CAN frames: decodes the needed frames and assembles those of one instant.
+
+    Silence, errors and recovery are reported once per change. Without needed frames there is no silence.
+    """
+
+    def __init__(self, database: CanDatabase, needed: Mapping[FrameKey, str], silence: float, window: float):
+        """`needed` are the kinds of frame and their names; the others see `WheelsSettings`."""
+        self.phase = EndpointPhase.WAITING
+        self.is_bus_off = False
+        """The interface is bus-off; nothing can be sent."""
+        self.counts: Counter[str] = Counter()
+        """Frames, samples, incomplete instants, silences, commands, and rejections by reason. `outside_range`: values
+        outside the range of the DBC, which are used; `rejected.reserved`: those that stand for no measurement."""
+        self.problems = database.warnings
+        """What is wrong with parts of the DBC file that are not used."""
+        self._database, self._needed, self._silence_s = database, needed, silence
+        self._assembler = CanFrameAssembler(frozenset(needed), round(window * 1e9))
+        self._seq = 0
+        self._silence_deadline_ns: int | None = None
+        self._received = 0
+        self._others: Counter[FrameKey] = Counter()
+        self._useless: Counter[str] = Counter()
+        """Since the last usable data: frames, those that are not needed, and what is wrong with the others."""
+        self._reasons: dict[str, None] = {}
+        """Why values of the last instant cannot be used."""
+        self._reported: set[object] = set()
+
+    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Discard incomplete instants and start the silence timer."""
+        self._assembler.clear()
+        self.phase, self.is_bus_off = EndpointPhase.WAITING, False
+        self._reported.clear()
+        self._restart_silence_timer(now)
+        flaws = [
+            EndpointStatus(EndpointPhase.WAITING, str(each), is_warning=True) for each in self.problems[:MAX_FLAWS]
+        ]
+        if not self._needed:
+            return [*flaws]
+        return [*flaws, EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")]
+
+    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+        if unit.is_error:
+            return self._on_error_frame(unit)
+        self._received += 1
+        if unit.key not in self._needed:
+            self.counts["other_frames"] += 1
+            if unit.key in self._others or len(self._others) < MAX_SEEN:
+                self._others[unit.key] += 1
+            return []
+        try:
+            values = self._database.decode(unit)
+        except FrameError as error:
+            return self._on_malformed_frame(unit, error)
+        self.counts["frames"] += 1
+        arrival = get_arrival_time(unit, now)
+        return self._publish(self._assembler.add(unit.key, values, arrival.monotonic_ns, arrival.utime), now)
+
+    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Publish instants whose window has passed; report silence after its timeout."""
+        outputs = self._publish(self._assembler.pop_expired(now.monotonic_ns), now)
+        if self._silence_deadline_ns is not None and now.monotonic_ns >= self._silence_deadline_ns:
+            self._silence_deadline_ns = None
+            self.phase = EndpointPhase.SILENT
+            self.counts["silences"] += 1
+            outputs.append(EndpointStatus(EndpointPhase.SILENT, self._explain_silence()))
+        return outputs
+
+    def get_deadline(self) -> int | None:
+        deadlines = (self._assembler.get_deadline(), self._silence_deadline_ns)
+        return min((each for each in deadlines if each is not None), default=None)
+
+    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
+        return []
+
+    @abstractmethod
+    def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
+        """Make the samples of complete and expired instants."""
+
+    def _on_usable(self, now: HostTime, text: str) -> list[Output[CanFrame]]:
+        self._restart_silence_timer(now)
+        if self.phase is EndpointPhase.STREAMING:
+            return []
+        self.phase = EndpointPhase.STREAMING
+        return [EndpointStatus(EndpointPhase.STREAMING, text)]
+
+    def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
+        """Count a malformed frame; reported once per kind."""
+        self.counts[f"rejected.{error.reason}"] += 1
+        self._note_useless(f"{self._needed[frame.key]} ({frame.key}) {error.summary}")
+        if frame.key in self._reported:
+            return []
+        self._reported.add(frame.key)
+        return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
+
+    def _note_useless(self, what: str) -> None:
+        """Note what is wrong with a frame, or with the frames of an instant."""
+        if what in self._useless or len(self._useless) < MAX_SEEN:
+            self._useless[what] += 1
+
+    def _note_empty(self) -> None:
+        """Count an instant without any value."""
+        self.counts["rejected.empty"] += 1
+        self._note_useless(f"no value that can be used ({', '.join(self._reasons) or 'no number'})")
+
+    def _check_values(self, signals: Iterable[BoundSignal | None], instant: CanFrameSet) -> list[Output[CanFrame]]:
+        """Count values outside the DBC's range, and those that stand for no measurement; each is reported once."""
+        outputs: list[Output[CanFrame]] = []
+        self._reasons.clear()
+        for signal in signals:
+            raw = instant.raw(signal)
+            if signal is None or raw is None or raw != raw:
+                continue
+            if name := signal.find_reserved(raw):
+                self.counts["rejected.reserved"] += 1
+                self._reasons[name] = None
+                text = f"{signal.path} is {raw:.0f}, {quote(name, 60)}: that is no measurement, and it is not used"
+            elif signal.is_outside(raw):
+                self.counts["outside_range"] += 1
+                name = "range"
+                value, limits = raw * signal.scale + signal.offset, f"[{signal.minimum:g}|{signal.maximum:g}]"
+                text = (
+                    f"{signal.path} is {value:g} {signal.unit}".rstrip() + f", outside its range {limits} in "
+                    f"{self._database.name}: it is used, for such ranges are often wrong"
+                )
+            else:
+                continue
+            if (signal.path, name) not in self._reported:
+                self._reported.add((signal.path, name))
+                outputs.append(EndpointStatus(self.phase, text, is_warning=True))
+        return outputs
+
+    def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
+        """Process an error frame of the interface; bus-off requests a reopening, once."""
+        self.counts["error_frames"] += 1
+        if not frame.is_bus_off or self.is_bus_off:
+            return []
+        self.counts["bus_off"] += 1
+        self.is_bus_off, self.phase, self._silence_deadline_ns = True, EndpointPhase.SILENT, None
+        why = "the CAN interface went bus-off: too many frames failed"
+        fix = "check wiring, the terminators at both ends (60 ohm between the lines) and the bit rate"
+        return [
+            EndpointStatus(EndpointPhase.SILENT, f"{why}; {fix}; nothing is published or sent until it is back"),
+            Reopen(why),
+        ]
+
+    def _restart_silence_timer(self, now: HostTime) -> None:
+        self._silence_deadline_ns = now.monotonic_ns + round(self._silence_s * 1e9) if self._needed else None
+        self._received = 0
+        self._others.clear()
+        self._useless.clear()
+
+    def _explain_silence(self) -> str:
+        head = f"no usable {self._format_needed()} for {self._silence_s:g} s"
+        if not self._received:
+            return f"{head}, and nothing on the bus: check power, wiring, the interface's name and the bit rate"
+        wrong = [f"{number} x {what}" for what, number in self._useless.most_common()]
+        if self._others:
+            keys = ", ".join(map(str, self._others)) + (", ..." if len(self._others) == MAX_SEEN else "")
+            wrong.append(f"others: {keys}")
+        fix = "" if self._useless else "; is the controller on, and is this its DBC and its bus?"
+        return f"{head}; received {self._received} frames: {'; '.join(wrong) or 'not all of an instant'}{fix}"
+
+    def _format_needed(self) -> str:
+        return ", ".join(f"{name} ({key})" for key, name in sorted(self._needed.items()))

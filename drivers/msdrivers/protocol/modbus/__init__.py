@@ -1,1 +1,0 @@
-"""Modbus: requests, replies and failures as values, and numbers in registers."""
