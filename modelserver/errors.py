@@ -269,6 +269,15 @@ class FrameMismatchError(ModelServerError, ValueError):
     """The adjacent frames of two multiplied transformations differ."""
 
 
+class SyntaxProblemError(Exception):
+    """A file cannot be parsed; with the line, and the fix."""
+
+    def __init__(self, message: str, line: int, fix: str):
+        super().__init__(message)
+        self.line = line
+        self.fix = fix
+
+
 class ProblemsError(ModelServerError):
     """A file breaks rules. `problems` lists every finding; the message, those of `LISTED` severities."""
 

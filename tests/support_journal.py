@@ -19,7 +19,7 @@ from modelserver.server.journal.writer import JournalWriter, Ring, list_segments
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, read_geometry
 from modelserver.server.vehicle import load_vehicle
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire.codec import encode
 
 START = 1_700_000_000_000_000

@@ -10,7 +10,7 @@ from support_moving import view as exact_view
 
 from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import MirrorReceiver, MirrorState
-from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry.model import Model
 from modelserver.messages import Estimate, SnapshotPart
 from modelserver.query import PlatformView

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from modelserver.key_files import write_key
 from modelserver.messages import CHANNEL_OF, Envelope
-from modelserver.signing.key_files import write_key
-from modelserver.signing.signatures import Key, sign
+from modelserver.signing import Key, sign
 from modelserver.wire.codec import encode
 
 KEY = Key("test", bytes(range(32)))

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TextIO
 
 from modelserver.errors import RecordingError
-from modelserver.files.regular import NotRegularFileError, open_regular
+from modelserver.files import NotRegularFileError, open_regular
 from msdrivers.endpoint import HostTime, U
 from msdrivers.links import EndOfRecordingError, Link, LinkWrapper
 

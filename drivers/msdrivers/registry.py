@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
-from modelserver.files.regular import read_regular
+from modelserver.files import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.plugins import PluginRegistry
 from msdrivers.emulate import FAULT_AMOUNTS, FaultInjector, InjectedFault

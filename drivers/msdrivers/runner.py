@@ -24,7 +24,7 @@ from typing import Generic
 
 from modelserver.errors import WireError, quote
 from modelserver.messages import NAN, DriverHealth, DriverPhase, Envelope, Sample, VehicleCommand
-from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.codec import decode, encode
 from msdrivers.device_clock import DeviceClock, Stamper
 from msdrivers.endpoint import (

@@ -29,7 +29,7 @@ import numpy as np
 from modelserver.client.extrapolation import MAX_SPAN_US, MIN_SPAN_US, OdomSample, PoseExtrapolator, PublishedEstimate
 from modelserver.errors import WireError, quote
 from modelserver.estimation.history import History
-from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot
 from modelserver.geometry import names
 from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.messages import JointsSample, PoseAnswer, SnapshotPart

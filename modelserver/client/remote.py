@@ -27,6 +27,7 @@ from modelserver.client.batch_reply import BatchQuery, BatchReplyAssembler, conc
 from modelserver.client.interface import NO_DEMAND, PlatformClient, R, require_answer
 from modelserver.client.pose_stream import PoseStream
 from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
+from modelserver.key_files import KEY_FILE_VARIABLE, read_keys
 from modelserver.messages import (
     CHANNEL_OF,
     MAX_CHANNEL_LENGTH,
@@ -49,8 +50,7 @@ from modelserver.messages import (
     TimeQuery,
     TransformReply,
 )
-from modelserver.signing.key_files import KEY_FILE_VARIABLE, read_keys
-from modelserver.signing.signatures import Key, sign
+from modelserver.signing import Key, sign
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, SIGNED
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer

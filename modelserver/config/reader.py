@@ -1,6 +1,6 @@
 """Read a YAML file into a dataclass: strict types, every problem at once, each with its line and a suggestion.
 
-The bytes are composed into YAML nodes (bounded in size and depth, without aliases), turned into plain values whose
+The nodes of the YAML tree (bounded in size and depth, without aliases) are turned into plain values whose
 lines are recorded, and validated by pydantic with the dataclass as the schema: its attributes are the keys.
 
 pydantic examines the rules of a section (its `__post_init__`) only when every value in it has the right type. So the
@@ -20,12 +20,20 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
+from modelserver.errors import (
+    ConfigError,
+    Location,
+    Problem,
+    Severity,
+    Suggestion,
+    SyntaxProblemError,
+    quote,
+    suggest_key,
+    suggest_name,
+)
+from modelserver.yaml_tree import NodeKind, YamlNode, parse_yaml
 
 MAX_BYTES = 1 << 20
-
-MAX_DEPTH = 16
-"""No section is nested deeper than 3. PyYAML's composer is recursive in C: deep nesting would end the process."""
 
 MAX_ROUNDS = 8
 """Validations of one file at most, each without what the ones before found wrong."""
@@ -33,14 +41,6 @@ MAX_ROUNDS = 8
 S = TypeVar("S")
 Path_ = tuple[str | int, ...]
 """Keys and list indices from the top of the file down to a value."""
-
-
-def read(raw: bytes, name: str, schema: type[S]) -> S:
-    """Return the instance of a dataclass that the file `name` holds. Raises ConfigError with every problem."""
-    found, problems = read_partly(raw, name, schema)
-    if found is None or problems:
-        raise ConfigError(problems)
-    return found
 
 
 def read_partly(
@@ -99,30 +99,17 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
     if len(raw) > MAX_BYTES:
         raise make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
-        if not raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-            raw.decode()
-        _check_shape(raw, name)
-        node = yaml.compose(raw, Loader=yaml.CSafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        what = getattr(error, "problem", None) or str(error).splitlines()[0]
-        line = mark.line + 1 if mark else 0
-        if "nesting depth" in what:
-            # later versions of libyaml have a limit of their own, which its scanner reaches before the event
-            raise _make_depth_error(name, line) from None
-        raise make_error(name, line, f"not YAML: {what}", "check indentation and quotes") from None
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        what = f"not text in UTF-8: byte 0x{raw[error.start]:02x} in this line"
-        raise make_error(name, line, what, "save it as UTF-8; is this the vehicle file?") from None
-    if not isinstance(node, yaml.MappingNode):
+        node = parse_yaml(raw, has_aliases=False)
+    except SyntaxProblemError as error:
+        raise make_error(name, error.line, str(error), error.fix) from None
+    if node.kind is not NodeKind.MAPPING:
         missing = dataclasses.MISSING
         required = [
             each.name
             for each in dataclasses.fields(schema)
             if each.default is missing and each.default_factory is missing
         ]
-        what = "the file is empty" if node is None else "the file is not a mapping (key: value, one per line)"
+        what = "the file is empty" if node.is_null else "the file is not a mapping (key: value, one per line)"
         raise make_error(name, 1, what, f"start with: {', '.join(required)}")
     reader = SettingsReader(name, schema)
     return reader, reader.read_value(node, ())
@@ -159,21 +146,20 @@ class SettingsReader:
                 break
         return None
 
-    def read_value(self, node: yaml.Node, at: Path_) -> Any:
+    def read_value(self, node: YamlNode, at: Path_) -> Any:
         """Return the plain value of a node; record its lines and duplicate keys."""
-        self.lines.setdefault(at, node.start_mark.line + 1)
-        if isinstance(node, yaml.SequenceNode):
-            return [self.read_value(each, (*at, index)) for index, each in enumerate(node.value)]
-        if not isinstance(node, yaml.MappingNode):
-            return _read_scalar(node)
+        self.lines.setdefault(at, node.line)
+        if node.kind is NodeKind.LIST:
+            return [self.read_value(each, (*at, index)) for index, each in enumerate(node.items)]
+        if node.kind is NodeKind.SCALAR:
+            return _read_scalar(node) if node.is_plain else node.text
         values: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            line = key_node.start_mark.line + 1
-            if not isinstance(key_node, yaml.ScalarNode):
+        for key_node, value_node in node.pairs:
+            line, key = key_node.line, key_node.text
+            if key_node.kind is not NodeKind.SCALAR:
                 self.lines[(*at, "?")] = line
                 self.add_problem((*at, "?"), "a key is a name, not a list or a mapping", "write name: value")
                 continue
-            key = str(key_node.value)
             first = self.lines.get((*at, key), 0)
             self.lines[(*at, key)] = line
             if key in values:
@@ -272,13 +258,16 @@ _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
 """Numbers such as 1e-3, which are text in YAML 1.1."""
 
 
-def _read_scalar(node: yaml.Node) -> Any:
-    if isinstance(node, yaml.ScalarNode) and not node.style and _EXPONENT.fullmatch(node.value):
-        return float(node.value)
+def _read_scalar(node: YamlNode) -> Any:
+    """Return the value that YAML 1.1 gives a text without quotes: a number, a truth value, null, or the text."""
+    if _EXPONENT.fullmatch(node.text):
+        return float(node.text)
+    loader = yaml.CSafeLoader("")
+    tag = loader.resolve(yaml.ScalarNode, node.text, (True, False))  # type: ignore[no-untyped-call]
     try:
-        return yaml.CSafeLoader("").construct_object(node, deep=True)
+        return loader.construct_object(yaml.ScalarNode(tag, node.text), deep=True)
     except (yaml.YAMLError, ValueError):
-        return str(node.value)
+        return node.text
 
 
 def list_known_keys(schema: Any, at: Path_) -> list[str]:
@@ -297,25 +286,6 @@ def list_known_keys(schema: Any, at: Path_) -> list[str]:
 @cache
 def _get_type_hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
-
-
-def _check_shape(raw: bytes, name: str) -> None:
-    """Raise ConfigError for deep nesting and for aliases, which the composer would expand without bound."""
-    depth = 0
-    for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
-        line = event.start_mark.line + 1 if event.start_mark else 0
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise _make_depth_error(name, line)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.AliasEvent):
-            raise make_error(name, line, f"aliases (*{event.anchor}) are not supported", "write the value again")
-
-
-def _make_depth_error(name: str, line: int) -> ConfigError:
-    return make_error(name, line, "nested too deeply", "look for brackets that are not closed")
 
 
 def make_error(name: str, line: int, message: str, fix: str) -> ConfigError:

@@ -15,13 +15,12 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver.config import reader
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.files.kinds import PROCESS_FIX, FileKind, detect_file_kind
-from modelserver.files.regular import NotRegularFileError, read_start
+from modelserver.files import PROCESS_FIX, FileKind, NotRegularFileError, detect_file_kind, read_start
 from modelserver.messages import Mode
 
 MAX_CHANNEL = 39
@@ -325,8 +324,6 @@ class LimitsConfig:
 
     def __post_init__(self) -> None:
         problems = []
-        if not 1e4 <= self.client_reply_bytes <= 1e9:
-            problems.append(f"client_reply_bytes is between 10000 and 1e9, got {self.client_reply_bytes:g}")
         if not 0.0 < self.history_s <= 600.0:
             problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
         _check(
@@ -338,6 +335,7 @@ class LimitsConfig:
             wait_ms=(0, 60_000),
             queued_requests=(1, 65536),
             requests_per_pass=(1, 1024),
+            client_reply_bytes=(1e4, 1e9),
         )
 
 
@@ -358,7 +356,7 @@ class CommandsConfig:
     drive: Literal["auto", "signed", "unsigned"] = "auto"
     """Whether commands to the vehicle controller must be signed. `auto`: where there is a key file."""
     key_file: str = ""
-    """Keys with which such a message must be signed, relative to this file; see `modelserver.signing.key_files`."""
+    """Keys with which such a message must be signed, relative to this file; see `modelserver.key_files`."""
     window_s: float = 5.0
     """Greatest age of a signed message, seconds, by the vehicle's clock."""
 
@@ -467,7 +465,8 @@ def load_partly(path: str | Path, *, blank: bool = False) -> tuple[VehicleConfig
     Raises ConfigError for a file that is not a YAML mapping, OSError.
     """
     path = Path(path)
-    config, problems = parse_partly(_read_bytes(path), str(path), blank=blank)
+    blanks = dict.fromkeys(("vehicle", "geometry", "base_frame"), "") if blank else None
+    config, problems = reader.read_partly(_read_bytes(path), str(path), VehicleConfig, blanks)
     return None if config is None else _resolve_paths(config, path), problems
 
 
@@ -544,14 +543,9 @@ def read_config_lines(path: str | Path) -> dict[tuple[str | int, ...], int]:
     return reader.read_lines(_read_bytes(Path(path)), str(path), VehicleConfig)
 
 
-def parse_partly(
-    raw: bytes, name: str = "", *, blank: bool = False
-) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
-    """Parse the bytes of the vehicle file `name` as `load_partly` does, without resolving its paths."""
-    blanks = dict.fromkeys(("vehicle", "geometry", "base_frame"), "") if blank else None
-    return reader.read_partly(raw, name, VehicleConfig, blanks)
-
-
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
     """Parse the bytes of the vehicle file `name`. Raises ConfigError with every problem."""
-    return reader.read(raw, name, VehicleConfig)
+    found, problems = reader.read_partly(raw, name, VehicleConfig)
+    if found is None or problems:
+        raise ConfigError(problems)
+    return found

@@ -9,7 +9,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 from modelserver import messages
 from modelserver.core.host_clock import HostClock, Instant
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import NotConnectedError
 from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer

@@ -3,9 +3,9 @@
 Pinocchio, of the extra `dynamics`, does the algebra; it is imported when a `Dynamics` is made.
 """
 
-from modelserver.dynamics.mass_covariance import MassUncertainty
 from modelserver.dynamics.multibody import STANDARD_GRAVITY, CenterOfMass, Dynamics
 from modelserver.dynamics.stability import Stability, TipOver, assess_stability, compute_tip_over
+from modelserver.dynamics.tree import MassUncertainty
 
 __all__ = [
     "STANDARD_GRAVITY",

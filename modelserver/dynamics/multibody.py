@@ -15,8 +15,8 @@ the force that does work on it: with the map S below, S^T times the torque along
 Pinocchio computes in its own velocities w = S(q) q'. A joint is there a row of prismatic, revolute and spherical ones
 without mass between them, so that S = T(q) C. Each row of the constant C has one coordinate: C is a permutation, with
 signs where a rotation vector is passed backward, and further rows, with multipliers, for mimic joints. T is the
-identity but for a block J_r(v) on the rows of each rotation vector v (`rates`). The equations above follow by the
-principle of virtual work, with dS the derivative of S by time and ^T the transpose:
+identity but for a block J_r(v) on the rows of each rotation vector v (`compute_turn_motion`). The equations above
+follow by the principle of virtual work, with dS the derivative of S by time and ^T the transpose:
 
     D = S^T D_w S,   tau = S^T RNEA(q, S q', S q'' + dS q'),   S q'' = ABA(q, S q', S^-T tau) - dS q'
 
@@ -40,16 +40,22 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.dynamics.mass_covariance import MassUncertainty, iterate_center_covariance
-from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
-from modelserver.dynamics.tree import GROUND, Tree, TreeJoint, TreeLink, build_tree
+from modelserver.dynamics.tree import (
+    GROUND,
+    MassUncertainty,
+    Tree,
+    TreeJoint,
+    TreeLink,
+    build_tree,
+    iterate_center_covariance,
+)
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
-from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.inertia import RigidInertia, to_rows
 from modelserver.geometry.joint import JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import format_names
 from modelserver.transforms import so3
-from modelserver.transforms.pose import Pose
+from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array
 
 STANDARD_GRAVITY: Final = 9.80665
@@ -350,7 +356,7 @@ class Dynamics:
         whole = self._ground
         if self._moving_mass:
             self._pin.ccrba(self._model, self._data, q_pin, np.zeros(self._model.nv))
-            center, about = so3.to_vector3(self._data.com[0]), _to_rows(self._data.Ig.inertia)
+            center, about = so3.to_vector3(self._data.com[0]), to_rows(self._data.Ig.inertia)
             whole = _combine(RigidInertia(self._moving_mass, center, about), whole)
         return np.array((_transform(self.frame_pose(q, frame).inverse(), whole) if frame else whole).matrix())
 
@@ -498,13 +504,13 @@ def _with_masses(model: Model, tree: Tree, masses: Mapping[str, float], payload:
                 raise MalformedRequestError(f"{name} is not joined to {tree.root}; its {what} has no effect")
             known = links[body].inertia
             if what == "payload":
-                point = RigidInertia(mass, model.frame(name).pose.xyz, _to_rows(np.zeros((3, 3))))
+                point = RigidInertia(mass, model.frame(name).pose.xyz, to_rows(np.zeros((3, 3))))
                 found = point if known is None else _combine(known, point)
             elif known is None:
                 raise MalformedRequestError(f"body {body} has no inertia to change; state one in the geometry file")
             else:
                 about = np.array(known.about_center) * (mass / known.mass)
-                found = RigidInertia(mass, known.center, _to_rows(about))
+                found = RigidInertia(mass, known.center, to_rows(about))
             links[body] = links[body]._replace(inertia=found)
     return tree._replace(links=links)
 
@@ -517,18 +523,12 @@ def _combine(*parts: RigidInertia) -> RigidInertia:
     for each in parts:
         K = so3.skew(np.array(each.center) - center)
         about += np.array(each.about_center) - each.mass * K @ K
-    return RigidInertia(total, so3.to_vector3(center), _to_rows(about))
+    return RigidInertia(total, so3.to_vector3(center), to_rows(about))
 
 
 def _transform(X_AB: Pose, inertia: RigidInertia) -> RigidInertia:
     """Return an inertia along the axes of A from that along those of B."""
-    R = X_AB.rotation
-    center = X_AB.transform(inertia.center)
-    return RigidInertia(inertia.mass, so3.to_vector3(center), _to_rows(R @ np.array(inertia.about_center) @ R.T))
-
-
-def _to_rows(M: Array) -> Any:
-    return tuple([so3.to_vector3(row) for row in M])
+    return RigidInertia.from_moments(inertia.mass, X_AB @ Pose(inertia.center), inertia.about_center)
 
 
 def _build_pinocchio(tree: Tree, gravity: float) -> tuple[Any, Any, list[int], Array, Array, list[int]]:

@@ -20,8 +20,8 @@ from typing import NamedTuple
 from pyproj import Proj, Transformer
 from pyproj.enums import TransformDirection
 
+from modelserver.earth import Origin
 from modelserver.earth.magnetism import MagnetismError, declination
-from modelserver.earth.origin import Origin
 from modelserver.errors import ModelServerError
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose

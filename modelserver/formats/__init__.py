@@ -17,9 +17,16 @@ from pathlib import PurePath
 from typing import NamedTuple
 
 from modelserver.errors import GeometryError, Location, Problem, Severity, quote
-from modelserver.files.kinds import PROCESS_FIX, FileKind, detect_file_kind, find_geometry_path
-from modelserver.files.regular import FileTooLargeError, NotRegularFileError, read_regular
-from modelserver.formats.writing import SavedModel
+from modelserver.files import (
+    PROCESS_FIX,
+    FileKind,
+    FileTooLargeError,
+    NotRegularFileError,
+    detect_file_kind,
+    find_geometry_path,
+    read_regular,
+)
+from modelserver.formats.common import SavedModel
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 
@@ -36,7 +43,7 @@ __all__ = [
     "save_model",
 ]
 
-_WRITERS = {"yaml": "yaml_writer", "miro": "miro_writer", "miro-frames": "frame_tree_writer", "urdf": "urdf_writer"}
+_WRITERS = {"yaml": "yaml_geometry", "miro": "miro", "miro-frames": "frame_tree", "urdf": "urdf"}
 
 FORMATS = tuple(_WRITERS)
 """Formats that `save_model` writes: YAML, Miro body and constraint XML, Miro frame-tree XML, URDF."""
@@ -111,9 +118,9 @@ def parse_content(
         elif bot_frames.is_bot_param(text):
             bot_frames.load(content, builder, file)
         else:
-            from modelserver.formats import yaml_loader
+            from modelserver.formats import yaml_geometry
 
-            yaml_loader.load(content, builder, file)
+            yaml_geometry.load(content, builder, file)
     return builder
 
 
@@ -133,8 +140,8 @@ def _pause_garbage_collector() -> Iterator[None]:
 
 
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    from modelserver.formats import frame_tree_loader, miro_loader, urdf_loader, xml_document
-    from modelserver.formats.reading import label
+    from modelserver.formats import frame_tree, miro, urdf, xml_document
+    from modelserver.formats.common import label
 
     root = xml_document.parse(content, builder, file)
     if root is None:
@@ -142,7 +149,7 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
     name = xml_document.get_tag(root)
     first = Location(file, xml_document.get_line(root), f"<{label(name)}>")
     if name == "robot":
-        urdf_loader.load(root, builder, file)
+        urdf.load(root, builder, file)
         return
     if name in _OTHER_XML:
         builder.add_error(_OTHER_XML[name], first, "give a file in one of Miro's formats, URDF or YAML")
@@ -151,12 +158,12 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
         builder.add_error(_OTHER_XML["config_group"], first, "give the file with BodyName and ConstraintName in it")
         return
     before = len(builder.problems)
-    if next(frame_tree_loader.find_instances(root), None) is not None:
-        frame_tree_loader.load(root, builder, file, variables)
-        if not miro_loader.has_bodies(root):
+    if next(frame_tree.find_instances(root), None) is not None:
+        frame_tree.load(root, builder, file, variables)
+        if not miro.has_bodies(root):
             return
         # one configuration may hold both
-    miro_loader.load(root, builder, file)
+    miro.load(root, builder, file)
     if builder.is_empty and not any(problem.severity == "error" for problem in builder.problems[before:]):
         builder.add_error(
             "there is no geometry in this file: no parameter BodyName, no instance of type FrameRpyParameters"

@@ -22,9 +22,16 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from modelserver.errors import Location, Suggestion, has_error, quote, suggest_name
-from modelserver.formats import reading
-from modelserver.formats.reading import ORIGIN, ElementReader, SyntaxProblemError, label, suggest_known_key
+from modelserver.errors import Location, Suggestion, SyntaxProblemError, has_error, quote, suggest_name
+from modelserver.formats.common import (
+    MAX_POSITION,
+    MAX_SUGGESTIONS,
+    ORIGIN,
+    ElementReader,
+    find_cycles,
+    label,
+    suggest_known_key,
+)
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, Joint, JointType
@@ -190,17 +197,8 @@ class _BlockReader(ElementReader):
 
     def __init__(self, builder: ModelBuilder, file: str, block: ParamBlock, place: str, known: tuple[str, ...]):
         super().__init__(builder, file, block.line, place)
-        self.fields: dict[str, ParamValue | ParamBlock] = {}
-        for name, entry in block.entries:
-            if name in self.fields:
-                message = f"{name} is given twice (first on line {self.fields[name].line})"
-                self.error(message, "remove one of the two", entry.line)
-            elif name in known:
-                self.fields[name] = entry
-            else:
-                near = suggest_known_key(name, known)
-                fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-                self.warning(f"unknown name {quote(name)}; ignored", fix, entry.line, near)
+        entries = [(name, entry, entry.line) for name, entry in block.entries]
+        self.fields = self.select(entries, known, "name")
 
     def read_transform(self) -> Pose | None:
         turns = [key for key in _ROTATIONS if key in self.fields]
@@ -223,7 +221,7 @@ class _BlockReader(ElementReader):
         line = self.fields[key].line
         if key == "quat":
             return self.repair_quaternion(values, line)
-        if max(map(abs, values)) > reading.MAX_POSITION:
+        if max(map(abs, values)) > MAX_POSITION:
             self.error(f"{key} is out of reach", "look for a slip in the exponent", line)
             return None
         if key == "rpy":
@@ -238,14 +236,11 @@ class _BlockReader(ElementReader):
         return so3.exponential((x * scale, y * scale, z * scale))
 
     def read_numbers(self, key: str, count: int, unit: str) -> list[float] | None:
-        entry = self.fields[key]
-        try:
-            if isinstance(entry, ParamBlock):
-                raise ValueError(f"{key} is a block, not a list of {count} numbers")
-            return reading.parse_numbers(entry.texts, count, key)
-        except ValueError as error:
-            self.error(str(error), f"write {key} = [{', '.join(['number'] * count)}]; ({unit})", entry.line)
+        entry, fix = self.fields[key], f"write {key} = [{', '.join(['number'] * count)}]; ({unit})"
+        if isinstance(entry, ParamBlock):
+            self.error(f"{key} is a block, not a list of {count} numbers", fix, entry.line)
             return None
+        return self.read_row(entry.texts, count, key, fix, entry.line)
 
 
 @dataclass(slots=True)
@@ -352,16 +347,14 @@ class _BotFramesReader(ElementReader):
         missing = [each for each in self.frames.values() if each.parent != top and each.parent not in self.frames]
         for number, frame in enumerate(missing):
             near = Suggestion()
-            if number < reading.MAX_SUGGESTIONS:
+            if number < MAX_SUGGESTIONS:
                 near = suggest_name(frame.parent, (top, *self.frames))
             message = f"relative_to names frame {quote(frame.parent)}, which does not exist"
             fix = f"write {near[0]}" if near else "name the root frame, or a frame of this file"
             self.builder.add_error(message, frame.parent_source, fix, near)
         if missing:
             return False
-        for cycle in reading.find_cycles(
-            self.frames, lambda name: self.frames[name].parent if name in self.frames else None
-        ):
+        for cycle in find_cycles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
             message = f"frames form a cycle: {' in '.join(map(label, cycle))}"
             fix = f"one of them must be relative to the root frame {label(top)}, or to one that is"
             self.builder.add_error(message, self.frames[cycle[-1]].parent_source, fix)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from lxml import etree
 
-from modelserver.errors import Location, quote
-from modelserver.formats.reading import ElementReader, label, suggest_known_key
+from modelserver.errors import Location
+from modelserver.formats.common import ElementReader, label, suggest_known_key
 from modelserver.geometry.builder import ModelBuilder
 
 if TYPE_CHECKING:
@@ -136,25 +136,14 @@ class NamedParameters(ElementReader):
 
     def __init__(self, element: Element, known: tuple[str, ...], builder: ModelBuilder, file: str, place: str):
         super().__init__(builder, file, get_line(element), place)
-        self.elements: dict[str, Element] = {}
-        given = {get_name(child) for child in iterate_children(element)}
+        parameters: list[tuple[str, Element, int]] = []
         for child in iterate_children(element):
-            name, tag, line = get_name(child), get_tag(child), get_line(child)
-            if tag != "parameter":
-                fix, near = "write <parameter name=... value=.../>", suggest_known_key(tag, ("parameter",))
-                self.warning(f"unexpected element <{label(tag)}>; ignored", fix, line, tuple(near))
-            elif name in self.elements:
-                first = get_line(self.elements[name])
-                message = f"parameter {name} is given twice (first on line {first})"
-                self.error(message, "remove one of the two", line)
-            elif name in known:
-                self.elements[name] = child
+            if (tag := get_tag(child)) == "parameter":
+                parameters.append((get_name(child), child, get_line(child)))
             else:
-                # a name that is present already is not what was meant
-                near = suggest_known_key(name, tuple(each for each in known if each not in given))
-                message = f"unknown parameter {quote(name)}" if name else "a parameter without a name"
-                fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-                self.warning(f"{message}; ignored", fix, line, near)
+                fix, near = "write <parameter name=... value=.../>", suggest_known_key(tag, ("parameter",))
+                self.warning(f"unexpected element <{label(tag)}>; ignored", fix, get_line(child), tuple(near))
+        self.elements: dict[str, Element] = self.select(parameters, known, "parameter")
 
     def locate(self, at: int | str = 0) -> Location:
         """Return the location of a line or a parameter; of the element if the parameter is absent."""

@@ -1,4 +1,4 @@
-"""Read poses, sigmas and joints of the YAML format.
+"""Read poses, sigmas, inertias and joints of the YAML geometry format from the nodes of a file.
 
 A joint is `joint: floating`, or a mapping with type, axis, limits and so on. A key that ends in `_deg` is in degrees,
 one without it in meters and radians, as `rpy_deg` and `rpy` are. A joint with one coordinate has plain values; one with
@@ -12,20 +12,112 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from modelserver.errors import has_error, quote, suggest_name
-from modelserver.formats.reading import MAX_POSITION
-from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode
+from modelserver.formats.common import (
+    LARGEST_SIGMA,
+    LARGEST_SURVEY_SIGMA,
+    MAX_POSITION,
+    ElementReader,
+    looks_like_degrees,
+    looks_like_radians,
+    parse_number,
+)
+from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.inertia import RigidInertia, Rows
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.parts import Sigma
-from modelserver.geometry.plausibility import (
-    LARGEST_SIGMA,
-    LARGEST_SURVEY_SIGMA,
-    looks_like_degrees,
-    looks_like_radians,
-)
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.yaml_tree import NodeKind, YamlNode
+
+
+class YamlMapping(ElementReader):
+    """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
+
+    Null values are left out of the fields; unknown and duplicate keys are errors.
+    """
+
+    def __init__(self, builder: ModelBuilder, file: str, node: YamlNode, place: str, known: tuple[str, ...] = ()):
+        super().__init__(builder, file, node.line, place)
+        self.pairs: list[tuple[str, YamlNode, YamlNode]] = []
+        self.fields: dict[str, YamlNode] = {}
+        if not node.is_null and node.kind is not NodeKind.MAPPING:
+            self.error(f"expected a mapping (key: value), got {node.kind.value}", "write key: value, one per line")
+        for key, value in node.pairs:
+            if key.kind is not NodeKind.SCALAR:
+                self.error(f"a key is a name, got {key.kind.value}", "write name: value", key.line)
+            elif key.text == "<<" and key.is_plain:
+                fix = "use templates; see docs/geometry-files.md"
+                self.error("merge keys (<<) are not supported", fix, key.line)
+            else:
+                self.pairs.append((key.text.strip(), key, value))
+        if known:
+            entries = [(name, value, key.line) for name, key, value in self.pairs]
+            selected = self.select(entries, known, "key", is_strict=True)
+            self.fields = {name: value for name, value in selected.items() if not value.is_null}
+
+    def enter(self, node: YamlNode, place: str, known: tuple[str, ...] = ()) -> YamlMapping:
+        return YamlMapping(self.builder, self.file, node, place, known)
+
+    def line_of(self, key: str) -> int:
+        return self.fields[key].line if key in self.fields else 0
+
+    def read_text(self, key: str) -> str:
+        """Return the trimmed text of a scalar, empty if it is absent or, with an error, no scalar."""
+        node = self.fields.get(key)
+        if node is None:
+            return ""
+        if node.kind is NodeKind.SCALAR:
+            return node.text.strip()
+        fix = f"write {key}: some text, in quotes if need be"
+        self.error(f"{key} is a text, got {node.kind.value}", fix, node.line)
+        return ""
+
+    def read_numbers(self, node: YamlNode, count: int, key: str, unit: str = "") -> list[float] | None:
+        """Read a list of `count` numbers; None, with an error, if it is wrong."""
+        fix = f"write {key}: [{', '.join(['number'] * count)}]" + (f", in {unit}" if unit else "")
+        if node.kind is not NodeKind.LIST:
+            got = quote(node.text, 40) if node.kind is NodeKind.SCALAR else node.kind.value
+            self.error(f"{key} is a list of {count} numbers, got {got}", fix, node.line)
+            return None
+        read = [self.read_number(item, key, fix) for item in node.items]
+        values = [value for value in read if value is not None]
+        if len(values) < len(read):
+            return None
+        if len(values) != count:
+            plural = "" if len(values) == 1 else "s"
+            self.error(f"{key} has {len(values)} number{plural}, not {count}", fix, node.line)
+            return None
+        return values
+
+    def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
+        """Read one number; None, with an error, if it is wrong."""
+        if node.kind is not NodeKind.SCALAR:
+            self.error(f"{key}: expected a number, got {node.kind.value}", fix, node.line)
+            return None
+        try:
+            if not node.is_plain:
+                raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
+            return parse_number(node.text)
+        except ValueError as error:
+            self.error(f"{key}: {error}", fix, node.line)
+            return None
+
+    def read_rows(self, key: str, shapes: tuple[int, ...], width: int) -> list[list[float]] | None:
+        """Read rows of `width` numbers; their count is one of `shapes`."""
+        node = self.fields[key]
+        wanted = " or ".join(map(str, shapes))
+        if node.kind is not NodeKind.LIST or len(node.items) not in shapes:
+            what = f"has {len(node.items)} rows, not {wanted}"
+            if node.kind is not NodeKind.LIST:
+                what = f"is a list of rows, got {node.kind.value}"
+            fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
+            self.error(f"{key} {what}", fix, node.line)
+            return None
+        rows = [self.read_numbers(item, width, f"{key} row {number}") for number, item in enumerate(node.items, 1)]
+        read = [row for row in rows if row is not None]
+        return read if len(read) == len(rows) else None
+
 
 POSE_KEYS = ("xyz", "rpy_deg", "rpy", "quaternion", "rotation", "matrix")
 """`xyz` in meters with at most one of the rotations, or `matrix` alone."""

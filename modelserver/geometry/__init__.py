@@ -3,8 +3,7 @@
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model, Search
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.shape import Material, Shape, ShapeKind
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Material, Shape, ShapeKind, Sigma
 from modelserver.geometry.topology import Neighbor
 
 __all__ = [

@@ -15,6 +15,7 @@ A file reader fills one and adds the problems that it met; a program may do the 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -27,16 +28,23 @@ from modelserver.errors import (
     Suggestion,
     has_error,
     quote,
+    suggest_name,
 )
-from modelserver.geometry import loop_closure as loops
 from modelserver.geometry import names
-from modelserver.geometry.joint import FIXED, Joint
-from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
+from modelserver.geometry.joint import FIXED, Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
-from modelserver.geometry.shape import Shape
-from modelserver.geometry.topology import Topology, full_name
+from modelserver.geometry.parts import (
+    Body,
+    BodyFrame,
+    Constraint,
+    Shape,
+    Sigma,
+    apply_mimic_defaults,
+    resolve_mimics,
+    suggest_frame,
+)
+from modelserver.geometry.topology import MAX_SIGMAS, LoopMisclosure, Topology, compute_misclosure, full_name
 from modelserver.transforms.pose import Pose
 
 MAX_LOOP_SIGMAS = 3.0
@@ -45,6 +53,16 @@ MAX_LOOP_SIGMAS = 3.0
 MAX_SUGGESTIONS = 100
 """Constraint ends for which the nearest names are searched, which is slow."""
 
+
+MAX_POSITION = 1e9
+"""Meters or radians; a default position beyond would cost the precision of millimeters."""
+
+
+MAX_ANGLE = 2.0 * math.tau
+"""Radians; an angle beyond two turns is probably one in degrees."""
+
+LocatedConstraint = tuple[Constraint, Location]
+"""A constraint and its source location."""
 
 NO_LOCATION: Final = Location()
 
@@ -368,10 +386,164 @@ class _ModelReview:
         self.report(f"{label}: {sense} {problem}", source, f"write {near[0]}" if near else fix, near)
         return False
 
-    def check_joints(self, placed: tuple[LocatedConstraint, ...]) -> tuple[LocatedConstraint, ...]:
+    def check_joints(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
         """Return the constraints whose joints are valid, with the defaults of mimic joints applied."""
-        known = set(self.draft.constraint_names)
-        return JointRules(self.report, self.add_problem, known, self.draft.unreadable_joints, self.repair).apply(placed)
+        placed = self._drop_invalid_mimics(self._drop_duplicate_coordinates(placed))
+        # a joint that follows one out of range cannot stay
+        return self._apply_defaults(self._drop_invalid_mimics(self._drop_out_of_range(placed)))
+
+    def _drop_duplicate_coordinates(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
+        valid: list[LocatedConstraint] = []
+        taken: dict[str, LocatedConstraint] = {}
+        for constraint, source in placed:
+            mine = coordinate_names(constraint.name, constraint.joint)
+            clash = next((name for name in mine if name in taken), None)
+            if clash is not None:
+                other, place = taken[clash]
+                self.report(
+                    f"constraint {quote(constraint.name)}: a coordinate of its joint is called {quote(clash)}, as is "
+                    f"one of constraint {other.name}{format_first_location(place)}",
+                    source,
+                    "rename one of the two constraints",
+                )
+                continue
+            taken.update((name, (constraint, source)) for name in mine)
+            valid.append((constraint, source))
+        return valid
+
+    def _drop_invalid_mimics(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
+        """Return the constraints without the joints whose mimic chains end at none that can be followed.
+
+        Of a chain only its last joint is reported, and a cycle once; what follows them is reported with `repair`.
+        """
+        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
+        sources = {constraint.name: source for constraint, source in placed}
+        is_valid: dict[str, bool] = {}
+        for constraint, source in placed:
+            chain: dict[str, Constraint] = {}
+            each: Constraint | None = constraint
+            while each is not None and each.joint.mimic is not None and each.name not in chain | is_valid:
+                chain[each.name] = each
+                each = joints.get(each.joint.mimic.joint)
+            if not chain:
+                continue
+            if each is not None and is_valid.get(each.name, each.name not in chain and each.joint.count == 1):
+                is_valid |= dict.fromkeys(chain, True)
+                continue
+            followers = list(chain.values())
+            if each is constraint:
+                self._report_cycle(list(chain), source)
+                followers = []
+            elif each is not None and each.name in chain:
+                # the cycle is reported where this loop comes to the first of it
+                followers = followers[: list(chain).index(each.name)]
+                chain = {follower.name: follower for follower in followers}
+            elif (each is None or each.name not in is_valid) and self._report_leader(followers[-1], joints, sources):
+                followers.pop()
+            for follower in followers:
+                self._report_follower(follower, sources[follower.name])
+            is_valid |= dict.fromkeys(chain, False)
+        return [item for item in placed if is_valid.get(item[0].name, True)]
+
+    def _report_cycle(self, chain: list[str], source: Location) -> None:
+        label = f"constraint {quote(chain[0])}"
+        if len(chain) == 1:
+            self.report(f"{label}: its joint follows itself", source, "name another joint, or remove mimic")
+            return
+        cycle = " follows ".join([*chain, chain[0]][:MAX_LISTED])
+        more = " follows ..." if len(chain) >= MAX_LISTED else ""
+        message = f"{label}: joints follow each other in a cycle: {cycle}{more}"
+        self.report(message, source, "remove the mimic of one of them")
+
+    def _report_leader(
+        self, constraint: Constraint, joints: Mapping[str, Constraint], sources: Mapping[str, Location]
+    ) -> bool:
+        """Report that a joint follows one that cannot be followed; return whether the fault is its own."""
+        assert constraint.joint.mimic is not None
+        name, near = constraint.joint.mimic.joint, Suggestion()
+        if (leader := joints.get(name)) is not None:
+            what = f"{name}, a {leader.joint.type} one with {leader.joint.count} coordinates"
+            fix = "follow a joint with one coordinate, revolute or prismatic"
+        elif name in sources and name not in self.draft.unreadable_joints:
+            what, fix = f"{name}, which does not move", "follow a joint that moves, or remove mimic"
+        elif name in self.draft.constraint_names:
+            return False
+        else:
+            near = suggest_name(name, joints)
+            what = f"{quote(name)}, and there is no constraint of that name"
+            fix = f"write {near[0]}" if near else f"joints here are: {format_names(list(joints))}"
+        message = f"constraint {quote(constraint.name)}: its joint follows {what}"
+        self.report(message, sources[constraint.name], fix, near)
+        return True
+
+    def _report_follower(self, constraint: Constraint, source: Location) -> None:
+        """Report a follower of a dropped joint; without `repair` nothing is dropped, and the first report is enough."""
+        if self.repair and constraint.joint.mimic is not None:
+            message = f"constraint {quote(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
+            self.report(f"{message}, which was removed", source, "fix that one")
+
+    def _warn(self, constraint: Constraint, message: str, source: Location, fix: str) -> None:
+        self.add_problem(Severity.WARNING, f"constraint {quote(constraint.name)}: {message}", source, fix)
+
+    def _apply_defaults(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
+        self._check_degrees(placed)
+        applied = apply_mimic_defaults(constraint for constraint, _ in placed)
+        for (stated, source), each in zip(placed, applied, strict=True):
+            joint, mimic = each.joint, each.joint.mimic
+            if mimic is None:
+                continue
+            unused = f"is not used, because it follows {mimic.joint}"
+            if stated.joint.default not in ((), joint.default):
+                fix = f"remove it, or state the default of {mimic.joint}"
+                self._warn(each, f"the default of its joint {unused}", source, fix)
+            if stated.joint.sigma:
+                fix = f"remove it, or state the sigma of {mimic.joint}: their errors are common"
+                self._warn(each, f"the sigma of its joint {unused}", source, fix)
+            if joint.is_out_of_limits(joint.default):
+                (value,) = joint.default
+                at = f"{math.degrees(value):.4g} deg" if joint.angle_flags[0] else f"{value:.4g} m"
+                fix = "fix the multiplier or offset of mimic, the limits, or the default of the joint it follows"
+                self._warn(
+                    each, f"at the default of {mimic.joint}, its joint is at {at}, out of its limits", source, fix
+                )
+        return tuple((each, source) for (_, source), each in zip(placed, applied, strict=True))
+
+    def _check_degrees(self, placed: Sequence[LocatedConstraint]) -> None:
+        """Warn of angles so large that they look like degrees written as radians."""
+        for constraint, source in placed:
+            joint = constraint.joint
+            for key in ("lower", "upper", "default"):
+                turns = [
+                    value
+                    for value, angle in zip(getattr(joint, key), joint.angle_flags, strict=False)
+                    if angle and MAX_ANGLE < abs(value) < math.inf
+                ]
+                if turns:
+                    what = "default" if key == "default" else f"{key} limit"
+                    size = f"{turns[0]:.6g} rad, {abs(turns[0]) / math.tau:.3g} turns"
+                    fix = "where that is degrees, name them so (limits_deg, default_deg); a winch may turn that far"
+                    self._warn(constraint, f"the {what} of its joint is {size}", source, fix)
+                    break
+
+    def _drop_out_of_range(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
+        """Return those whose default positions are in range; report the others."""
+        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
+        drives = resolve_mimics(joints.values())
+        valid = []
+        for constraint, source in placed:
+            if constraint.joint.mimic is not None:
+                drive = drives[constraint.name]
+                (leader_default,) = joints[drive.leader].joint.default_position
+                if not abs(drive.multiplier * leader_default + drive.offset) <= MAX_POSITION:
+                    self.report(
+                        f"constraint {quote(constraint.name)}: following {constraint.joint.mimic.joint} puts its "
+                        f"joint beyond {MAX_POSITION:g}",
+                        source,
+                        "fix the multipliers and offsets of the mimic chain",
+                    )
+                    continue
+            valid.append((constraint, source))
+        return valid
 
     def _suggest_end(self, end: str, bodies: dict[str, Body]) -> Suggestion:
         """Return a suggestion for an end of a constraint that does not exist.
@@ -407,7 +579,7 @@ class _ModelReview:
                 self.add_problem(Severity.WARNING, message, self.locations[body], fix)
         closures = tuple(topology.find_loop_closures())
         for closing in closures:
-            found = loops.compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
+            found = compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
             self.add_problem(
                 Severity.WARNING if bad else Severity.NOTE,
@@ -441,7 +613,7 @@ def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
     return bodies[body].frame(frame)
 
 
-def _describe_misclosure(found: loops.LoopMisclosure) -> str:
+def _describe_misclosure(found: LoopMisclosure) -> str:
     if found.is_exact:
         return "it closes exactly" + (", with joints at their defaults" if found.joints else "")
     joints = ", with joints at their defaults," if found.joints else ""
@@ -450,11 +622,11 @@ def _describe_misclosure(found: loops.LoopMisclosure) -> str:
         return f"{text}, and no sigma is stated for {format_names(found.missing_sigmas)}"
     if math.isinf(found.sigmas):
         return f"{text}, in a direction that the surveys state as exact"
-    more = "more than " if found.sigmas >= loops.MAX_SIGMAS else ""
+    more = "more than " if found.sigmas >= MAX_SIGMAS else ""
     return f"{text}, {more}{found.sigmas:.1f} sigma of the surveys"
 
 
-def _suggest_fix(found: loops.LoopMisclosure) -> str:
+def _suggest_fix(found: LoopMisclosure) -> str:
     if found.sigmas is None:
         missing = format_names(found.missing_sigmas)
         return f"state sigma: of {missing}, remove one constraint of the loop, or fix the survey"

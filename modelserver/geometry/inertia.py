@@ -41,7 +41,7 @@ class RigidInertia(NamedTuple):
     def from_moments(cls, mass: float, pose: Pose, moments: Sequence[Sequence[float]]) -> RigidInertia:
         """Return the inertia from `moments` (3, 3) about the origin and along the axes of `pose`, as in URDF."""
         R = np.array(so3.matrix_rows(pose.wxyz))
-        return cls(mass, pose.xyz, _to_rows(R @ np.asarray(moments, dtype=float) @ R.T))
+        return cls(mass, pose.xyz, to_rows(R @ np.asarray(moments, dtype=float) @ R.T))
 
     def matrix(self) -> Rows:
         """Return the spatial inertia, 6 rows of 6."""
@@ -106,7 +106,7 @@ def from_spatial_inertia(matrix: Sequence[Sequence[float]]) -> RigidInertia | No
         about = M[3:, 3:] + m * so3.skew(center) @ so3.skew(center)
     if not np.isfinite(about).all():
         return None
-    found = RigidInertia(m, center, _to_rows((about + about.T) / 2.0))
+    found = RigidInertia(m, center, to_rows((about + about.T) / 2.0))
     rebuilt = np.asarray(found.matrix())
     for rows in (slice(0, 3), slice(3, 6)):
         for columns in (slice(0, 3), slice(3, 6)):
@@ -116,6 +116,7 @@ def from_spatial_inertia(matrix: Sequence[Sequence[float]]) -> RigidInertia | No
     return found
 
 
-def _to_rows(M: Array) -> tuple[Vector3, Vector3, Vector3]:
+def to_rows(M: Array) -> tuple[Vector3, Vector3, Vector3]:
+    """Return the rows of a matrix (3, 3) as plain floats."""
     (a, b, c), (d, e, f), (g, h, i) = (M + 0.0).tolist()
     return (a, b, c), (d, e, f), (g, h, i)

@@ -83,7 +83,7 @@ class Joint:
     `axis` is the unit vector, in the frame that the constraint's pose leads to, about or along which it moves. `lower`,
     `upper`, `rate_limit`, `default` and `sigma` have one number for each coordinate, in radians or meters (per second),
     or are empty for no limit, default 0, and no stated sigma. `sigma` is the standard deviation of positions whose
-    message states none. The default of a mimic joint follows from its leader's (`joint_rules.apply_mimic_defaults`).
+    message states none. The default of a mimic joint follows from its leader's (`parts.apply_mimic_defaults`).
 
     Raises ValueError for an unknown type, an axis of no length, limits in the wrong order, a default beyond them, and
     numbers that are not finite, or negative where they may not be.

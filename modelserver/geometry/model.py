@@ -25,10 +25,9 @@ from modelserver.errors import (
 )
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates, Joint, Mimic
-from modelserver.geometry.joint_rules import resolve_mimics
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
 from modelserver.geometry.names import format_names
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, resolve_mimics
 from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, full_name, list_edges
 from modelserver.plugins import load_object
 from modelserver.transforms import chain

@@ -1,19 +1,103 @@
-"""Bodies, frames and constraints as immutable values (report 4.2 to 4.4)."""
+"""Bodies, frames, constraints and shapes as immutable values (report 4.2 to 4.4).
+
+Shapes and materials are for viewers, and not used in answers; mesh files are not opened. A mimic joint follows another,
+also through chains of joints that follow each other: `resolve_mimics` finds the coordinates that drive each joint.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Final, NamedTuple
 
 from modelserver.errors import UnknownFrameError, find_nearest_names, find_suggestion, quote
 from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
-from modelserver.geometry.joint import FIXED, Joint
-from modelserver.geometry.shape import Shape
+from modelserver.geometry.joint import FIXED, Joint, Mimic, coordinate_names
 from modelserver.transforms import covariance
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+
+
+class ShapeKind(StrEnum):
+    """The kind of a shape."""
+
+    BOX = "box"
+    CYLINDER = "cylinder"
+    SPHERE = "sphere"
+    MESH = "mesh"
+
+
+DIMENSIONS: Final[dict[ShapeKind, tuple[str, ...]]] = {
+    ShapeKind.BOX: ("x", "y", "z"),
+    ShapeKind.CYLINDER: ("radius", "length"),
+    ShapeKind.SPHERE: ("radius",),
+    ShapeKind.MESH: ("x", "y", "z"),
+}
+"""The numbers of a shape's `size`, meters; those of a mesh are scale factors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """A named material: color as red, green, blue and opacity from 0 to 1, and the name of a texture file.
+
+    Raises ValueError for a name that is empty or not printable, or a color out of its range.
+    """
+
+    name: str
+    color: tuple[float, float, float, float] | None = None
+    texture: str = ""
+
+    def __post_init__(self) -> None:
+        _check_text("a material's name", self.name, required=True)
+        _check_text("a texture's file", self.texture)
+        if self.color is not None:
+            values = tuple([float(value) + 0.0 for value in self.color])
+            if len(values) != 4 or not all(0.0 <= value <= 1.0 for value in values):
+                raise ValueError("a color is red, green, blue and opacity, each from 0 to 1")
+            object.__setattr__(self, "color", values)
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A shape on a body: `pose` is that of its center, or of the mesh's origin, in body coordinates.
+
+    `size` is ordered as in `DIMENSIONS`; the axis of a cylinder is z. `file` names a mesh's file and is empty for other
+    kinds. Raises ValueError for sizes that are missing, not finite, or, except for a mesh, negative.
+    """
+
+    kind: ShapeKind
+    size: tuple[float, ...]
+    pose: Pose = field(default_factory=Pose.identity)
+    file: str = ""
+    name: str = ""
+    material: Material | None = None
+
+    def __post_init__(self) -> None:
+        wanted = DIMENSIONS[self.kind]
+        size = tuple([float(value) + 0.0 for value in self.size])
+        if len(size) != len(wanted):
+            raise ValueError(
+                f"the size of a {self.kind} is {', '.join(wanted)}: {len(wanted)} numbers, got {len(size)}"
+            )
+        for what, value in zip(wanted, size, strict=True):
+            # a mesh is mirrored by a negative scale
+            if not math.isfinite(value) or (value < 0.0 and self.kind is not ShapeKind.MESH):
+                raise ValueError(f"the {what} of a {self.kind} is finite and not negative, got {value:g}")
+        object.__setattr__(self, "size", size)
+        _check_text("a mesh's file", self.file, required=self.kind is ShapeKind.MESH)
+        if self.file and self.kind is not ShapeKind.MESH:
+            raise ValueError(f"a {self.kind} has no file")
+        _check_text("a shape's name", self.name)
+
+
+def _check_text(what: str, text: str, required: bool = False) -> None:
+    if required and not text:
+        raise ValueError(f"{what} is missing")
+    if not text.isprintable() or text != text.strip():
+        raise ValueError(f"{what} is printable and has no white space around it, got {quote(text)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,3 +287,53 @@ def suggest_frame(name: str, bodies: Mapping[str, Body]) -> str:
         return names.join(body, near) if near else ""
     near = find_suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
     return names.join(near, frame) if near else ""
+
+
+class JointDrive(NamedTuple):
+    """The position of a joint: `multiplier` times the coordinates `names` of its `leader`, plus `offset`.
+
+    For a chain of mimic joints, multiplier and offset are those of the whole chain.
+    """
+
+    names: tuple[str, ...]
+    leader: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def resolve_mimics(joints: Iterable[Constraint]) -> dict[str, JointDrive]:
+    """Return the drive of each joint by its constraint's name.
+
+    Mimic chains end at a joint that follows none; `ModelBuilder` rejects those that do not.
+    """
+    by_name = {each.name: each for each in joints}
+    found: dict[str, JointDrive] = {}
+    for each in by_name.values():
+        links: list[tuple[str, Mimic]] = []
+        while each.name not in found and (mimic := each.joint.mimic) is not None:
+            links.append((each.name, mimic))
+            each = by_name[mimic.joint]
+        drive = found.setdefault(each.name, JointDrive(coordinate_names(each.name, each.joint), each.name))
+        for name, mimic in reversed(links):
+            offset = mimic.multiplier * drive.offset + mimic.offset
+            drive = JointDrive(drive.names, drive.leader, mimic.multiplier * drive.multiplier, offset)
+            found[name] = drive
+    return {name: found[name] for name in by_name}
+
+
+def apply_mimic_defaults(constraints: Iterable[Constraint]) -> tuple[Constraint, ...]:
+    """Return the constraints with the default of each mimic joint computed from its leader's default position.
+
+    Every mimic chain must end at a joint that follows none. Raises ValueError where a position is not finite.
+    """
+    constraints = tuple(constraints)
+    moving = {each.name: each for each in constraints if each.joint.is_movable}
+    drives = resolve_mimics(moving.values())
+    result = []
+    for each in constraints:
+        if each.joint.mimic is not None:
+            drive = drives[each.name]
+            (leader,) = moving[drive.leader].joint.default_position
+            each = replace(each, joint=replace(each.joint, default=(drive.multiplier * leader + drive.offset,)))
+        result.append(each)
+    return tuple(result)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.earth.origin import Origin
+from modelserver.earth import Origin
 from modelserver.messages.flags import MET, NAN, NO_FLAGS, Quality, Unmet
 from modelserver.transforms.so3 import Array
 from modelserver.transforms.transformation import Transformation

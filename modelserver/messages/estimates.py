@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from modelserver.earth.origin import Origin as Origin
+from modelserver.earth import Origin as Origin
 from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
-from modelserver.earth.origin import Origin
+from modelserver.earth import Origin
 from modelserver.messages.answers import PoseAnswer, PoseBatch
 from modelserver.messages.flags import NAN
 from modelserver.messages.generated import (

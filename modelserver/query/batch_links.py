@@ -16,8 +16,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import LIMIT_TOLERANCE, Joint, JointType
 from modelserver.geometry.kinematic_path import PathJoint
 from modelserver.geometry.topology import EdgeKind
-from modelserver.joints.rotation_vector import ROTATION_VECTOR_TYPES, interpolate_batch
-from modelserver.joints.track import MAX_GAP_S
+from modelserver.joints.track import MAX_GAP_S, ROTATION_VECTOR_TYPES, interpolate_batch
 from modelserver.messages import Estimate, Invalid, Origin, Quality
 from modelserver.query.steps import Steps
 from modelserver.query.view import ODOM_INVALID, PlatformView, find_vehicle_pose

@@ -17,8 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
-from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
@@ -38,7 +37,7 @@ from modelserver.query.motion import compute_motion
 from modelserver.query.steps import Steps
 from modelserver.query.view import PlatformView
 from modelserver.transforms import so3
-from modelserver.transforms.pose import Pose
+from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array
 
 MAX_COORDINATES: Final = 100

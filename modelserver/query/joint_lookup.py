@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 from modelserver.errors import TooNewError, TooOldError
 from modelserver.geometry.joint import Coordinates
-from modelserver.geometry.joint_rules import JointDrive
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
+from modelserver.geometry.parts import JointDrive
 from modelserver.joints.history import MAX_CLOCK_LEAD_S, JointHistory
-from modelserver.joints.rotation_vector import ROTATION_VECTOR_TYPES, combine
-from modelserver.joints.track import MAX_GAP_S, JointTrack, Provenance, Reading
+from modelserver.joints.track import MAX_GAP_S, ROTATION_VECTOR_TYPES, JointTrack, Provenance, Reading, combine
 from modelserver.messages import NAN, NO_FLAGS, VALID, Invalid, Policy, Quality
 
 _QUALITY_OF: Mapping[Provenance, int] = {

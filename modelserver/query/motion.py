@@ -1,6 +1,6 @@
 """Motion of a frame in another: velocity and acceleration, from the joints' rates and the vehicle's own motion.
 
-The rigid motion of each edge is composed along the path (`transforms.kinematics`). A joint moves by J q' and
+The rigid motion of each edge is composed along the path (`transforms.pose`). A joint moves by J q' and
 J q'' + J' q', with its Jacobian J differenced along q'. The vehicle's acceleration is measured at the inertial unit and
 transferred by the lever arm: a + dw x r + w x (w x r). The covariance of the velocities is first order in the chain.
 Accelerations are linear in those of the vehicle, which gives their covariance; that of a measured joint is not known.
@@ -22,8 +22,7 @@ from modelserver.query.path import PathStep, lookup_path
 from modelserver.query.view import PlatformView
 from modelserver.transforms import chain, so3
 from modelserver.transforms.chain import ChainLink
-from modelserver.transforms.kinematics import UNKNOWN, ZERO, RigidMotion
-from modelserver.transforms.pose import Pose
+from modelserver.transforms.pose import UNKNOWN, ZERO, Pose, RigidMotion
 from modelserver.transforms.so3 import Array, add, cross, to_vector3
 
 _STEP = 1e-4

@@ -6,7 +6,7 @@ the model and the joints; for a world frame it is the inverse of the vehicle's p
 for each world frame by geodesy at the vehicle's position.
 
 Covariances: the vehicle's is transported to a frame by the lever arm, also for large heading errors
-(`transforms.large_angle`), and the independent one of the mount and its joints is added.
+(`transforms.covariance`), and the independent one of the mount and its joints is added.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.dynamics.settings import DynamicsSettings
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import (
     LimitError,
     MalformedRequestError,

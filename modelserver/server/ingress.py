@@ -43,7 +43,7 @@ from modelserver.messages import (
 from modelserver.named_tuples import new_tuple
 from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog
-from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
+from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode, encode, read_request_header
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME

@@ -33,7 +33,7 @@ from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
 from modelserver.errors import quote
-from modelserver.files.regular import check_links, read_start
+from modelserver.files import check_links, read_start
 from modelserver.messages import Origin, PersistedPose, PersistedState, RestoredState
 from modelserver.server.log import escape_text, start_in_background
 from modelserver.transforms.so3 import Quaternion, Vector3

@@ -21,13 +21,13 @@ from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.estimation.findings import find_unusable
 from modelserver.estimation.sensor_rig import SPEEDOMETER, Mounts, SensorRig, SpeedometerSignal, SteeringSignal
 from modelserver.formats import FileExamination, examine_file
-from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.formats.common import is_far
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
-from modelserver.geometry.plausibility import is_far
+from modelserver.key_files import read_keys
 from modelserver.server.ingress import MODE_TYPE, CommandVerifier, SensorChannel
-from modelserver.signing.key_files import read_keys
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import get_type_name
 from modelserver.wire.urls import leaves_machine

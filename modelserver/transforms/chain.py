@@ -13,7 +13,7 @@ Links with the same `source` have the same errors, column by column: their J L a
 that shared errors cancel where a chain passes the same link forth and back. Links of different sources are independent.
 
 First order is not enough where the rotation of a link is very uncertain, as the vehicle's heading before it has moved:
-such a link is marked `is_large_angle` and gets the large-angle lever-arm covariance (`large_angle`).
+such a link is marked `is_large_angle` and gets the large-angle lever-arm covariance (`covariance`).
 
 `ChainLinkBatch` and the `*_batch` functions compute the same for many chains at once: poses and factors with one row
 for each chain, or a single row where they are equal in all.
@@ -29,7 +29,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.transforms import so3
-from modelserver.transforms.large_angle import large_angle_lever_arm, large_angle_lever_arm_batch
+from modelserver.transforms.covariance import large_angle_lever_arm, large_angle_lever_arm_batch
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.pose_array import PoseArray, to_matrices
 from modelserver.transforms.so3 import Array

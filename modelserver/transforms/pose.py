@@ -1,17 +1,29 @@
-"""Pose: a position and an orientation, as one immutable value (report 3.1 and Annex F)."""
+"""Pose: a position and an orientation, as one immutable value (report 3.1 and Annex F), and its motion.
+
+Rigid-body kinematics: pose, velocity and acceleration are composed along a chain. All vectors of `RigidMotion` X_FT are
+of T's origin relative to F, along the axes of F, as observed in F. Composition and inversion are the kinematics of
+rigid bodies (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 2).
+
+Rates of a rotation vector and angular velocities are converted in plain floats. With the left Jacobian J_l(v) = 1 + a
+[v]x + b [v]x [v]x of SO(3) (Sola 2017, eq. 183), a rotation vector that changes at the rate v' has the angular velocity
+J_l(v) v' along the axes of the near frame, J_r(v) v' = J_l(-v) v' along those of the far one. a and b are functions of
+v.v, so the derivative of J_l needs only theirs, da and db by v.v / 2. All are taken from series at small angles, where
+their quotients lose digits. A rotation vector is singular at a length of 2 pi, as every three numbers of a rotation are
+somewhere.
+"""
 
 from __future__ import annotations
 
 import math
 import reprlib
 from collections.abc import Iterable
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.transforms import so3
-from modelserver.transforms.so3 import Array, Quaternion, Vector3
+from modelserver.transforms.so3 import Array, Quaternion, Vector3, add, cross, scale
 
 
 def _freeze(values: object) -> Array:
@@ -257,3 +269,137 @@ class Pose:
 # Setting a slot by its descriptor bypasses the guard above, at half the cost of object.__setattr__.
 _put_p = Pose.__dict__["_p"].__set__
 _put_q = Pose.__dict__["_q"].__set__
+
+
+ZERO: Vector3 = (0.0, 0.0, 0.0)
+UNKNOWN: Vector3 = (math.nan, math.nan, math.nan)
+
+
+class RigidMotion(NamedTuple):
+    """The pose of T in F and its derivatives: m/s, rad/s, m/s2, rad/s2; nan where unknown."""
+
+    pose: Pose
+    velocity: Vector3 = ZERO
+    angular_velocity: Vector3 = ZERO
+    acceleration: Vector3 = ZERO
+    angular_acceleration: Vector3 = ZERO
+
+    def compose(self, other: RigidMotion) -> RigidMotion:
+        """Return X_FT @ X_TU with its motion."""
+        q = self.pose.wxyz
+        r = so3.rotate(q, other.pose.xyz)
+        v, w = so3.rotate(q, other.velocity), so3.rotate(q, other.angular_velocity)
+        a, t = so3.rotate(q, other.acceleration), so3.rotate(q, other.angular_acceleration)
+        omega = self.angular_velocity
+        tangential = cross(omega, r)
+        return RigidMotion(
+            self.pose @ other.pose,
+            add(self.velocity, tangential, v),
+            add(omega, w),
+            add(
+                self.acceleration,
+                cross(self.angular_acceleration, r),
+                cross(omega, tangential),
+                scale(2.0, cross(omega, v)),
+                a,
+            ),
+            add(self.angular_acceleration, t, cross(omega, w)),
+        )
+
+    def inverse(self) -> RigidMotion:
+        """Return X_TF with its motion: the motion of F as observed in T.
+
+        p_TF = -R' p and d(R')/dt = -R' [w]x. With u = -v + w x p the velocity is R' u, the acceleration R' (du/dt - w x
+        u).
+        """
+        q = so3.conjugate(self.pose.wxyz)
+        p, w = self.pose.xyz, self.angular_velocity
+        u = add(scale(-1.0, self.velocity), cross(w, p))
+        du = add(scale(-1.0, self.acceleration), cross(self.angular_acceleration, p), cross(w, self.velocity))
+        return RigidMotion(
+            self.pose.inverse(),
+            so3.rotate(q, u),
+            so3.rotate(q, scale(-1.0, w)),
+            so3.rotate(q, add(du, scale(-1.0, cross(w, u)))),
+            so3.rotate(q, scale(-1.0, self.angular_acceleration)),
+        )
+
+
+SMALL_ANGLE = 0.1
+"""Radians below which the functions of the angle are taken from their series: the quotients lose digits there."""
+
+
+def compute_turn_motion(
+    v: Vector3, rate: Vector3, change: Vector3 = (0.0, 0.0, 0.0), sign: float = 1.0
+) -> tuple[Vector3, Vector3]:
+    """Return angular velocity J_l v' and acceleration of a rotation vector, with v' and v''. `sign` -1: of J_r.
+
+    The acceleration is J_l v'' + (v.v') (da v x v' + db v x (v x v')) + b v' x (v x v').
+    """
+    x, y, z = v
+    dx, dy, dz = rate
+    ddx, ddy, ddz = change
+    square = x * x + y * y + z * z
+    along = x * dx + y * dy + z * dz
+    a, b, da, db = _get_coefficients(square)
+    # sums of multiples: of crosses, of v, of v' and v''
+    c, n = sign * a, 1.0 - b * square
+    m = b * along
+    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    k = sign * along * da
+    dm = along * along * db + b * (dx * dx + dy * dy + dz * dz + x * ddx + y * ddy + z * ddz)
+    dn = -along * (square * db + b)
+    return (
+        (c * cx + m * x + n * dx, c * cy + m * y + n * dy, c * cz + m * z + n * dz),
+        (
+            k * cx + c * (y * ddz - z * ddy) + dm * x + dn * dx + n * ddx,
+            k * cy + c * (z * ddx - x * ddz) + dm * y + dn * dy + n * ddy,
+            k * cz + c * (x * ddy - y * ddx) + dm * z + dn * dz + n * ddz,
+        ),
+    )
+
+
+def compute_turn_rate(v: Vector3, velocity: Vector3, sign: float = 1.0) -> Vector3:
+    """Return the rate at which a rotation vector changes with an angular velocity: the inverse of J_l, times that.
+
+    It is 1 - [v]x / 2 + c [v]x [v]x, c = (1 - h cot h) / v.v with half the angle h. With `sign` -1 it is that of J_r.
+    """
+    x, y, z = v
+    dx, dy, dz = velocity
+    square = x * x + y * y + z * z
+    if square < SMALL_ANGLE * SMALL_ANGLE:
+        c = 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0 + square / 1209600.0))
+    elif square < math.inf:
+        half = 0.5 * math.sqrt(square)
+        c = (1.0 - half / math.tan(half)) / square
+    else:
+        c = math.nan
+    m = c * (x * dx + y * dy + z * dz)
+    n = 1.0 - c * square
+    k = -0.5 * sign
+    return (
+        k * (y * dz - z * dy) + m * x + n * dx,
+        k * (z * dx - x * dz) + m * y + n * dy,
+        k * (x * dy - y * dx) + m * z + n * dz,
+    )
+
+
+def _get_coefficients(square: float) -> tuple[float, float, float, float]:
+    """Return a, b, da and db of the squared angle."""
+    if square < SMALL_ANGLE * SMALL_ANGLE:
+        return (
+            1.0 / 2.0 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)),
+            1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)),
+            -1.0 / 12.0 + square * (1.0 / 180.0 - square * (1.0 / 6720.0 - square / 453600.0)),
+            -1.0 / 60.0 + square * (1.0 / 1260.0 - square * (1.0 / 60480.0 - square / 4989600.0)),
+        )
+    if not square < math.inf:
+        return (math.nan,) * 4
+    angle = math.sqrt(square)
+    sine, versine = math.sin(angle), 2.0 * math.sin(angle / 2.0) ** 2
+    return (
+        versine / square,
+        (angle - sine) / (square * angle),
+        (angle * sine - 2.0 * versine) / (square * square),
+        (angle * versine - 3.0 * (angle - sine)) / (square * square * angle),
+    )

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import NamedTuple, Self, TypeAlias
 
 from modelserver.errors import RecordingError
-from modelserver.files.regular import NotRegularFileError, open_regular
+from modelserver.files import NotRegularFileError, open_regular
 from modelserver.messages import MAX_CHANNEL_LENGTH
 from modelserver.wire.fields import MAX_UTIME
 

@@ -10,8 +10,8 @@ from support_formats import assert_same_transforms, models, read
 from support_spatial import rotations
 
 from modelserver.formats import save_model
-from modelserver.formats.frame_tree_writer import list_instance_names
-from modelserver.formats.yaml_writer import to_rpy_degrees
+from modelserver.formats.common import to_rpy_degrees
+from modelserver.formats.frame_tree import list_instance_names
 from modelserver.transforms import Pose
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from modelserver.joints import track as joint_track
-from modelserver.joints.rotation_vector import combine, interpolate_batch
-from modelserver.joints.track import JointTrack
+from modelserver.joints.track import JointTrack, combine, interpolate_batch
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import left_jacobian
 

@@ -9,8 +9,7 @@ from support_spatial import poses
 
 from modelserver.transforms import chain, so3
 from modelserver.transforms.chain import ChainLink
-from modelserver.transforms.kinematics import RigidMotion
-from modelserver.transforms.pose import Pose
+from modelserver.transforms.pose import Pose, RigidMotion
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3)
 motions = st.builds(RigidMotion, poses, vectors, vectors, vectors, vectors)

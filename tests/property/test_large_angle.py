@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from modelserver.transforms.large_angle import large_angle_lever_arm, large_angle_lever_arm_batch
+from modelserver.transforms.covariance import large_angle_lever_arm, large_angle_lever_arm_batch
 from modelserver.transforms.so3 import Array
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support_formats import models
 
 from modelserver.errors import WireError
-from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot, encode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot, encode_snapshot
 from modelserver.geometry.model import Model
 from modelserver.messages import SnapshotPart
 from modelserver.wire.snapshot import SnapshotAssembler, split_snapshot

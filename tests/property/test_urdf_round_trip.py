@@ -12,7 +12,7 @@ from support_formats import all_frames, read
 from support_urdf import URDF, jointed_models, joints, pose_at, positions
 
 from modelserver.formats import save_model
-from modelserver.formats.urdf_writer import list_link_names
+from modelserver.formats.urdf import list_link_names
 from modelserver.geometry import ModelBuilder
 from modelserver.transforms import Pose
 

@@ -21,7 +21,7 @@ from support_signing import ALLOWED, write_test_key
 from modelserver.client.remote import Platform
 from modelserver.errors import TooNewError
 from modelserver.messages import Health
-from modelserver.signing.signatures import MAX_CLOCK_LEAD_S
+from modelserver.signing import MAX_CLOCK_LEAD_S
 from modelserver.wire.codec import decode, encode
 
 if TYPE_CHECKING:

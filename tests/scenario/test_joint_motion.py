@@ -16,7 +16,7 @@ from support_lcm import Listener, invoke, wait_until
 from support_samples import GEOMETRY, write_vehicle
 
 import modelserver as ms
-from modelserver.formats.snapshot import decode_snapshot
+from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode

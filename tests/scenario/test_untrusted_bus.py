@@ -18,7 +18,7 @@ from test_joint_motion import run_tool
 import modelserver as ms
 from modelserver.client.remote import Platform
 from modelserver.messages import GetTransformation, ReloadModel, ReplyHeader, RequestHeader, SensorHeader
-from modelserver.signing.signatures import MAX_CLOCK_LEAD_S, Key
+from modelserver.signing import MAX_CLOCK_LEAD_S, Key
 from modelserver.wire.codec import decode, encode
 
 SIGNED = "MODELSERVER_SIGNED"

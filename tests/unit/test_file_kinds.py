@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_samples import GEOMETRY, VEHICLE
 
-from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind, find_geometry_path
+from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, find_geometry_path
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -16,9 +16,9 @@ VALUES = {"errors", "version", "named_tuples", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "estimation.history"}
 CORE = GEOMETRY | POSES | {"dynamics", "joints", "estimation", "query"}
-FILES = {"files.kinds", "files.regular"}
-WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
-SIGNING = {"signing.signatures", "signing.key_files"}
+FILES = {"files"}
+WIRE = VALUES | {"messages", "wire", "mslcm", "files"}
+SIGNING = {"signing", "key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
 DRIVERS = {"msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
 TOOLS = {
@@ -33,7 +33,7 @@ TOOLS = {
     "deployment": {"terminal"},
     "view": {"terminal", "edit", "recordings"},
 }
-SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
+SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
 BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"}
 
 MAY_IMPORT: dict[str, set[str]] = {
@@ -42,36 +42,34 @@ MAY_IMPORT: dict[str, set[str]] = {
     # folders
     "config": set(),
     "files": set(),
-    "signing": set(),
     "errors": set(),
     "transforms": {"errors"},
     "geometry": VALUES | {"plugins"},
     "dynamics": GEOMETRY,
     "messages": VALUES | {"earth"},
-    "signing.signatures": VALUES | {"messages"},
-    "signing.key_files": VALUES | {"messages", "signing.signatures", "files.regular"},
+    "signing": VALUES | {"messages"},
+    "key_files": VALUES | {"messages", "signing", "files"},
     "earth": VALUES,
     "estimation.history": VALUES | {"messages"},
     "joints": GEOMETRY | {"messages"},
-    "files.kinds": set(),
-    "files.regular": set(),
     # load code, and neither compute nor read anything
     "estimation.filterpy_import": set(),
     "plugins": set(),
-    "formats": GEOMETRY | FILES,
+    "formats": GEOMETRY | FILES | {"yaml_tree"},
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
     "core": CORE,
     "simulation": GEOMETRY | {"messages", "earth"},
     "config.vehicle_file": GEOMETRY | FILES | {"messages", "dynamics", "estimation", "config.reader"},
-    "config.reader": {"errors"},
+    "config.reader": {"errors", "yaml_tree"},
+    "yaml_tree": {"errors"},
     "wire": WIRE,
     "server": SERVER,
     "client": WIRE | GEOMETRY | POSES | SIGNING | {"formats", "joints", "query"},
     "msdrivers.endpoint": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.endpoint"},
     "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.devices", "msdrivers.endpoint"},
-    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing.signatures"},
+    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing"},
     "mslcm": set(),
     **{f"mstools.{name}": BELOW_TOOLS | {f"mstools.{each}" for each in below} for name, below in TOOLS.items()},
     "mstools.commands": BELOW_TOOLS | {"mstools", *(f"mstools.{name}" for name in TOOLS)},
@@ -84,14 +82,13 @@ MAY_IMPORT: dict[str, set[str]] = {
 PURE = {
     "errors",
     "named_tuples",
-    "files.kinds",
     "transforms",
     "geometry",
     "dynamics",
     "earth",
     "estimation",
     "messages",
-    "signing.signatures",
+    "signing",
     "estimation.history",
     "joints",
     "query",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import KeyFileError
-from modelserver.signing.key_files import KEY_BYTES, find_group_writable_folder, generate_key, read_keys, write_key
+from modelserver.key_files import KEY_BYTES, find_group_writable_folder, generate_key, read_keys, write_key
 from mstools.cli import main
 
 HEX = "00112233445566778899aabbccddeeff"

@@ -16,7 +16,7 @@ import pytest
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import ConfigError, GeometryError, KeyFileError, RecordingError
-from modelserver.files.regular import (
+from modelserver.files import (
     FileTooLargeError,
     NotRegularFileError,
     open_regular,
@@ -24,10 +24,10 @@ from modelserver.files.regular import (
     read_start,
 )
 from modelserver.formats import load_model
+from modelserver.key_files import read_keys
 from modelserver.server.journal.verify import files_of
 from modelserver.server.journal.writer import Ring
 from modelserver.server.persistence import write_atomically
-from modelserver.signing.key_files import read_keys
 from modelserver.wire.eventlog import LogFile
 from msdrivers.raw_log import open_for_reading, open_for_writing
 from msdrivers.settings import SourceMap, make_driver, read_driver

@@ -99,7 +99,7 @@ TERMS = {
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",
     "watchdog": "modelserver/server/supervision.py",
-    "HMAC": "modelserver/signing/signatures.py",
+    "HMAC": "modelserver/signing.py",
     "replay attack": "modelserver/server/ingress.py",
     "clock drift": "drivers/msdrivers/device_clock.py",
     "checksum": "drivers/msdrivers/devices/stream.py",

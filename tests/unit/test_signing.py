@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from support_signing import KEY, envelope
 
 from modelserver.messages import Envelope, ReloadModel, RequestHeader
-from modelserver.signing.signatures import (
+from modelserver.signing import (
     MAX_CLOCK_LEAD_S,
     MAX_SENDERS,
     Freshness,

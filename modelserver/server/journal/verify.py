@@ -54,7 +54,7 @@ from modelserver.server.journal.writer import (
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.requests import REQUEST_TYPES
 from modelserver.server.vehicle import Vehicle
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire import journal
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode, read_request_header

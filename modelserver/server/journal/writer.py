@@ -38,7 +38,7 @@ from typing import Any, Final, NamedTuple
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.errors import RecordingError
-from modelserver.files.regular import open_regular, read_regular, read_start
+from modelserver.files import open_regular, read_regular, read_start
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import Clock
@@ -53,7 +53,7 @@ from modelserver.server.persistence import (
     to_file_name,
     write_atomically,
 )
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.version import __version__
 from modelserver.wire import journal
 from modelserver.wire.eventlog import Buffer

@@ -11,9 +11,9 @@ import pytest
 
 import modelserver as ms
 from modelserver.config.vehicle_file import CommandsConfig, LcmConfig, VehicleConfig
+from modelserver.key_files import generate_key, write_key
 from modelserver.messages import Envelope, VehicleCommand
-from modelserver.signing.key_files import generate_key, write_key
-from modelserver.signing.signatures import Key, sign
+from modelserver.signing import Key, sign
 from modelserver.wire.codec import encode
 from modelserver.wire.provider import handle_message
 from msdrivers.endpoint import HostTime

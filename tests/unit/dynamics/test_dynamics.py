@@ -14,11 +14,11 @@ from support_dynamics import MOVING, MujocoTwin, is_close, random_inertia, rando
 
 from modelserver import load_model
 from modelserver.dynamics import Dynamics, MassUncertainty
-from modelserver.dynamics.rates import compute_turn_motion, compute_turn_rate
 from modelserver.errors import LimitError, MalformedRequestError, UnknownFrameError
 from modelserver.geometry import Joint, JointType, Mimic, Model, ModelBuilder, Sigma
 from modelserver.geometry.inertia import RigidInertia
 from modelserver.transforms import Pose, so3
+from modelserver.transforms.pose import compute_turn_motion, compute_turn_rate
 
 pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
 

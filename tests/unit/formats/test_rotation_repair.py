@@ -7,7 +7,7 @@ import pytest
 from support_formats import YAML, miro, miro_body, miro_frame, only_problem, problems_of, read, rows
 
 from modelserver.errors import Severity
-from modelserver.formats.reading import MAX_DEVIATION, ROUNDING_DEVIATION
+from modelserver.formats.common import MAX_DEVIATION, ROUNDING_DEVIATION
 
 
 def with_rotation(matrix):

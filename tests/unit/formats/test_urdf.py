@@ -8,7 +8,7 @@ from support_urdf import URDF, pose_at
 
 from modelserver.errors import GeometryError, Severity
 from modelserver.formats import save_model
-from modelserver.formats.urdf_writer import list_link_names
+from modelserver.formats.urdf import list_link_names
 from modelserver.geometry import Joint, JointType, Material, Mimic, ModelBuilder, Shape, ShapeKind, Sigma
 from modelserver.transforms import Pose
 
@@ -101,8 +101,8 @@ def test_each_type_of_joint_is_one_of_the_models(kind, limit, wanted):
         ('xyz="0.2 0 0.4"', 'xyz="0.2, 0, 0.4"', "decimals take a point", "xyz=", "joint pan"),
         ('xyz="0.2 0 0.4"', 'xyz="0.2 0 inf"', "'inf' is not a finite number", "xyz=", "joint pan"),
         ('xyz="0.2 0 0.4"', 'xyz="0.2 0 4e12"', "out of reach", "meters", "joint pan"),
-        (MIMIC, MIMIC.replace("pan", "pam"), "mimic names joint 'pam'", "write pan", "joint grip"),
-        (MIMIC, MIMIC.replace("pan", "grip"), "grip follows grip", "remove its <mimic>", "joint grip"),
+        (MIMIC, MIMIC.replace("pan", "pam"), "its joint follows 'pam'", "write pan", "joint grip"),
+        (MIMIC, MIMIC.replace("pan", "grip"), "its joint follows itself", "remove mimic", "joint grip"),
         (MIMIC, MIMIC.replace("0.05", "x"), "'x' is not a number", "multiplier=", "joint grip"),
         (GRIP, GRIP.replace("prismatic", "floating"), "has several coordinates", "remove <mimic>", "joint grip"),
         (GRIP, GRIP.replace("grip", "pan"), "joint pan is defined twice (first on line", "rename", "joint pan"),

@@ -374,7 +374,7 @@ def test_an_alias_bomb_is_rejected():
 
 
 def test_a_bomb_of_templates_is_rejected(monkeypatch):
-    monkeypatch.setattr("modelserver.formats.yaml_loader.MAX_FRAMES", 2000)
+    monkeypatch.setattr("modelserver.formats.yaml_geometry.MAX_FRAMES", 2000)
     frames = ", ".join(f"f{n}: {{}}" for n in range(300))
     bodies = "".join(f"  b{n}: {{template: t}}\n" for n in range(5000))
     found = problems_of(f"templates:\n  t: {{frames: {{{frames}}}}}\nbodies:\n{bodies}")

@@ -9,7 +9,7 @@ import pytest
 
 from modelserver.errors import GeometryError, Location, Severity
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder
-from modelserver.geometry.joint_rules import JointDrive
+from modelserver.geometry.parts import JointDrive
 from modelserver.transforms import Pose
 
 X = (1.0, 0.0, 0.0)
@@ -111,6 +111,12 @@ def test_given_a_planar_joint_then_no_other_may_be_called_as_one_of_its_coordina
             "remove",
         ),
         ({"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e9))}, "beyond 1e+09", "multipliers"),
+        # what follows one out of range is back in range, and has lost its leader
+        (
+            {"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e9)), "C": slide(Mimic("B", 1e-9))},
+            "constraint 'B': following A puts its joint beyond 1e+09",
+            "multipliers",
+        ),
         (
             {"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e200)), "C": slide(Mimic("B", 1e200))},
             "constraint 'B': following A puts its joint beyond 1e+09",

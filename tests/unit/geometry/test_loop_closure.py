@@ -12,13 +12,13 @@ from scipy.stats import chi2, norm
 
 from modelserver.errors import Location, Severity
 from modelserver.geometry import Joint, JointType, ModelBuilder, Sigma
-from modelserver.geometry.loop_closure import (
+from modelserver.geometry.topology import (
     MAX_SIGMAS,
+    Topology,
     chi_square_to_sigmas,
     compute_misclosure,
     residual_significance,
 )
-from modelserver.geometry.topology import Topology
 from modelserver.transforms import Pose
 
 MILLIMETER = Sigma((0.001, 0.0, 0.0))

@@ -10,7 +10,7 @@ from support_samples import write_vehicle
 
 from modelserver.errors import Problem, Severity
 from modelserver.formats import check_file
-from modelserver.geometry.plausibility import looks_like_degrees, looks_like_radians
+from modelserver.formats.common import looks_like_degrees, looks_like_radians
 from mstools.commands.check import check_vehicle
 
 GEOMETRY = """\

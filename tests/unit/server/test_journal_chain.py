@@ -14,7 +14,7 @@ from support_journal import SMALL, JournalRig
 from modelserver.errors import RecordingError
 from modelserver.server.journal.verify import VerificationReport, VerificationResult, verify
 from modelserver.server.journal.writer import NEWEST_NAME, NewestMarker, read_newest, seal_segment
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.wire.journal import (
     JournalRecord,
     RecordKind,

@@ -27,7 +27,7 @@ from modelserver.config.vehicle_file import load_config
 from modelserver.core import CoreState
 from modelserver.errors import Status
 from modelserver.estimation.modes import ModeLocalizer
-from modelserver.formats.snapshot import decode_snapshot
+from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.geometry import Model
 from modelserver.messages import (
     GetExplanation,

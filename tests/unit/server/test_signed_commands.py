@@ -28,7 +28,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import CommandVerifier, SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.reloading import PollReload
-from modelserver.signing.signatures import Key
+from modelserver.signing import Key
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 

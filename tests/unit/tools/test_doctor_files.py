@@ -13,8 +13,8 @@ from support_samples import VEHICLE, write_vehicle
 from support_signing import ALLOWED, write_test_key
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
+from modelserver.key_files import read_keys
 from modelserver.server.diagnostics import Diagnosis, DiagnosisLevel
-from modelserver.signing.key_files import read_keys
 from mstools.commands import doctor as diagnosis
 from mstools.commands.doctor import diagnose_files, diagnose_keys, diagnose_state, diagnose_storage
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import ConfigError, ModelServerError, Severity
-from modelserver.signing.key_files import generate_key, write_key
+from modelserver.key_files import generate_key, write_key
 from mstools import deployment as install_steps
 from mstools.cli import main
 from mstools.commands import install

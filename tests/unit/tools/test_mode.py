@@ -26,7 +26,7 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.signing.signatures import has_valid_signature
+from modelserver.signing import has_valid_signature
 from modelserver.transforms import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main

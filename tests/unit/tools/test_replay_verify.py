@@ -10,9 +10,9 @@ import pytest
 from support_journal import SMALL, JournalRig
 from support_samples import gps
 
+from modelserver.key_files import generate_key, write_key
 from modelserver.server.journal.verify import VerificationResult
 from modelserver.server.journal.writer import NEWEST_NAME, NewestMarker
-from modelserver.signing.key_files import generate_key, write_key
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import JournalRecord, encode_batch, read_segment
 from mstools import cli

@@ -14,7 +14,7 @@ from support_lcm import reserved_url
 from support_samples import START, VEHICLE, write_vehicle
 
 from modelserver.formats import load_model
-from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.transforms import Pose

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from modelserver.earth.geodesy import geodesy_of, origin_at
-from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model

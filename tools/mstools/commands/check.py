@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, has_error
-from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
-from modelserver.files.regular import NotRegularFileError, read_start
+from modelserver.files import EXAMINED_BYTES, FileKind, NotRegularFileError, detect_file_kind, read_start
 from modelserver.formats import FORMATS, check_file, format_of_path, save_model
 from modelserver.geometry.model import Model
 from mstools.commands.driver import find_driver_problems

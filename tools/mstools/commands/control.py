@@ -15,6 +15,7 @@ import typer
 
 from modelserver.errors import ForbiddenError, Location, ModelServerError, NoServerError, RejectedError
 from modelserver.geometry import names
+from modelserver.key_files import KEY_FILE_VARIABLE
 from modelserver.messages import (
     Decision,
     Health,
@@ -28,7 +29,6 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion
@@ -551,7 +551,7 @@ def create(
     name: Annotated[str, option("--name TEXT", "Name of the key.")] = "",
 ) -> None:
     """Write a new key to a file that only its owner can read."""
-    from modelserver.signing.key_files import generate_key, write_key
+    from modelserver.key_files import generate_key, write_key
 
     new = generate_key(name)
     write_key(file, new)

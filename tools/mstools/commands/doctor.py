@@ -21,10 +21,10 @@ import typer
 
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.errors import BusError, ConfigError, KeyFileError, Problem, Severity
+from modelserver.key_files import find_group_writable_folder, read_keys
 from modelserver.server.diagnostics import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
 from modelserver.server.journal.writer import LOCK_NAME, get_journal_directory, get_max_bytes, list_segments
 from modelserver.server.persistence import get_state_directory
-from modelserver.signing.key_files import find_group_writable_folder, read_keys
 from mstools.deployment import CREDENTIAL, SERVICE, STATE, UNITS, VEHICLE
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import escape, find_nearest_path, format_count

@@ -318,7 +318,7 @@ def subscribe_commands(
     Where commands must be signed, those on `channel` itself are rejected. Raises KeyFileError.
     """
     from modelserver.errors import WireError
-    from modelserver.signing.key_files import read_keys
+    from modelserver.key_files import read_keys
     from modelserver.wire.channels import DRIVE_SIGNED, to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.provider import handle_message

@@ -96,7 +96,7 @@ def command(
         _show(*_query_daemon(frame, floating, equations, npy is not None, url, prefix, timeout), npy, as_json)
         return
     from modelserver.dynamics import MassUncertainty, assess_stability
-    from modelserver.dynamics.settings import DynamicsSettings
+    from modelserver.dynamics.stability import DynamicsSettings
     from modelserver.transforms import so3
 
     root, known, variables = "", DynamicsSettings(), parse_variables(settings)

@@ -17,7 +17,7 @@ import lcm
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
-from modelserver.files.regular import check_links
+from modelserver.files import check_links
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import ConfigError, Severity, quote
-from modelserver.files.regular import read_regular
+from modelserver.files import read_regular
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from mstools import deployment
 from mstools.terminal.options import option

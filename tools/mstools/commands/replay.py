@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
-from modelserver.files.regular import FileTooLargeError, read_regular
+from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.encoded import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
@@ -464,8 +464,8 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
     `key`: the vehicle's key file. Without one authenticity is not verified, and a journal that is reproduced bit for
     bit exits with 0.
     """
+    from modelserver.key_files import read_keys
     from modelserver.server.journal.verify import VerificationResult, files_of, verify
-    from modelserver.signing.key_files import read_keys
 
     keys = () if key is None else read_keys(key)
     files = files_of(journal)

@@ -15,10 +15,9 @@ import typer
 from modelserver.errors import NoServerError
 from modelserver.geometry import names
 from modelserver.geometry.joint import Joint, coordinate_names
-from modelserver.geometry.loop_closure import compute_misclosure
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
-from modelserver.geometry.topology import Crossing, LoopClosure, Topology
+from modelserver.geometry.topology import Crossing, LoopClosure, Topology, compute_misclosure
 from mstools.report.charts import BLUE, ORANGE
 from mstools.terminal.options import PrefixOption, UrlOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import (

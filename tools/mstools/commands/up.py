@@ -16,7 +16,7 @@ import typer
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Severity, has_error
-from modelserver.files.regular import check_links
+from modelserver.files import check_links
 from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle

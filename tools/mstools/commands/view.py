@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError
-from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
-from modelserver.files.regular import read_start
+from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from mstools.terminal.options import (
     KeyOption,
     PrefixOption,

@@ -16,21 +16,19 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import ModelServerError, Problem, has_error, quote
-from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
-from modelserver.files.regular import read_start
+from modelserver.errors import ModelServerError, Problem, SyntaxProblemError, has_error, quote
+from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
-from modelserver.formats.reading import parse_number
-from modelserver.formats.writing import format_number
-from modelserver.formats.yaml_elements import POSE_KEYS, read_pose
-from modelserver.formats.yaml_nodes import YamlMapping, parse_yaml
-from modelserver.formats.yaml_writer import format_joint_fields, format_scalar_or_list, format_text, quote_text
+from modelserver.formats.common import format_number, parse_number
+from modelserver.formats.yaml_elements import POSE_KEYS, YamlMapping, read_pose
+from modelserver.formats.yaml_geometry import format_joint_fields, format_scalar_or_list, format_text, quote_text
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
+from modelserver.yaml_tree import parse_yaml
 from mstools.edit.yaml_text import EditError, KeyPath, YamlText
 from mstools.terminal.output import open_atomic
 
@@ -346,11 +344,11 @@ def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
 
 def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
-    builder = ModelBuilder()
-    root = parse_yaml(text.get_entry(path).encode(), builder, "")
-    if root is None:
-        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first")
-    return read_pose(YamlMapping(builder, "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
+    try:
+        root = parse_yaml(text.get_entry(path).encode())
+    except SyntaxProblemError:
+        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first") from None
+    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
 
 
 def _set(text: YamlText, path: KeyPath, key: str, value: str) -> YamlText:

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from modelserver.errors import ModelServerError, quote
-from modelserver.formats.yaml_nodes import parse_yaml
-from modelserver.geometry.builder import ModelBuilder
+from modelserver.errors import ModelServerError, SyntaxProblemError, quote
+from modelserver.yaml_tree import parse_yaml
 
 KeyPath = Sequence[str]
 MAX_SPACES = 1000
@@ -58,11 +57,11 @@ class YamlText:
             content = text.encode()
         except UnicodeEncodeError as error:
             raise EditError(f"{text[error.start : error.end]!r} is no character of a text file; remove it") from None
-        builder = ModelBuilder()
-        # bounds depth and size: the parser below is recursive
-        if parse_yaml(content, builder, "") is None:
-            problem = builder.problems[0]
-            raise EditError(f"line {problem.line}: {problem.message}; {problem.fix}")
+        try:
+            # bounds depth and size: the parser below is recursive
+            parse_yaml(content)
+        except SyntaxProblemError as error:
+            raise EditError(f"line {error.line}: {error}; {error.fix}") from None
         self._root = yaml.compose(text, Loader=_LOADER)
         self._newline = "\r\n" if "\r\n" in text else "\n"
         uses = Counter(id(node) for node in _walk(self._root))

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
-from modelserver.earth.origin import Origin
 from modelserver.errors import QueryError, WireError
-from modelserver.formats.snapshot import decode_snapshot
+from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.geometry.joint import Coordinates, coordinate_names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model

@@ -58,7 +58,7 @@ from modelserver.earth.geodesy import GeodesyError
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.geometry.shape import Shape, ShapeKind
+from modelserver.geometry.parts import Shape, ShapeKind
 from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import decode, fingerprint_of, get_type_names

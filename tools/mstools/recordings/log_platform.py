@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.errors import QueryError, RecordingError, WireError
-from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.messages import Policy, PoseAnswer, SnapshotPart, TimeQuery

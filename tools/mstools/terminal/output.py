@@ -27,7 +27,7 @@ from modelserver.errors import (
     Severity,
     find_nearest_names,
 )
-from modelserver.files.regular import check_links
+from modelserver.files import check_links
 from modelserver.geometry.model import Model
 
 if TYPE_CHECKING:

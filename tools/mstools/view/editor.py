@@ -21,8 +21,7 @@ import viser
 
 from modelserver.client.remote import Platform
 from modelserver.errors import ModelServerError, Problem, QueryError, Severity, quote
-from modelserver.formats.reading import parse_number
-from modelserver.formats.writing import format_number
+from modelserver.formats.common import format_number, parse_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model

@@ -24,12 +24,11 @@ import numpy.typing as npt
 import trimesh
 import viser
 
+from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
-from modelserver.earth.origin import Origin
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import Body
-from modelserver.geometry.shape import Shape, ShapeKind
+from modelserver.geometry.parts import Body, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FIX_COLORS, FixColor, FramePoses, Picture

@@ -12,7 +12,7 @@ from typing import Final
 from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
-from modelserver.formats.snapshot import ModelSnapshot
+from modelserver.formats.yaml_geometry import ModelSnapshot
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader

@@ -1,4 +1,4 @@
-"""Read Miro frame-tree XML: `<instance type="rapid::FrameRpyParameters" name=...>` elements, as NASA's rovers use.
+"""Miro frame-tree XML, as NASA's rovers use: `<instance type="rapid::FrameRpyParameters" name=...>` elements.
 
 Each instance is a frame at X, Y, Z (meters) in its Parent, rotated by Roll, Pitch, Yaw (degrees, about fixed axes:
 Rz(yaw) Ry(pitch) Rx(roll)); omitted values are 0. The format has no bodies, so the frames are grouped:
@@ -18,27 +18,48 @@ has the same rules, but requires a parent before its children; here the order of
 in two passes: first those with a unique name, then, as the paths above them become known, those whose name several
 frames have. A Parent that is not in the file but outside a vehicle by its nature (an absolute path, the earth, a UTM
 grid) becomes a root, so that its children stay connected.
-"""
+
+The writer inverts the grouping. Each body becomes an instance at its origin, with the body's name, and each frame an
+instance below it. Two kinds of frames have no instance of their own: `Origin` at the body's origin, which is the body's
+instance; and the frame at which a body is mounted without an offset and with the body's name, because the reader
+creates it again. The parent of a body is found by a breadth-first search from the first body."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from modelserver.errors import Location, Severity, Suggestion, find_suggestion, quote, suggest_name
-from modelserver.formats.reading import MAX_SUGGESTIONS, ORIGIN, ElementReader, find_cycles, label, parse_number
+from modelserver.formats.common import (
+    MAX_SUGGESTIONS,
+    ORIGIN,
+    ElementReader,
+    SavedModel,
+    find_cycles,
+    format_element,
+    format_names,
+    label,
+    list_physical_features,
+    list_text_and_sigma_features,
+    parse_number,
+    to_rpy_degrees,
+)
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name
 from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.model import Model
+from modelserver.geometry.topology import Crossing, Topology
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
+
 
 _POSITION = ("X", "Y", "Z")
 _ROTATION = ("Roll", "Pitch", "Yaw")
@@ -97,41 +118,6 @@ def parse_path(text: str) -> FramePath:
     return FramePath(tuple(parts), text.startswith("/"))
 
 
-@dataclass(slots=True)
-class Ancestry:
-    """The names of the ancestors of frames, by `parents`: the key of each frame's parent, "" for a root.
-
-    The parent of a frame that is not in `parents` is not known yet.
-    """
-
-    names: Mapping[str, str]
-    parents: Mapping[str, str]
-    steps: int = 0
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether more than `MAX_STEPS` levels were visited."""
-        return self.steps > MAX_STEPS
-
-    def match(self, path: FramePath, names: list[str]) -> bool:
-        """Return whether a path matches the frame with these names; False when exhausted."""
-        self.steps += len(names) * (len(path.parts) if ANY in path.parts else 1)
-        return not self.is_exhausted and path.matches(names)
-
-    def of(self, key: str) -> list[str] | None:
-        """Return the names from the root down to a frame; None if a parent is not known yet, or for a cycle."""
-        found: list[str] = []
-        seen: set[str] = set()
-        while key:
-            self.steps += 1
-            if key in seen or key not in self.parents or self.is_exhausted:
-                return None
-            seen.add(key)
-            found.append(self.names[key])
-            key = self.parents[key]
-        return found[::-1]
-
-
 def find_instances(root: Element) -> Iterator[Element]:
     for element in root.iter("{*}instance"):
         if (element.get("type") or "").strip().endswith("FrameRpyParameters"):
@@ -174,7 +160,11 @@ class _FrameTreeReader(ElementReader):
         """By name; a second frame of a name, with another parent, by parent and name."""
         self.parents: dict[str, str] = {}
         """Key of the parent of each frame, empty for a root."""
+        self.keys: defaultdict[str, list[str]] = defaultdict(list)
+        """Keys of the frames of each name."""
         self.undefined: defaultdict[str, list[Location]] = defaultdict(list)
+        self.steps = 0
+        """Levels visited for paths."""
 
     def read_frame(self, element: Element) -> None:
         """Read one instance; a second one of the same name and parent is ignored with a warning."""
@@ -283,6 +273,27 @@ class _FrameTreeReader(ElementReader):
             else:
                 self.note(message, at=lines[0])
 
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether more than `MAX_STEPS` levels were visited."""
+        return self.steps > MAX_STEPS
+
+    def match(self, path: FramePath, above: list[str]) -> bool:
+        """Return whether a path matches the frame with these names; False when exhausted."""
+        self.steps += len(above) * (len(path.parts) if ANY in path.parts else 1)
+        return not self.is_exhausted and path.matches(above)
+
+    def list_names(self, key: str) -> list[str] | None:
+        """Return the names from the root down to a frame; None if a parent is not known yet, or for a cycle."""
+        found: dict[str, str] = {}
+        while key:
+            self.steps += 1
+            if key in found or key not in self.parents or self.is_exhausted:
+                return None
+            found[key] = self.frames[key].name
+            key = self.parents[key]
+        return list(found.values())[::-1]
+
     def find_parents(self) -> bool:
         """Find the parent of each frame; report missing parents and cycles. Return whether there are none."""
         named = {frame.name for frame in self.frames.values()}
@@ -291,13 +302,11 @@ class _FrameTreeReader(ElementReader):
                 # a name may hold slashes
                 frame.path = FramePath((frame.parent,), False)
         self.add_external_roots()
-        keys: defaultdict[str, list[str]] = defaultdict(list)
         for key, frame in self.frames.items():
-            keys[frame.name].append(key)
-        ancestry = Ancestry({key: frame.name for key, frame in self.frames.items()}, self.parents)
+            self.keys[frame.name].append(key)
         several: list[str] = []
         for key, frame in self.frames.items():
-            candidates = keys.get(frame.path.name, [])
+            candidates = self.keys.get(frame.path.name, [])
             if not frame.path.parts:
                 self.parents[key] = ""
             elif len(candidates) == 1:
@@ -305,19 +314,19 @@ class _FrameTreeReader(ElementReader):
                 self.parents[key] = candidates[0]
             elif candidates:
                 several.append(key)
-        self.resolve_shared_names(several, keys, ancestry)
+        self.resolve_shared_names(several)
         missing = [key for key in self.frames if key not in self.parents]
         is_tree = self.has_no_cycles()
         if is_tree:
             for key, frame in self.frames.items():
                 parent = self.parents.get(key, "")
-                if parent and not frame.path.is_plain and not self.is_parent_on_path(frame, parent, keys, ancestry):
+                if parent and not frame.path.is_plain and not self.is_parent_on_path(frame, parent):
                     missing.append(key)
-        if not ancestry.is_exhausted:
-            self.report_missing(missing, keys, ancestry)
+        if not self.is_exhausted:
+            self.report_missing(missing)
         else:
             self.error("the paths of parents are too many and too deep", "write plain names")
-        return is_tree and not missing and not ancestry.is_exhausted
+        return is_tree and not missing and not self.is_exhausted
 
     def add_external_roots(self) -> None:
         """Add a root for each parent that is outside the file by its nature."""
@@ -343,30 +352,30 @@ class _FrameTreeReader(ElementReader):
                     Severity.NOTE, f"Parent {label(frame.parent)} is not in the file; it becomes a root", source
                 )
 
-    def resolve_shared_names(self, several: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+    def resolve_shared_names(self, several: list[str]) -> None:
         """Find the parents whose name several frames have, when the ancestors of those are known."""
         while several:
             left: list[str] = []
             for key in several:
-                if ancestry.is_exhausted:
+                if self.is_exhausted:
                     return
                 path = self.frames[key].path
-                above = {each: ancestry.of(each) for each in keys[path.name] if each != key}
-                fitting = [(len(at), each) for each, at in above.items() if at is not None and ancestry.match(path, at)]
+                above = {each: self.list_names(each) for each in self.keys[path.name] if each != key}
+                fitting = [(len(at), each) for each, at in above.items() if at is not None and self.match(path, at)]
                 if None in above.values() and not any(depth == 1 for depth, _ in fitting):
                     left.append(key)
                 elif fitting:
                     self.parents[key] = min(fitting, key=lambda found: found[0])[1]
                     if len(fitting) > 1:
-                        self.report_ambiguous(key, [each for _, each in fitting], ancestry)
+                        self.report_ambiguous(key, [each for _, each in fitting])
             if len(left) == len(several):
                 return
             several = left
 
-    def report_ambiguous(self, key: str, fitting: list[str], ancestry: Ancestry) -> None:
+    def report_ambiguous(self, key: str, fitting: list[str]) -> None:
         frame = self.frames[key]
-        paths = ["/".join(ancestry.of(each) or ()) for each in fitting]
-        chosen = "/".join(ancestry.of(self.parents[key]) or ())
+        paths = ["/".join(self.list_names(each) or ()) for each in fitting]
+        chosen = "/".join(self.list_names(self.parents[key]) or ())
         self.builder.add_warning(
             f"Parent {label(frame.parent)} names {len(fitting)} frames: {', '.join(map(label, paths[:4]))}; "
             f"{label(chosen)} is used",
@@ -374,30 +383,30 @@ class _FrameTreeReader(ElementReader):
             "write the path of the one that is meant",
         )
 
-    def is_parent_on_path(self, frame: _FrameInstance, parent: str, named: Collection[str], ancestry: Ancestry) -> bool:
+    def is_parent_on_path(self, frame: _FrameInstance, parent: str) -> bool:
         """Return whether the ancestors of a frame's parent match its path."""
-        above = ancestry.of(parent)
+        above = self.list_names(parent)
         if above is None:
-            return ancestry.is_exhausted
+            return self.is_exhausted
         path = frame.path
         if path.is_absolute:
             # the part above the roots of the file cannot be compared
-            inside = next((n for n, part in enumerate(path.parts) if part in named or part == ANY), 0)
+            inside = next((n for n, part in enumerate(path.parts) if part in self.keys or part == ANY), 0)
             path = FramePath(path.parts[inside:], True)
-        return ancestry.match(path, above) or ancestry.is_exhausted
+        return self.match(path, above) or self.is_exhausted
 
-    def report_missing(self, missing: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+    def report_missing(self, missing: list[str]) -> None:
         """Report missing parents, each with a suggestion if it is unambiguous."""
         meant: dict[FramePath, str] = {}
         for key in missing:
             frame = self.frames[key]
             path = frame.path
             if path not in meant:
-                meant[path] = self.suggest_parent(frame, keys, ancestry) if len(meant) < MAX_SUGGESTIONS else ""
+                meant[path] = self.suggest_parent(frame) if len(meant) < MAX_SUGGESTIONS else ""
             near = meant[path]
             why = ""
             if self.parents.get(key):
-                why = f": {label(path.name)} is {label('/'.join(ancestry.of(self.parents[key]) or ()))}"
+                why = f": {label(path.name)} is {label('/'.join(self.list_names(self.parents[key]) or ()))}"
             self.builder.add_error(
                 f"Parent names {quote(frame.parent)}, which does not exist{why}",
                 frame.parent_source,
@@ -405,23 +414,23 @@ class _FrameTreeReader(ElementReader):
                 Suggestion.of(frame.parent, near),
             )
 
-    def suggest_parent(self, frame: _FrameInstance, keys: dict[str, list[str]], ancestry: Ancestry) -> str:
+    def suggest_parent(self, frame: _FrameInstance) -> str:
         """Return the path of which one name is misspelled in a Parent; empty if that is ambiguous.
 
         It has as many names: an ancestor is another place, and a frame cannot be its own parent.
         """
         parts = list(frame.path.parts)
-        unknown = [n for n, part in enumerate(parts) if part not in keys and part != ANY]
+        unknown = [n for n, part in enumerate(parts) if part not in self.keys and part != ANY]
         if len(unknown) != 1:
             return ""
         (at,) = unknown
-        near = find_suggestion(parts[at], [name for name in keys if name != frame.name and name not in parts])
+        near = find_suggestion(parts[at], [name for name in self.keys if name != frame.name and name not in parts])
         if not near:
             return ""
         parts[at] = near
         found = FramePath(tuple(parts), frame.path.is_absolute)
-        placed = (ancestry.of(key) for key in keys[found.name])
-        if not found.is_plain and not any(above is not None and ancestry.match(found, above) for above in placed):
+        placed = (self.list_names(key) for key in self.keys[found.name])
+        if not found.is_plain and not any(above is not None and self.match(found, above) for above in placed):
             return ""
         return ("/" if found.is_absolute else "") + "/".join(parts)
 
@@ -481,3 +490,131 @@ class _FrameTreeReader(ElementReader):
                 self.report_duplicate(self.frames[other], self.frames.pop(key))
                 del self.parents[key]
         self.parents = {key: replaced.get(parent, parent) for key, parent in self.parents.items()}
+
+
+def save(model: Model) -> SavedModel:
+    """Return the text of `model`, and its features that this format does not support."""
+    writer = _FrameTreeWriter(model)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<!DOCTYPE MiroConfigDocument>", "<config>"]
+    lines += ['  <section name="Frames">', *writer.format_instances(), "  </section>", "</config>"]
+    return SavedModel("\n".join(lines) + "\n", (*writer.list_renamed(), *_list_unsupported(model, writer.used)))
+
+
+def list_instance_names(model: Model) -> dict[str, str]:
+    """Return the instance in the file for each frame of `model`, by full name."""
+    return _FrameTreeWriter(model).frame_names
+
+
+class _FrameTreeWriter:
+    def __init__(self, model: Model):
+        self.model = model
+        self.crossings: dict[str, Crossing] = {}
+        topology = Topology(model.bodies, model.constraints)
+        for assembly in topology.assemblies:
+            self.crossings |= {each.far_body: each for each in topology.traverse_breadth_first(assembly[0])}
+        self.used = {crossing.constraint.name for crossing in self.crossings.values()}
+        self.aligned = {body: self._find_aligned_mount(body, crossing) for body, crossing in self.crossings.items()}
+        """For each mounted body the frame that its instance represents too, empty for none."""
+        self.bodies = self._name_bodies()
+        self.frame_names = self._name_frames()
+
+    def _find_aligned_mount(self, body: str, crossing: Crossing) -> str:
+        mount = names.split(crossing.near_frame)[1]
+        return (
+            crossing.near_frame if mount == body != ORIGIN and self._locate_origin(crossing) == Pose.identity() else ""
+        )
+
+    def _locate_origin(self, crossing: Crossing) -> Pose:
+        return crossing.pose @ self.model.frame(crossing.far_frame).pose.inverse()
+
+    def _name_bodies(self) -> dict[str, str]:
+        """Return the name of each body's instance: the body's, but a child is not named Origin."""
+        taken = {body.name for body in self.model.bodies}
+        return {
+            name: _make_unique(name, taken) if name == ORIGIN and name in self.crossings else name
+            for name in tuple(taken)
+        }
+
+    def _name_frames(self) -> dict[str, str]:
+        """Return the name of the instance for each frame, by full name."""
+        count = Counter(frame.name for body in self.model.bodies for frame in body)
+        merged = set(self.aligned.values())
+        named: dict[str, str] = {}
+        taken = {ORIGIN, *self.bodies, *self.bodies.values()}
+        for body in self.model.bodies:
+            for frame in body:
+                full = names.join(body.name, frame.name)
+                if frame.name == ORIGIN and frame.pose == Pose.identity():
+                    named[full] = self.bodies[body.name]
+                elif full in merged:
+                    named[full] = frame.name
+                else:
+                    shared = count[frame.name] > 1 or frame.name in taken
+                    named[full] = _make_unique(f"{body.name}.{frame.name}" if shared else frame.name, taken)
+        return named
+
+    def format_instances(self) -> Iterator[str]:
+        """Yield the lines of all instances, a body before its frames."""
+        for body in self.model.bodies:
+            own = self.bodies[body.name]
+            crossing = self.crossings.get(body.name)
+            if crossing is None:
+                yield from _format_instance(own, "", body.pose or Pose.identity())
+            elif not self.aligned[body.name]:
+                yield from _format_instance(own, self.frame_names[crossing.near_frame], self._locate_origin(crossing))
+            for frame in body:
+                name = self.frame_names[names.join(body.name, frame.name)]
+                if name != own:
+                    yield from _format_instance(name, own, frame.pose)
+
+    def list_renamed(self) -> Iterator[str]:
+        """Yield the frames that get another name, and the bodies that are not read back as bodies."""
+        renamed = [
+            f"{full} as {name}"
+            for full, name in self.frame_names.items()
+            if name not in (names.split(full)[1], self.bodies[names.split(full)[0]])
+        ]
+        renamed += [f"body {name} as {own}" for name, own in self.bodies.items() if own != name]
+        if renamed:
+            yield f"frame names that are not unique in the whole model; written {format_names(renamed)}"
+        parents = {crossing.near_body for crossing in self.crossings.values()}
+        bare = [
+            body.name
+            for body in self.model.bodies
+            if body.name in self.crossings
+            and body.name not in parents
+            and all(self.frame_names[names.join(body.name, frame.name)] == self.bodies[body.name] for frame in body)
+        ]
+        if bare:
+            yield f"that these are bodies, because nothing is mounted on them: {format_names(bare)}"
+
+
+def _list_unsupported(model: Model, used: set[str]) -> Iterator[str]:
+    if model.name:
+        yield f"the model's name, {model.name}"
+    yield from list_text_and_sigma_features(model)
+    yield from list_physical_features(model)
+    if model.constraints:
+        yield "the names of constraints, and on which of their frames bodies meet"
+    if loops := [each.name for each in model.constraints if each.name not in used]:
+        yield f"constraints that close a loop: {format_names(loops)}"
+    mounted = {names.split(end)[0] for each in model.constraints for end in (each.from_, each.to)}
+    if posed := [body.name for body in model.bodies if body.pose is not None and body.name in mounted]:
+        yield f"the own transform of {format_names(posed)}"
+
+
+def _make_unique(name: str, taken: set[str]) -> str:
+    """Return `name`, lengthened until it is not in `taken`, and add it there."""
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
+def _format_instance(name: str, parent: str, pose: Pose) -> Iterator[str]:
+    angles = to_rpy_degrees(pose.wxyz) or tuple(map(math.degrees, so3.to_rpy(pose.wxyz)))
+    values = zip(("X", "Y", "Z", "Roll", "Pitch", "Yaw"), (*pose.xyz, *angles), strict=True)
+    inside = [*format_element("parameter", value=parent, name="Parent")]
+    inside += [line for key, value in values for line in format_element("parameter", value=value, name=key)]
+    lines = format_element("instance", inside, type="rapid::FrameRpyParameters", name=name)
+    return (f"    {line}" for line in lines)

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.errors import KeyFileError, quote
-from modelserver.files.regular import open_regular
-from modelserver.signing.signatures import MIN_KEY_BYTES, Key
+from modelserver.files import open_regular
+from modelserver.signing import MIN_KEY_BYTES, Key
 
 MAX_BYTES: Final = 8192
 MAX_KEYS: Final = 8

@@ -1,22 +1,36 @@
-"""Read Miro body and constraint XML: the geometry file of the 2005 report (Annexes B.3, B.4 and C).
+"""Miro body and constraint XML, read and written: the geometry file of the 2005 report (Annexes B.3, B.4 and C).
 
 The names of the section and of the two lists vary between files, so a body is recognized by its parameter BodyName and
 a constraint by its ConstraintName, anywhere in the file. A frame or constraint without HTransform has the identity.
 White space around names is trimmed, and folded in descriptions, where it comes from line breaks of the file.
+
+The writer uses the layout of Annex C.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from modelserver.errors import Suggestion, quote
-from modelserver.formats.reading import ElementReader, label, parse_numbers, suggest_known_key
+from modelserver.formats.common import (
+    ElementReader,
+    SavedModel,
+    format_element,
+    format_names,
+    label,
+    list_physical_features,
+    suggest_known_key,
+)
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name, get_tag, iterate_children
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Body, Constraint
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
+
 
 _BODY_KEYS = ("BodyName", "Description", "HTransform", "Frames", "FrameList")
 _FRAME_KEYS = ("FrameName", "Description", "HTransform")
@@ -146,17 +160,11 @@ def _read_transform(owner: NamedParameters) -> Pose | None:
 
 def _read_row(parts: NamedParameters, name: str) -> list[float] | None:
     """Read the four numbers of a row; None, with an error, if there are not four."""
+    fix = f'write <parameter name="{name}" value="r r r p"/>: a row of the rotation, then a position in meters'
+    if name not in parts.elements:
+        parts.error(f"{name} is missing", fix, name)
     text = parts.read_text(name)
-    if text is None and name in parts.elements:
-        return None
-    try:
-        if text is None:
-            raise ValueError(f"{name} is missing")
-        return parse_numbers(text.split(), 4, name)
-    except ValueError as error:
-        fix = f'write <parameter name="{name}" value="r r r p"/>: a row of the rotation, then a position in meters'
-        parts.error(str(error), fix, name)
-        return None
+    return None if text is None else parts.read_row(text.split(), 4, name, fix, name)
 
 
 def _read_description(parts: NamedParameters) -> str:
@@ -167,3 +175,70 @@ def _get_value(element: Element, key: str) -> str:
     """Return the value of the first parameter `key`, empty for none: it names the place of problems."""
     found = (each.get("value") or "" for each in iterate_children(element) if get_name(each) == key)
     return next(found, "").strip()
+
+
+def save(model: Model) -> SavedModel:
+    """Return the text of `model`, and its features that this format does not support."""
+    bodies = [line for body in model.bodies for line in _format_body(body)]
+    constraints = [line for each in model.constraints for line in _format_constraint(each)]
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<config>", ' <section name="Geometry">']
+    for name, inside in (("BodyList", bodies), ("ConstraintList", constraints)):
+        lines += [f'  <parameter name="{name}">', *(f"    {line}" for line in inside), "  </parameter>"]
+    lines += [" </section>", "</config>"]
+    return SavedModel("\n".join(lines) + "\n", tuple(_list_unsupported(model)))
+
+
+def _list_unsupported(model: Model) -> Iterator[str]:
+    if model.name:
+        yield f"the model's name, {model.name}"
+    if model.description:
+        yield "the model's description"
+    frames = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body if frame.sigma is not None]
+    if frames:
+        yield f"the sigmas of {len(frames)} frames: {format_names(frames)}"
+    constraints = [each.name for each in model.constraints if each.sigma is not None]
+    if constraints:
+        yield f"the sigmas of {len(constraints)} constraints: {format_names(constraints)}"
+    yield from list_physical_features(model)
+    described = [(body.name, body.description) for body in model.bodies]
+    described += [(f"{body.name}:{frame.name}", frame.description) for body in model.bodies for frame in body]
+    described += [(each.name, each.description) for each in model.constraints]
+    if changed := [name for name, text in described if _fold_description(text) != text]:
+        yield f"line breaks and control characters in {len(changed)} descriptions: {format_names(changed)}"
+
+
+def _fold_description(text: str) -> str:
+    """Return a text as it is read back: without control characters, which XML does not have, and with folded spaces."""
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())
+
+
+def _format_body(body: Body) -> Iterator[str]:
+    lines = _format_head("BodyName", body.name, body.description)
+    if body.pose is not None:
+        lines += _format_transform(body.pose)
+    lines.append('<parameter name="Frames">')
+    for frame in body:
+        inside = [*_format_head("FrameName", frame.name, frame.description), *_format_transform(frame.pose)]
+        lines += [f"  {line}" for line in format_element("parameter", inside, "BodyFrame")]
+    lines.append("</parameter>")
+    return format_element("parameter", lines, "Body")
+
+
+def _format_constraint(each: Constraint) -> Iterator[str]:
+    lines = _format_head("ConstraintName", each.name, each.description)
+    for key, end in (("From", each.from_), ("To", each.to)):
+        lines += format_element("parameter", name=key, value=end)
+    return format_element("parameter", [*lines, *_format_transform(each.default_pose)], "Constraint")
+
+
+def _format_head(key: str, name: str, description: str) -> list[str]:
+    lines = [*format_element("parameter", name=key, value=name)]
+    if description:
+        lines += format_element("parameter", name="Description", value=_fold_description(description))
+    return lines
+
+
+def _format_transform(pose: Pose) -> Iterator[str]:
+    rows = enumerate(pose.matrix_rows()[:3], 1)
+    inside = [line for n, row in rows for line in format_element("parameter", name=f"Row{n}", value=row)]
+    return format_element("parameter", inside, name="HTransform")

@@ -1,4 +1,4 @@
-"""YAML text as a tree of nodes with their lines, and typed reading of the nodes.
+"""YAML text as a tree of nodes with their lines.
 
 PyYAML's composer is recursive in C, so a few kilobytes of brackets would end the process; its events are not. The tree
 is built from them with bounded depth and bounded size. The size counts the nodes of each alias again, so an alias bomb
@@ -15,15 +15,13 @@ from typing import Any
 
 import yaml
 
-from modelserver.errors import Location, quote
-from modelserver.formats.reading import ElementReader, SyntaxProblemError, parse_number, suggest_known_key
-from modelserver.geometry.builder import ModelBuilder
+from modelserver.errors import SyntaxProblemError
 
 MAX_DEPTH = 20
-"""No geometry file is nested deeper than 8."""
+"""No geometry file is nested deeper than 8, no vehicle file deeper than 5."""
 
 _DEPTH_MESSAGE = f"the file nests deeper than {MAX_DEPTH} levels"
-_DEPTH_FIX = "no geometry needs that; look for brackets that are not closed"
+_DEPTH_FIX = "look for brackets that are not closed"
 
 MAX_NODES = 4_000_000
 """Nodes, aliases expanded; 10,000 frames have about 130,000."""
@@ -67,27 +65,24 @@ _NO_ITEMS: list[YamlNode] = []
 _NO_PAIRS: list[tuple[YamlNode, YamlNode]] = []
 
 
-def parse_yaml(content: bytes, builder: ModelBuilder, file: str) -> YamlNode | None:
-    """Parse the one document in `content`; None, with an error in `builder`, if it is not YAML."""
+def parse_yaml(content: bytes, has_aliases: bool = True) -> YamlNode:
+    """Parse the one document in `content`. Raises SyntaxProblemError, without `has_aliases` for aliases too."""
     text = ""
     try:
         text = content.decode("utf-8-sig")
-        return _NodeBuilder().build(text)
+        return _NodeBuilder(has_aliases).build(text)
     except UnicodeDecodeError as error:
         message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
-        fix, line = "save it as UTF-8; a binary file is not a geometry file", content.count(b"\n", 0, error.start) + 1
-    except SyntaxProblemError as error:
-        message, fix, line = str(error), error.fix, error.line
+        fix, line = "save it as UTF-8", content.count(b"\n", 0, error.start) + 1
     except yaml.MarkedYAMLError as error:
         message, fix, line = _explain_syntax(error, text)
     except yaml.reader.ReaderError as error:
         place = error.position if isinstance(error.position, int) else 0
         message = f"the file holds a character that YAML forbids: {_format_character(error.character)}"
-        fix, line = "remove it; a binary file is not a geometry file", text.count("\n", 0, place) + 1
+        fix, line = "remove it, and save the file as UTF-8 text", text.count("\n", 0, place) + 1
     except yaml.YAMLError as error:
-        message, fix, line = f"the YAML cannot be read: {error}", "write it as in docs/geometry-files.md", 0
-    builder.add_error(message, Location(file, line), fix)
-    return None
+        message, fix, line = f"the YAML cannot be read: {error}", "look for a damaged place", 0
+    raise SyntaxProblemError(message, line, fix)
 
 
 def _format_character(value: object) -> str:
@@ -110,7 +105,8 @@ def _explain_syntax(error: yaml.MarkedYAMLError, text: str) -> tuple[str, str, i
 
 
 class _NodeBuilder:
-    def __init__(self) -> None:
+    def __init__(self, has_aliases: bool) -> None:
+        self.has_aliases = has_aliases
         self.anchors: dict[str, YamlNode] = {}
         self.total = 0
 
@@ -138,6 +134,9 @@ class _NodeBuilder:
                 if anchor:
                     self.anchors[anchor] = node
             elif kind is yaml.AliasEvent:
+                if not self.has_aliases:
+                    message = f"aliases (*{event.anchor}) are not supported"
+                    raise SyntaxProblemError(message, line, "write the value again")
                 if event.anchor not in self.anchors:
                     message = f"alias *{event.anchor} has no complete anchor &{event.anchor} before it"
                     raise SyntaxProblemError(message, line, "write the anchor first; a value cannot hold itself")
@@ -171,111 +170,3 @@ class _NodeBuilder:
             message = f"the file, with its aliases expanded, holds more than {MAX_NODES} values"
             fix = "split it, or use a template instead of aliases within aliases"
             raise SyntaxProblemError(message, line, fix)
-
-
-class YamlMapping(ElementReader):
-    """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
-
-    Null values are left out of the fields; unknown and duplicate keys are errors. The value of a misspelled key is at
-    the key that is meant: it is examined, and not missing.
-    """
-
-    def __init__(self, builder: ModelBuilder, file: str, node: YamlNode, place: str, known: tuple[str, ...] = ()):
-        super().__init__(builder, file, node.line, place)
-        self.pairs: list[tuple[str, YamlNode, YamlNode]] = []
-        self.fields: dict[str, YamlNode] = {}
-        if not node.is_null and node.kind is not NodeKind.MAPPING:
-            self.error(f"expected a mapping (key: value), got {node.kind.value}", "write key: value, one per line")
-        for key, value in node.pairs:
-            if key.kind is not NodeKind.SCALAR:
-                self.error(f"a key is a name, got {key.kind.value}", "write name: value", key.line)
-            elif key.text == "<<" and key.is_plain:
-                fix = "use templates; see docs/geometry-files.md"
-                self.error("merge keys (<<) are not supported", fix, key.line)
-            else:
-                self.pairs.append((key.text.strip(), key, value))
-        if known:
-            self._select(known)
-
-    def _select(self, known: tuple[str, ...]) -> None:
-        first: dict[str, int] = {}
-        given = {name for name, _, _ in self.pairs}
-        for name, key, value in self.pairs:
-            if name in first:
-                message = f"{name} is given twice (first on line {first[name]})"
-                self.error(message, "remove one of the two", key.line)
-                continue
-            if name in known:
-                first[name] = key.line
-            else:
-                # a key that is present already is not what was meant
-                near = suggest_known_key(name, tuple(each for each in known if each not in given))
-                fix = f"write {near[0]}" if near else f"keys here are {', '.join(known)}"
-                self.error(f"unknown key {quote(name)}", fix, key.line, near)
-                if not near or near[0] in self.fields:
-                    continue
-                name = near[0]
-            if not value.is_null:
-                self.fields[name] = value
-
-    def enter(self, node: YamlNode, place: str, known: tuple[str, ...] = ()) -> YamlMapping:
-        return YamlMapping(self.builder, self.file, node, place, known)
-
-    def line_of(self, key: str) -> int:
-        return self.fields[key].line if key in self.fields else 0
-
-    def read_text(self, key: str) -> str:
-        """Return the trimmed text of a scalar, empty if it is absent or, with an error, no scalar."""
-        node = self.fields.get(key)
-        if node is None:
-            return ""
-        if node.kind is NodeKind.SCALAR:
-            return node.text.strip()
-        fix = f"write {key}: some text, in quotes if need be"
-        self.error(f"{key} is a text, got {node.kind.value}", fix, node.line)
-        return ""
-
-    def read_numbers(self, node: YamlNode, count: int, key: str, unit: str = "") -> list[float] | None:
-        """Read a list of `count` numbers; None, with an error, if it is wrong."""
-        fix = f"write {key}: [{', '.join(['number'] * count)}]" + (f", in {unit}" if unit else "")
-        if node.kind is not NodeKind.LIST:
-            got = quote(node.text, 40) if node.kind is NodeKind.SCALAR else node.kind.value
-            self.error(f"{key} is a list of {count} numbers, got {got}", fix, node.line)
-            return None
-        read = [self.read_number(item, key, fix) for item in node.items]
-        values = [value for value in read if value is not None]
-        if len(values) < len(read):
-            return None
-        if len(values) != count:
-            plural = "" if len(values) == 1 else "s"
-            self.error(f"{key} has {len(values)} number{plural}, not {count}", fix, node.line)
-            return None
-        return values
-
-    def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
-        """Read one number; None, with an error, if it is wrong."""
-        if node.kind is not NodeKind.SCALAR:
-            self.error(f"{key}: expected a number, got {node.kind.value}", fix, node.line)
-            return None
-        try:
-            if not node.is_plain:
-                raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
-            return parse_number(node.text)
-        except ValueError as error:
-            self.error(f"{key}: {error}", fix, node.line)
-            return None
-
-    def read_rows(self, key: str, shapes: tuple[int, ...], width: int) -> list[list[float]] | None:
-        """Read rows of `width` numbers; their count is one of `shapes`."""
-        node = self.fields[key]
-        wanted = " or ".join(map(str, shapes))
-        if node.kind is not NodeKind.LIST or len(node.items) not in shapes:
-            what = f"has {len(node.items)} rows, not {wanted}"
-            if node.kind is not NodeKind.LIST:
-                what = f"is a list of rows, got {node.kind.value}"
-            fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
-            self.error(f"{key} {what}", fix, node.line)
-            return None
-        rows = [self.read_numbers(item, width, f"{key} row {number}") for number, item in enumerate(node.items, 1)]
-        read = [row for row in rows if row is not None]
-        return read if len(read) == len(rows) else None

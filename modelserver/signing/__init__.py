@@ -1,1 +1,0 @@
-"""Signed commands: key files, signatures, and protection against replayed messages."""
