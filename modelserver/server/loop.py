@@ -45,11 +45,10 @@ from modelserver.server.reloading import PollReload
 from modelserver.server.requests.handler import RequestHandler
 from modelserver.server.requests.scheduler import RunDelay
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
-from modelserver.wire.codec import encode, fingerprint_of
+from modelserver.wire.codec import encode, fingerprint_of, split_snapshot
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
-from modelserver.wire.snapshot import split_snapshot
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from modelserver.server.clock import Clock
-from modelserver.wire.encoded import restamp
+from modelserver.wire.codec import restamp
 from modelserver.wire.eventlog import LogEvent
 
 

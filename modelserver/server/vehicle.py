@@ -31,7 +31,7 @@ from modelserver.signing.key_files import read_keys
 from modelserver.signing.signatures import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import get_type_name
-from modelserver.wire.urls import leaves_machine
+from modelserver.wire.provider import leaves_machine
 
 if TYPE_CHECKING:
     from modelserver.estimation.modes import LocalizerConfig

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from modelserver.errors import quote
-from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
-from modelserver.wire.urls import UdpAddress, make_route_command
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress, make_route_command
 
 
 class DiagnosisLevel(IntEnum):

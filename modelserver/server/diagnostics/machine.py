@@ -21,8 +21,7 @@ from modelserver.errors import BusError
 from modelserver.messages import Gauges
 from modelserver.server.diagnostics.checks import BusFacts, ClockFacts, NetworkInterface
 from modelserver.server.requests.scheduler import RunDelay
-from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
-from modelserver.wire.urls import UdpAddress, parse_udp_address
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress, parse_udp_address
 
 STATM = Path("/proc/self/statm")
 SCHEDSTAT = Path("/proc/thread-self/schedstat")

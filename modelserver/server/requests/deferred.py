@@ -6,9 +6,8 @@ from collections import deque
 from typing import Final
 
 from modelserver.messages import GetDynamics, GetHistory, GetTransformations, Request
-from modelserver.query import HISTORY_LIMIT
 from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer
-from modelserver.query.steps import Steps, complete
+from modelserver.query.view import HISTORY_LIMIT, Steps, complete
 from modelserver.server.requests.scheduler import MAX_REPLY_BYTES, QueuedRequest
 from modelserver.wire.codec import encode
 

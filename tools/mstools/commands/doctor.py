@@ -80,8 +80,7 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     from modelserver.server.diagnostics.machine import HostClockMonitor, read_bus_facts
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
-    from modelserver.wire.provider import resolve_url
-    from modelserver.wire.urls import find_url_problem
+    from modelserver.wire.provider import find_url_problem, resolve_url
     from mstools.deployment.diagnosis import diagnose_vehicle
 
     vehicle: VehicleConfig | None = None

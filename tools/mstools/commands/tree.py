@@ -88,8 +88,8 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
 def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
     """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
     from modelserver.formats.snapshot import decode_snapshot
+    from modelserver.wire.codec import SnapshotAssembler
     from modelserver.wire.provider import open_lcm, resolve_url
-    from modelserver.wire.snapshot import SnapshotAssembler
     from mstools.commands.listener import DaemonListener
 
     provider = resolve_url(url)

@@ -10,7 +10,7 @@ from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
-from modelserver.wire.urls import group_of
+from modelserver.wire.provider import group_of
 from mstools.deployment import plan as planning
 from mstools.terminal.problems import ProblemCollector, make_error
 

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import yaml
 
-from modelserver.wire.urls import make_route_command
+from modelserver.wire.provider import make_route_command
 from mstools.launch.processes import MODELSERVER, ChildProcesses, LaunchError
 from mstools.terminal.output import write_file
 

@@ -41,9 +41,8 @@ from modelserver.messages import (
 )
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from modelserver.wire.codec import decode, fingerprint_of
+from modelserver.wire.codec import SnapshotAssembler, decode, fingerprint_of
 from modelserver.wire.fields import read_text
-from modelserver.wire.snapshot import SnapshotAssembler
 
 PICTURE_PERIOD_US: Final = 30_000
 """Least time between two stored poses, and two stored messages of joints of one source, microseconds."""

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
 from modelserver.formats.snapshot import ModelSnapshot
