@@ -613,8 +613,7 @@ class _Reader:
         value = f"({', '.join(numbers)})"
         if "optional" not in each.options:
             return self._check_expression(each, value)
-        partial = "partial_" if "partial" in each.options else ""
-        known = f"read_{partial}{VECTORS[each.size].lower()}({value})"
+        known = f"read_{'partial' if 'partial' in each.options else 'known'}({value})"
         if "check" not in each.options:
             return known
         return f"None if ({name} := {known}) is None else {self._check_expression(each, name)}"

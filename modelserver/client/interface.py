@@ -200,7 +200,7 @@ class FrameClient(ABC):
         max_horizontal, max_heading
             The errors, m and rad, may be beyond them with a probability of 1 - min_integrity at most.
         max_age
-            Largest age of the newest data, s.
+            Largest age of the newest data, s; in a `PlatformMirror` that of the newest published pose.
         min_integrity
             0 for 0.99. If it is stated the pose must be valid; without limits above the configured ones must hold with
             it.

@@ -25,7 +25,6 @@ from modelserver.client.interface import (
     R,
     Time,
     concatenate,
-    make_demand,
     to_utime,
 )
 from modelserver.client.mirror_state import NEVER, Ages, MirrorReceiver, MirrorState
@@ -320,26 +319,11 @@ class PlatformMirror(LocalPlatform):
         except KeyError:
             return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms).transformation
 
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: Time = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-        max_horizontal: float = 0.0,
-        max_heading: float = 0.0,
-        max_age: float = 0.0,
-        min_integrity: float = 0.0,
+    def _query_pose(
+        self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
     ) -> PoseAnswer:
-        """Return the transformation with its origin, levels and quality flags, and what it lacks of a demand.
-
-        See `Platform.get_pose`. The age is that of the newest published pose.
-        """
-        demand = make_demand(max_horizontal, max_heading, max_age, min_integrity)
-        known = None if any(demand) else self._static_answers.get((frame_of_interest, frame_of_reference))
-        return known or self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms, demand)
+        known = self._static_answers.get((interest, reference)) if demand is NO_DEMAND else None
+        return known or super()._query_pose(interest, reference, at, policy, wait_ms, demand)
 
     @property
     def age(self) -> Ages:
