@@ -257,6 +257,20 @@ def test_given_a_page_then_its_links_and_paths_lead_somewhere(path: Path) -> Non
             assert list(ROOT.glob(place.rstrip("/"))), f"{path.name} names {place}"
 
 
+@pytest.mark.parametrize(
+    ("start", "known"),
+    [
+        ("modelserver", set(COMMANDS)),
+        ("make", set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))),
+        ("python -m benchmarks", {path.stem for path in (ROOT / "benchmarks").glob("*.py")}),
+    ],
+)
+def test_given_the_pages_then_the_commands_that_they_name_exist(start: str, known: set[str]) -> None:
+    for path in LINKING[:-3]:
+        named = set(re.findall(rf"(?:^|`|&& |\$ ){start} ([a-z][a-z_-]*)", path.read_text(encoding="utf-8"), re.MULTILINE))
+        assert named <= known, path.name
+
+
 PLACES = r"`(?:python )?((?:tests|benchmarks|examples|config|drivers|tools|lcmtypes|modelserver)/[\w./*-]+)[` ]"
 
 
