@@ -267,7 +267,9 @@ def test_given_a_page_then_its_links_and_paths_lead_somewhere(path: Path) -> Non
 )
 def test_given_the_pages_then_the_commands_that_they_name_exist(start: str, known: set[str]) -> None:
     for path in LINKING[:-3]:
-        named = set(re.findall(rf"(?:^|`|&& |\$ ){start} ([a-z][a-z_-]*)", path.read_text(encoding="utf-8"), re.MULTILINE))
+        named = set(
+            re.findall(rf"(?:^|`|&& |\$ ){start} ([a-z][a-z_-]*)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        )
         assert named <= known, path.name
 
 
