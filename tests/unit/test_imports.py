@@ -21,7 +21,21 @@ WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
 SIGNING = {"signing.signatures", "signing.key_files"}
 CONFIG = {"config.vehicle_file", "config.reader"}
 DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
+TOOLS = {
+    # each imports only those before it
+    "terminal": set(),
+    "edit": {"terminal"},
+    "recordings": {"terminal"},
+    "report": {"terminal"},
+    "calibration": {"terminal", "report"},
+    "tuning": {"terminal", "report"},
+    "launch": {"terminal"},
+    "scaffold": {"terminal"},
+    "deployment": {"terminal"},
+    "view": {"terminal", "edit", "recordings"},
+}
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
+BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -61,7 +75,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.endpoint"},
     "msdrivers": WIRE | DRIVERS | {"config.reader", "earth", "plugins", "signing.signatures"},
     "mslcm": set(),
-    "mstools": SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"},
+    **{f"mstools.{name}": BELOW_TOOLS | {f"mstools.{each}" for each in below} for name, below in TOOLS.items()},
+    "mstools.commands": BELOW_TOOLS | {"mstools", *(f"mstools.{name}" for name in TOOLS)},
+    "mstools": BELOW_TOOLS | {"mstools.terminal"},
     # the public names, loaded when they are first used
     "modelserver": VALUES | CONFIG | {"geometry", "messages", "formats", "client"},
 }
@@ -118,9 +134,8 @@ def package_of(module: str) -> str:
     if parts[0] == "modelserver":
         deeper = ".".join(parts[1:3])
         return deeper if deeper in MAY_IMPORT else parts[1] if len(parts) > 1 else "modelserver"
-    if parts[0] == "msdrivers" and parts[1:2] and f"msdrivers.{parts[1]}" in MAY_IMPORT:
-        return f"msdrivers.{parts[1]}"
-    return parts[0] if parts[0] in MAY_IMPORT else ""
+    deeper = ".".join(parts[:2])
+    return deeper if deeper in MAY_IMPORT else parts[0] if parts[0] in MAY_IMPORT else ""
 
 
 @cache
@@ -263,6 +278,8 @@ def test_the_table_itself_has_no_cycle():
             "modelserver.wire",
         ),
         ("msdrivers.protocol.nmea", "from msdrivers import runner", "msdrivers.protocol imports msdrivers.runner"),
+        ("mstools.recordings.drive", "from mstools.view import page", "mstools.recordings imports mstools.view.page"),
+        ("mstools.view.page", "from mstools import cli", "mstools.view imports mstools.cli"),
         ("modelserver.novelty", "import math", "package novelty is not in the table"),
     ],
 )

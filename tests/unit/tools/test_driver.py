@@ -163,7 +163,8 @@ def test_given_a_log_without_the_channel_or_of_long_ago_then_it_is_an_error_at_o
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:
-    from mstools.commands.driver import constraints_of, find_driver_problems
+    from mstools.commands.driver import constraints_of
+    from mstools.deployment.diagnosis import find_driver_problems
 
     path = RAPTOR / "vehicle.yaml"
     config = load_config(path)

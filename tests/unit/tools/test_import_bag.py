@@ -18,7 +18,7 @@ from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.commands.import_bag import import_bag
-from mstools.recordings.bag_messages import DEFAULT_OPTIONS, Altitude, BagOptions, ImuOrientation, TopicKind
+from mstools.recordings.bags import DEFAULT_OPTIONS, Altitude, BagOptions, ImuOrientation, TopicKind
 
 TYPE_NAMES = {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t", "JOINTS": "joints_t"}
 

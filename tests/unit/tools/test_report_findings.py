@@ -8,11 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from modelserver.errors import Severity
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
-from mstools.report import consistency
-from mstools.report.findings import collect_findings, estimate_fix_latency
-from mstools.report.replay_data import FindingLevel, FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
+from mstools.report.findings import (
+    collect_findings,
+    compute_consistency,
+    compute_running_nis,
+    estimate_fix_latency,
+)
+from mstools.report.replay_data import FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
 
 START = 1_700_000_000_000_000
 
@@ -60,7 +65,7 @@ def test_given_nothing_wrong_then_nothing_is_found() -> None:
 def test_given_a_wheel_that_counts_backward_then_it_is_named_and_the_other_is_not() -> None:
     found = collect_findings(make_data(wheels=(*turns("left", -1.01), *turns("right", 1.0))))
     assert [each.title for each in found] == ["Wheel left counts backward"]
-    assert found[0].level is FindingLevel.ERROR
+    assert found[0].level is Severity.ERROR
     assert "sign" in found[0].advice
 
 
@@ -170,7 +175,7 @@ def test_given_rejected_and_delayed_samples_and_gaps_then_all_are_found_worst_fi
         "sensor:imu: 7 samples too_old",
         "imu: 1 gap, the longest 5.0 s",
     ]
-    assert [each.level for each in found] == sorted(each.level for each in found)
+    assert [each.level for each in found] == sorted((each.level for each in found), key=list(Severity).index)
 
 
 def test_given_fixes_without_numbers_then_only_that_reason_is_explained() -> None:
@@ -187,10 +192,10 @@ def test_given_fixes_without_numbers_then_only_that_reason_is_explained() -> Non
 def test_given_normal_residuals_then_nis_is_one_and_a_twentieth_is_beyond() -> None:
     draws = np.random.default_rng(2).normal(0.0, 1.0, 4000) ** 2
     made = [decisions("a", float(nis), 1)[0]._replace(utime=START + n * 1000) for n, nis in enumerate(draws)]
-    (found,) = consistency.compute_consistency(made)
+    (found,) = compute_consistency(made)
     assert found.mean == pytest.approx(1.0, abs=0.07)
     assert found.beyond == pytest.approx(0.05, abs=0.015)
-    utimes, means = consistency.compute_running_nis(made, 1.0)
+    utimes, means = compute_running_nis(made, 1.0)
     assert len(utimes) == len(means) == 4000
     assert means[-1] == pytest.approx(float(draws[-1001:].mean()))
 
@@ -198,4 +203,4 @@ def test_given_normal_residuals_then_nis_is_one_and_a_twentieth_is_beyond() -> N
 def test_given_what_was_set_aside_then_it_does_not_count() -> None:
     aside = decisions("a", 9.0, 1)[0]._replace(verdict=Verdict.MONITORED)
     rejected = Decision(START, "gps", 0, "a", Verdict.REJECTED, "satellites")
-    assert consistency.compute_consistency([aside, rejected]) == []
+    assert compute_consistency([aside, rejected]) == []

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
+from modelserver.errors import Severity
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.messages import (
     VALID,
@@ -24,11 +25,13 @@ from modelserver.messages import (
     WheelsSample,
 )
 from modelserver.server.stamp_axis import StampAxis
-from mstools.report.findings import collect_findings
-from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
-from mstools.report.sensor_motion import (
+from mstools.report.findings import ReportFinding, collect_findings
+from mstools.report.replay_data import (
+    ReplayData,
     SecondMeans,
     SensorMotion,
+    SourceTimes,
+    StateSample,
     compare_turn_rates,
     compute_sensor_motion,
     compute_wheel_travel,
@@ -109,6 +112,20 @@ def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
     assert only(make_data(sensor_motion=swapped)).title == "Left and right wheels are swapped"
 
 
+def test_given_quick_turns_of_a_slow_vehicle_then_the_gyro_is_compared_over_the_steps_of_the_fixes() -> None:
+    plane, gyro, fixes = LocalFrame.at(50.0, -111.0, 0.0), {}, []
+    x = y = yaw = 0.0
+    for n in range(600):
+        # a quarter turn within two seconds every half minute, left and right in turns
+        gyro[START + n] = rate = (math.pi / 4.0 if n % 30 < 2 else 0.0) * (-1) ** (n // 60)
+        yaw += rate
+        x, y = x + math.cos(yaw), y + math.sin(yaw)
+        latitude, longitude, _ = geodetic_from_ecef(plane.to_ecef((x, y, 0.0)))
+        fixes.append(GpsSample(SensorHeader((START + n) * 1_000_000, "gps"), FixType.FIX_3D, latitude, longitude))
+    found = compute_sensor_motion(gyro, fixes, [], {})
+    assert found.compare_with_course(gyro) == pytest.approx((1.0, 1.0), abs=0.2)
+
+
 def test_given_speeds_without_travel_then_they_are_means_of_their_seconds() -> None:
     speed = [0.5, 1.5]
     samples = [
@@ -168,14 +185,14 @@ def test_given_a_good_drive_then_nothing_is_found() -> None:
 @pytest.mark.parametrize("name", ["left", "right"])
 def test_given_one_wheel_whose_sign_is_swapped_then_it_is_named(name: str, with_gyro: bool) -> None:
     found = only(make_data(sensor_motion=make_motion(**{name: -1.0}, with_gyro=with_gyro)))  # type: ignore[arg-type]
-    assert (found.level, found.title) == (FindingLevel.ERROR, f"Wheel {name} counts backward")
+    assert (found.level, found.title) == (Severity.ERROR, f"Wheel {name} counts backward")
     assert ("gyro" if with_gyro else "course") in found.observation
 
 
 @pytest.mark.parametrize("with_gyro", [True, False])
 def test_given_wheels_whose_names_are_swapped_then_they_are_named(with_gyro: bool) -> None:
     found = only(make_data(sensor_motion=make_motion(swapped=True, with_gyro=with_gyro)))
-    assert (found.level, found.title) == (FindingLevel.ERROR, "Left and right wheels are swapped")
+    assert (found.level, found.title) == (Severity.ERROR, "Left and right wheels are swapped")
 
 
 def test_given_a_gyro_that_turns_against_wheels_and_fixes_then_it_is_the_gyro() -> None:
@@ -273,18 +290,18 @@ def test_given_a_drive_then_its_distance_is_known_without_any_state() -> None:
     [
         (
             {"GPS": -3600.0, "IMU": -3600.0},
-            FindingLevel.NOTE,
+            Severity.NOTE,
             "All stamps are 3,600.0 s (1 h: a time zone?) behind their receipt",
         ),
         (
             {"GPS": -18.0, "IMU": 0.0},
-            FindingLevel.ERROR,
+            Severity.ERROR,
             "The stamps on GPS are 18.0 s (GPS time instead of UTC?) behind",
         ),
     ],
 )
 def test_given_stamps_on_another_axis_then_the_amount_is_reported(
-    offsets: dict[str, float], level: FindingLevel, title: str
+    offsets: dict[str, float], level: Severity, title: str
 ) -> None:
     found = only(make_data(axis=StampAxis(offsets, float(START))))
     assert found.level is level

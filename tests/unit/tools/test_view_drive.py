@@ -35,8 +35,8 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import encode_event
-from mstools.view import drive as drive_module
-from mstools.view.drive import FIX_COLORS, Drive, EventKind, FixColor, Table
+from mstools.recordings import drive as drive_module
+from mstools.recordings.drive import FIX_COLORS, Drive, EventKind, FixColor, Table
 from mstools.view.sources import open_log
 
 START = 1_700_000_000_000_000

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import queue
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,9 @@ from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from mstools.edit.document import GeometryItem, ItemKind
 from mstools.edit.session import EditedFile, EditSession
-from mstools.view.editor import Editing, Editor
-from mstools.view.item_fields import Snap
-from mstools.view.page import open_page
-from mstools.view.scene import NameLabels, VehicleScene
+from mstools.view.editor import Editing, Editor, Snap
+from mstools.view.page import Actions, open_page
+from mstools.view.scene import VehicleScene
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
@@ -35,10 +33,10 @@ class EditedPage:
 
     def __init__(self, path: Path, server: Any):
         self.session = EditSession(EditedFile.open(path))
-        self.actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.actions = Actions()
         self.shown: list[Model] = []
         scene = VehicleScene(server, None, lambda frame, is_reference: None)
-        scene.set_model(self.session.drawn, "Raptor:CG", NameLabels.NONE)
+        scene.set_model(self.session.drawn, "Raptor:CG")
         self.scene = scene
         self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
         self.fields = self.editor._fields
@@ -367,12 +365,12 @@ def test_given_frames_that_coincide_then_the_constraint_is_placed(page: EditedPa
     page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FLEALateral"))
     place = page.editor._place
     place._frame.value, place._target.value = "FLEA:Lens", "Digiclops:RightLens"
-    place._coincide()
+    place._place(place._coincide)
     assert page.message == ""
     assert page.model.get_transformation("FLEA:Lens", "Digiclops:RightLens").pose.is_close(Pose.identity(), 2e-6, 1e-7)
     place._target.value = "Raptor:CG"
     place._frame.value = "Raptor:Origin"
-    place._coincide()
+    place._place(place._coincide)
     assert "one side" in page.message
 
 
@@ -385,7 +383,7 @@ def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page:
     for (frame, distance), name in zip(place._rows, others, strict=False):
         frame.value = name
         distance.value = [float(np.linalg.norm(true - page.model.frame(name).pose.xyz))]
-    place._measure()
+    place._place(place._measure)
     assert page.message == ""
     frame = page.model.frame(item.name)
     assert frame.pose.xyz == pytest.approx(true, abs=1e-5)
@@ -394,7 +392,7 @@ def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page:
     assert "+0.0 mm" in place._result.content.replace("-0.0", "+0.0")
     for row, _ in place._rows[2:]:
         row.value = "-"
-    place._measure()
+    place._place(place._measure)
     assert "three frames" in page.message
 
 
@@ -465,7 +463,7 @@ def test_given_notes_alone_then_they_are_counted(page: EditedPage) -> None:
 
 def test_given_a_service_that_does_not_answer_then_the_reason_is_shown(page: EditedPage) -> None:
     page.editor._editing = Editing(page.session, "memq://", "", 0.05)
-    page.editor._ask_apply()
+    page.editor._start_reload(dry_run=True)
     assert page.editor._reloading is not None
     page.editor._reloading[1].exception(10.0)
     page.editor.update(0.0)

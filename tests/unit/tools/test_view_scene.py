@@ -18,11 +18,11 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 
 from modelserver.transforms.pose import Pose
 from mstools.commands.demo import find_vehicle_file
-from mstools.view.drive import Picture
-from mstools.view.page import Page, open_page
-from mstools.view.panels import describe_answer, escape_markdown, format_code
+from mstools.recordings.drive import Picture
+from mstools.view.page import Page, escape_markdown, open_page
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid, read_mesh
 from mstools.view.sources import Source, list_coordinates, open_geometry
+from mstools.view.viewer import describe_answer, format_code
 
 TETRAHEDRON = """\
 v 0 0 0
@@ -46,7 +46,7 @@ def page() -> Iterator[Page]:
 def make_scene(page: Page, source: Source) -> VehicleScene:
     scene = VehicleScene(page.server, source.folder, lambda frame, is_reference: None)
     assert source.drive.model is not None
-    scene.set_model(source.drive.model, source.drive.base_frame, NameLabels.FRAMES)
+    scene.set_model(source.drive.model, source.drive.base_frame)
     return scene
 
 

@@ -14,11 +14,10 @@ from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import MirrorState
 from modelserver.messages import VALID, ChannelHealth, Health
 from mstools.commands.demo import find_vehicle_file
-from mstools.view.drive import Drive
+from mstools.recordings.drive import Drive
 from mstools.view.page import Page, open_page
-from mstools.view.panels import _format_sensors
 from mstools.view.sources import Source, open_geometry
-from mstools.view.viewer import Viewer
+from mstools.view.viewer import Viewer, _format_sensors
 
 URDF = """<robot name="r">
 <link name="a"><visual><geometry><mesh filename="&lt;b&gt;{x}*.stl"/></geometry></visual></link>

@@ -12,7 +12,6 @@ import typer
 from modelserver.errors import ModelServerError
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.export import check_foxglove
-from mstools.commands.listener import iter_batches
 from mstools.terminal.options import PrefixOption, UrlOption, argument, choose_name, option
 from mstools.terminal.progress import catch_signals
 
@@ -38,6 +37,7 @@ def command(
     check_foxglove()
     import foxglove
 
+    from mstools.recordings.drive import follow_bus
     from mstools.recordings.foxglove_messages import FoxgloveWriter
 
     context = foxglove.Context()
@@ -52,9 +52,6 @@ def command(
         sys.stdout.flush()
         end = time.monotonic() + seconds
         with catch_signals() as stop:
-            for batch in iter_batches(bus, prefix, lambda: stop.is_set() or time.monotonic() >= end):
-                now = time.time_ns() // 1000
-                for channel, data in batch:
-                    writer.feed(channel, data, now)
+            follow_bus(bus, prefix, writer.feed, lambda: stop.is_set() or time.monotonic() >= end)
     finally:
         server.stop()

@@ -15,7 +15,6 @@ from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
-from mstools.commands.driver import find_driver_problems
 from mstools.terminal.options import JsonOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import describe_size, escape, format_count, print_problems, to_json
 from mstools.terminal.problems import find_nearest_path
@@ -81,6 +80,7 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
     # imported here: a geometry file needs no configuration libraries and no geodesy
     from modelserver.config.vehicle_file import add_lines, load_partly
     from modelserver.server.vehicle import examine_vehicle, load_vehicle
+    from mstools.deployment.diagnosis import find_driver_problems
 
     try:
         config, problems = load_partly(file, blank=True)

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import signal
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,6 @@ import typer
 from modelserver.errors import (
     ConfigError,
     ModelServerError,
-    Problem,
     RecordingError,
     find_nearest_names,
     has_error,
@@ -37,42 +36,6 @@ if TYPE_CHECKING:
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
     from mstools.deployment.service_start import ServiceStart
-
-
-def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
-    """Return every problem of the drivers of a vehicle file that is visible without their devices.
-
-    `constraints` are those of its geometry; None if unknown.
-    """
-    from modelserver.config.vehicle_file import read_config_lines
-
-    lines = read_config_lines(file)
-    if not any(path[:1] == ("drivers",) for path in lines):
-        return ()
-    # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
-    from msdrivers.settings import SourceMap, read_drivers
-
-    found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
-    drivers = found.values()
-    unbuildable = find_unbuildable_drivers(drivers, Path(file).parent)
-    return (*problems, *unbuildable, *find_shared_lines(drivers), *find_misnamed(vehicle, drivers, constraints))
-
-
-def find_misnamed(
-    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
-) -> Iterator[Problem]:
-    """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
-
-    wheels = vehicle.sensors.wheels
-    for driver in drivers:
-        yield from find_backward_counters(driver)
-        # the server does not receive a driver on another channel
-        if wheels is not None and driver.channel in ("", wheels.channel):
-            yield from find_unknown_wheels(driver, wheels.frames)
-        if constraints is not None:
-            yield from find_unknown_joint(driver, constraints)
 
 
 def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...] | None:
@@ -172,6 +135,8 @@ def show_drivers(config: Path) -> None:
     vehicle, drivers = load_drivers(config)
     for name, driver in drivers.items():
         typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
+    from mstools.deployment.diagnosis import find_driver_problems
+
     problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
     print_problems(problems)
     if has_error(problems):
@@ -219,6 +184,8 @@ def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
     """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
     has_joints = any(hasattr(settings.device_settings, name) for name in ("joint", "joints"))
     constraints = constraints_of(vehicle) if has_joints else None
+    from mstools.deployment.diagnosis import find_misnamed
+
     for problem in find_misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 

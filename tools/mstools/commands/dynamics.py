@@ -14,7 +14,6 @@ import numpy as np
 import typer
 
 from modelserver.errors import quote
-from mstools.commands.pose_source import load_given_model
 from mstools.terminal.options import (
     JsonOption,
     ModelOption,
@@ -26,7 +25,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import escape, to_json
+from mstools.terminal.output import escape, load_given_model, to_json
 
 if TYPE_CHECKING:
     from modelserver.dynamics import CenterOfMass, Dynamics, Stability

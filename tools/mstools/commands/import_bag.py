@@ -21,17 +21,20 @@ from modelserver.files.regular import check_links
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.server.stamp_axis import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
-from mstools.recordings.bag_messages import (
+from mstools.recordings.bags import (
     CONVERTERS,
     DEFAULT_OPTIONS,
     ROS_TYPES,
     Altitude,
+    Bag,
     BagOptions,
     ImuOrientation,
+    Topic,
     TopicKind,
+    is_lcm_mcap,
+    open_bag,
+    open_mcap,
 )
-from mstools.recordings.bag_reader import Bag, Topic, open_bag
-from mstools.recordings.mcap_log import is_mcap, is_ros_mcap, open_mcap
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import show_progress
@@ -145,7 +148,7 @@ def import_bag(
     check_links(log_path)
     with tempfile.TemporaryDirectory(prefix=f".{log_path.name}.", dir=log_path.parent) as draft:
         part = Path(draft) / log_path.name
-        if is_mcap(bag_path) and not is_ros_mcap(bag_path):
+        if is_lcm_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
         else:
             with open_bag(bag_path) as bag:
@@ -176,11 +179,11 @@ def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) ->
             with show_progress(
                 f"importing {mcap_path.name}", sum(count for _, count in mcap.channels.values())
             ) as show:
-                for number, each in enumerate(mcap.read(), 1):
-                    report = reports[each.channel]
-                    out.write_event(each.utime, report.channel, each.data)
+                for number, (utime, channel, data) in enumerate(mcap.read(), 1):
+                    report = reports[channel]
+                    out.write_event(utime, report.channel, data)
                     report.written += 1
-                    first, last = first or each.utime, each.utime
+                    first, last = first or utime, utime
                     if number % 512 == 0:
                         show(number)
         finally:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -20,12 +19,6 @@ if TYPE_CHECKING:
 
 POLL_S: Final = 0.2
 """Period of checks of the condition without a message, seconds: a signal may have changed it."""
-
-
-QUEUE_CAPACITY: Final = 10_000
-"""Queued messages of all channels together."""
-
-MAX_BATCH: Final = 500
 
 
 class DaemonListener:
@@ -57,20 +50,6 @@ class DaemonListener:
 def _receive(listener: weakref.ref[DaemonListener], name: str, _: str, data: bytes) -> None:
     if (found := listener()) is not None:
         found._receive(name, data)
-
-
-def iter_batches(bus: lcm.LCM, prefix: str, is_stopped: Callable[[], bool]) -> Iterator[list[tuple[str, bytes]]]:
-    """Yield the messages, channel and bytes, of all channels with a prefix in batches; an empty one in a quiet time."""
-    received: list[tuple[str, bytes]] = []
-    subscription = bus.subscribe(f"{re.escape(prefix)}.*", lambda channel, data: received.append((channel, data)))
-    subscription.set_queue_capacity(QUEUE_CAPACITY)
-    while not is_stopped():
-        handle_message(bus, int(POLL_S * 1e3))
-        while len(received) < MAX_BATCH and handle_message(bus):
-            pass
-        yield received
-        received.clear()
-    bus.unsubscribe(subscription)
 
 
 def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> bool:

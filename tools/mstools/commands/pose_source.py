@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +22,9 @@ from modelserver.messages import (
     Quality,
 )
 from mstools.terminal.options import parse_variables
-from mstools.terminal.output import print_problems
+from mstools.terminal.output import load_given_model
 
 if TYPE_CHECKING:
-    from modelserver.geometry.model import Model
     from mstools.recordings.log_platform import LogPlatform
 
 
@@ -79,26 +77,14 @@ class FileAnswers(FrameClient):
         return reply
 
 
-def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
-    """Load a geometry file, and print its problems. Raises GeometryError, OSError."""
-    from modelserver.formats import load_model
-
-    model = load_model(path, variables=variables)
-    print_problems(model.problems)
-    return model
-
-
 def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:
     """Open a log as a source of poses, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
-    from modelserver.client.mirror_state import HISTORY_S
-    from modelserver.formats.snapshot import ModelSnapshot
     from mstools.recordings.log_platform import LogPlatform
 
     if model is None:
         return LogPlatform(log, prefix)
     given = load_given_model(model, parse_variables(settings))
-    root = f"{given.root.name}:{given.root.frames[0].name}"
-    source = LogPlatform(log, prefix, ModelSnapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
+    source = LogPlatform(log, prefix, given)
     if source.revision not in ("", given.revision):
         there = f"{model} has revision {given.revision}, but the poses in {log} have {source.revision}"
         typer.echo(f"modelserver: note: {there}", err=True)

@@ -19,10 +19,17 @@ from modelserver.geometry.loop_closure import compute_misclosure
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
 from modelserver.geometry.topology import Crossing, LoopClosure, Topology
-from mstools.commands.pose_source import load_given_model
 from mstools.report.charts import BLUE, ORANGE
 from mstools.terminal.options import PrefixOption, UrlOption, Variables, argument, option, parse_variables
-from mstools.terminal.output import check_writable, describe_size, escape, format_count, replace_unencodable, write_file
+from mstools.terminal.output import (
+    check_writable,
+    describe_size,
+    escape,
+    format_count,
+    load_given_model,
+    replace_unencodable,
+    write_file,
+)
 
 if TYPE_CHECKING:
     from modelserver.formats.snapshot import ModelSnapshot

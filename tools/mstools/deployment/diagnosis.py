@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
@@ -38,7 +38,6 @@ def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...
     from modelserver.server.diagnostics.machine import list_interfaces
     from modelserver.server.vehicle import examine_vehicle
     from msdrivers.settings import SourceMap, read_drivers
-    from mstools.commands.driver import find_driver_problems
 
     geometry, of_vehicle = examine_vehicle(vehicle, str(file))
     of_drivers = find_driver_problems(vehicle, str(file), geometry.constraints)
@@ -48,6 +47,40 @@ def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...
         *diagnose_files(vehicle, file),
         *diagnose_connections(drivers.values(), list_interfaces()),
     )
+
+
+def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
+    """Return every problem of the drivers of a vehicle file that is visible without their devices.
+
+    `constraints` are those of its geometry; None if unknown.
+    """
+    lines = read_config_lines(file)
+    if not any(path[:1] == ("drivers",) for path in lines):
+        return ()
+    # imported here: a vehicle file without drivers needs none of their libraries
+    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
+    from msdrivers.settings import SourceMap, read_drivers
+
+    found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
+    drivers = found.values()
+    unbuildable = find_unbuildable_drivers(drivers, Path(file).parent)
+    return (*problems, *unbuildable, *find_shared_lines(drivers), *find_misnamed(vehicle, drivers, constraints))
+
+
+def find_misnamed(
+    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
+) -> Iterator[Problem]:
+    """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
+    from msdrivers.factory import find_backward_counters, find_unknown_joint, find_unknown_wheels
+
+    wheels = vehicle.sensors.wheels
+    for driver in drivers:
+        yield from find_backward_counters(driver)
+        # the server does not receive a driver on another channel
+        if wheels is not None and driver.channel in ("", wheels.channel):
+            yield from find_unknown_wheels(driver, wheels.frames)
+        if constraints is not None:
+            yield from find_unknown_joint(driver, constraints)
 
 
 def diagnose_vehicle_file(problems: Iterable[Problem], file: Path) -> Diagnosis:

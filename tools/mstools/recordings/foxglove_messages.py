@@ -62,8 +62,7 @@ from modelserver.geometry.shape import Shape, ShapeKind
 from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import decode, fingerprint_of, get_type_names
-from mstools.view.drive import Drive, DriveEvent, EventKind
-from mstools.view.frames import FramePoses
+from mstools.recordings.drive import Drive, DriveEvent, EventKind, FramePoses
 
 FIX_PERIOD_US: Final = 200_000
 STATIC_PERIOD_US: Final = 5_000_000
@@ -81,41 +80,28 @@ _TYPE_OF: Final = {fingerprint_of(name): name for name in get_type_names()}
 _OK, _WARN, _ERROR, _STALE = range(4)
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
-DIAGNOSTICS_SCHEMA: Final = {
-    "title": "diagnostic_msgs/DiagnosticArray",
-    "type": "object",
-    "properties": {
-        "header": {
-            "type": "object",
-            "properties": {
-                "stamp": {
-                    "type": "object",
-                    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-                },
-                "frame_id": {"type": "string"},
-            },
-        },
-        "status": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "level": {"type": "integer"},
-                    "name": {"type": "string"},
-                    "message": {"type": "string"},
-                    "hardware_id": {"type": "string"},
-                    "values": {
-                        "type": "array",
-                        "items": {
-                            "type": "object",
-                            "properties": {"key": {"type": "string"}, "value": {"type": "string"}},
-                        },
-                    },
-                },
-            },
-        },
-    },
-}
+
+def _make_schema(**fields: object) -> dict[str, object]:
+    """Return the JSON schema of an object; a list is an array of its item, a text the name of a plain type."""
+
+    def convert(field: object) -> object:
+        if isinstance(field, list):
+            return {"type": "array", "items": convert(field[0])}
+        return {"type": field} if isinstance(field, str) else field
+
+    return {"type": "object", "properties": {name: convert(field) for name, field in fields.items()}}
+
+
+_STATUS: Final = _make_schema(
+    level="integer",
+    name="string",
+    message="string",
+    hardware_id="string",
+    values=[_make_schema(key="string", value="string")],
+)
+DIAGNOSTICS_SCHEMA: Final = {"title": "diagnostic_msgs/DiagnosticArray"} | _make_schema(
+    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"), status=[_STATUS]
+)
 
 
 def find_definitions() -> Path:
@@ -138,13 +124,11 @@ class FoxgloveWriter:
 
     def __init__(self, context: Context, prefix: str = "", definitions: Path | None = None):
         self._context = context
-        self._drive = Drive(prefix)
+        self._drive = Drive(prefix, on_event=self._log_event)
+        self._now = 0
         self._definitions = definitions
-        self._model: Model | None = None
         self._frames: FramePoses | None = None
-        self._joints: Mapping[str, float] = {}
         self._next_static = self._next_fix = 0
-        self._events: list[DriveEvent] = []
         self._tf = FrameTransformsChannel("/tf", context=context)
         self._pose = PoseInFrameChannel("/pose", context=context)
         self._place = LocationFixChannel("/pose/fix", context=context)
@@ -152,27 +136,27 @@ class FoxgloveWriter:
         self._log = LogChannel("/events", context=context)
         self._diagnostics = Channel("/diagnostics", schema=DIAGNOSTICS_SCHEMA, context=context)
         self._fixes: dict[str, LocationFixChannel] = {}
-        self._raw: dict[str, Channel | None] = {}
+        self._raw: dict[str, Channel] = {}
         self._gps = fingerprint_of("gps_t")
         self.skipped = 0
         """Messages that could not be read."""
 
     @property
     def has_geometry(self) -> bool:
-        """Whether a complete geometry was received."""
-        return self._model is not None
+        return self._frames is not None
 
     def feed(self, channel: str, data: bytes, now: int) -> None:
         """Log what a message received at `now`, microseconds, holds."""
         drive = self._drive
         if not channel.startswith(drive.prefix):
             return
+        self._now = now
         drive.feed(channel, data, now)
         name = channel[len(drive.prefix) :]
         if self._definitions is not None:
-            self._log_raw(channel, data, now)
+            self._log_raw(self._definitions, channel, data, now)
         try:
-            if drive.model is not None and (drive.model is not self._model or now >= self._next_static):
+            if drive.model is not None:
                 self._log_geometry(drive.model, now)
             if name == "POSE":
                 self._log_pose(decode("pose_transform_t", data), now)
@@ -180,46 +164,38 @@ class FoxgloveWriter:
                 self._log_health(decode("health_t", data), now)
             elif data[:8] == self._gps:
                 self._log_gps(decode("gps_t", data), now)
-            elif name.startswith("JOINTS") or channel == drive.joints_channel:
-                self._log_joints(now)
+            elif self._frames is not None and (name.startswith("JOINTS") or channel == drive.joints_channel):
+                self._log_frames(self._frames, self._frames.move_joints(drive.get_joints(now)), now)
         except (WireError, GeodesyError, OverflowError):
             # the last one is a stamp that Foxglove's cannot hold
             self.skipped += 1
-        self._log_events(now)
 
     # --- frames
 
     def _log_geometry(self, model: Model, now: int) -> None:
-        if model is not self._model:
-            if self._model is not None:
+        frames = self._frames
+        if frames is not None and frames.model is model and now < self._next_static:
+            return
+        if frames is None or frames.model is not model:
+            if frames is not None:
                 everything = SceneEntityDeletion(type=SceneEntityDeletionType.All)
                 self._scene.log(SceneUpdate(deletions=[everything]), log_time=now * 1000)
-            self._model = model
-            self._frames = FramePoses(model, self._drive.base_frame)
+            frames = self._frames = FramePoses(model, self._drive.base_frame)
+            frames.move_joints(self._drive.get_joints(now))
         self._next_static = now + STATIC_PERIOD_US
-        assert self._frames is not None
-        everything_in_base = self._frames.compute(self._joints)
-        self._log_frames(everything_in_base, now)
+        self._log_frames(frames, frames.compute_bodies(), now)
         entities = [
             _make_entity(body.frames[0].full_name, body.frames[0].pose, body.visuals or body.collisions, now)
             for body in model.bodies
-            if body.frames and (body.visuals or body.collisions) and body.frames[0].full_name in everything_in_base
+            if body.name in frames.paths and (body.visuals or body.collisions)
         ]
         if entities:
             self._scene.log(SceneUpdate(entities=entities), log_time=now * 1000)
 
-    def _log_joints(self, now: int) -> None:
-        """Log the frames behind joints that moved."""
-        joints = self._drive.get_joints(now)
-        if self._frames is None or joints == self._joints:
-            return
-        moved = {name for name, value in joints.items() if self._joints.get(name) != value}
-        self._joints = joints
-        self._log_frames(self._frames.compute(joints, moved), now)
-
-    def _log_frames(self, frames: Mapping[str, Pose], now: int) -> None:
+    def _log_frames(self, frames: FramePoses, bodies: Mapping[str, Pose], now: int) -> None:
         base = self._drive.base_frame
-        transforms = [_make_transform(base, name, pose, now) for name, pose in frames.items() if name != base]
+        poses = frames.compute_frames(bodies)
+        transforms = [_make_transform(base, name, pose, now) for name, pose in poses.items() if name != base]
         if transforms:
             self._tf.log(FrameTransforms(transforms=transforms), log_time=now * 1000)
 
@@ -272,35 +248,22 @@ class FoxgloveWriter:
         header = {"stamp": {"sec": sec, "nsec": usec * 1000}, "frame_id": ""}
         self._diagnostics.log({"header": header, "status": status}, log_time=now * 1000)
 
-    def _log_events(self, now: int) -> None:
-        """Log the events that the drive has found since the last call."""
-        events = self._drive.events
-        if not events or (self._events and events[-1] is self._events[-1]):
-            return
-        known = {id(each) for each in self._events}
-        self._events = list(events)
-        for each in events:
-            if id(each) not in known:
-                level = _LEVELS.get(each.kind, LogLevel.Info)
-                message = Log(timestamp=_stamp(each.utime), level=level, message=each.text, name=each.kind)
-                self._log.log(message, log_time=now * 1000)
+    def _log_event(self, event: DriveEvent) -> None:
+        level = _LEVELS.get(event.kind, LogLevel.Info)
+        message = Log(timestamp=_stamp(event.utime), level=level, message=event.text, name=event.kind)
+        self._log.log(message, log_time=self._now * 1000)
 
-    def _log_raw(self, channel: str, data: bytes, now: int) -> None:
+    def _log_raw(self, definitions: Path, channel: str, data: bytes, now: int) -> None:
         if channel not in self._raw:
-            self._raw[channel] = self._make_raw_channel(channel, data)
-        raw = self._raw[channel]
-        if raw is not None:
-            raw.log(data, log_time=now * 1000)
-
-    def _make_raw_channel(self, channel: str, data: bytes) -> Channel | None:
-        """Return a channel for LCM messages; None where there are too many."""
-        if len(self._raw) >= MAX_SOURCES:
-            return None
-        name, text = _TYPE_OF.get(data[:8], ""), b""
-        if name and self._definitions is not None:
-            text = (self._definitions / f"{name}.lcm").read_bytes()
-        schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
-        return Channel(f"/lcm/{channel}", schema=schema, message_encoding="lcm", context=self._context)
+            if len(self._raw) >= MAX_SOURCES:
+                return
+            name = _TYPE_OF.get(data[:8], "")
+            text = (definitions / f"{name}.lcm").read_bytes() if name else b""
+            schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
+            self._raw[channel] = Channel(
+                f"/lcm/{channel}", schema=schema, message_encoding="lcm", context=self._context
+            )
+        self._raw[channel].log(data, log_time=now * 1000)
 
 
 def _stamp(utime: int) -> Timestamp:
@@ -308,19 +271,24 @@ def _stamp(utime: int) -> Timestamp:
     return Timestamp(seconds, microseconds * 1000)
 
 
-def _convert_pose(pose: Pose) -> FoxglovePose:
+def _convert(pose: Pose) -> tuple[Vector3, Quaternion]:
     (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
-    return FoxglovePose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+
+
+def _convert_pose(pose: Pose) -> FoxglovePose:
+    position, orientation = _convert(pose)
+    return FoxglovePose(position=position, orientation=orientation)
 
 
 def _make_transform(parent: str, child: str, pose: Pose, utime: int) -> FrameTransform:
-    (x, y, z), (qw, qx, qy, qz) = pose.xyz, pose.wxyz
+    translation, rotation = _convert(pose)
     return FrameTransform(
         timestamp=_stamp(utime),
         parent_frame_id=parent,
         child_frame_id=child,
-        translation=Vector3(x=x, y=y, z=z),
-        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+        translation=translation,
+        rotation=rotation,
     )
 
 

@@ -14,10 +14,13 @@ from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.errors import QueryError, RecordingError, WireError
 from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
 from modelserver.messages import Policy, PoseAnswer, SnapshotPart, TimeQuery
 from modelserver.query.view import PlatformView
 from modelserver.wire.codec import SnapshotAssembler, decode
 from modelserver.wire.eventlog import LogEvent, LogFile
+from mstools.recordings.drive import read_stamp
 
 CORRECTION_WINDOW_US: Final = 2_000_000
 """Time after an instant in which delayed samples may still change its pose."""
@@ -55,27 +58,23 @@ class LogContents(NamedTuple):
 class LogPlatform(LocalPlatform):
     """`Platform` on a log. `prefix` is that of the channels.
 
-    `model` replaces the log's own geometry; `contents` are those of `scan_log`, if it was read already. Raises
-    RecordingError where geometry is missing, OSError.
+    `model` replaces the log's own geometry; its base frame is the log's, without poses its first one. `contents` are
+    those of `scan_log`, if it was read already. Raises RecordingError where geometry is missing, OSError.
     """
 
-    def __init__(
-        self, path: Path, prefix: str = "", model: ModelSnapshot | None = None, contents: LogContents | None = None
-    ):
+    def __init__(self, path: Path, prefix: str = "", model: Model | None = None, contents: LogContents | None = None):
         self.where = f"in {path}"
         self._path = path
         self._prefix = prefix
-        self._given_model = model
+        self._given: ModelSnapshot | None = None
         if contents is None:
             with LogFile(path) as log:
                 contents = scan_log(log, prefix, with_geometry=model is None)
         self._contents = contents
-        if model is not None and self._contents.base_frame:
-            base = self._contents.base_frame
-            self._given_model = ModelSnapshot(
-                model.vehicle, model.model, base, base, model.history_s, model.joints_channel
-            )
-        elif model is None and self._contents.snapshot is None:
+        if model is not None:
+            base = contents.base_frame or names.join(model.root.name, model.root.frames[0].name)
+            self._given = ModelSnapshot("", model, base, base, HISTORY_S, f"{prefix}JOINTS")
+        elif contents.snapshot is None:
             raise RecordingError(self._no_geometry())
         self._read: tuple[MirrorState, int] = (MirrorState(), 0)
 
@@ -95,8 +94,8 @@ class LogPlatform(LocalPlatform):
 
     @property
     def base_frame(self) -> str:
-        """The frame whose pose the log has, empty without poses."""
-        return self._contents.base_frame
+        """The frame whose pose the log has, without poses that of its geometry."""
+        return self._contents.base_frame or (self._given.base_frame if self._given is not None else "")
 
     def read_state(self) -> tuple[MirrorState, int]:
         """Return what was known at the time that was read up to."""
@@ -120,8 +119,8 @@ class LogPlatform(LocalPlatform):
         begin, end = self._contents.begin, self._contents.end
         if at and not begin - MAX_OUTSIDE_US <= at <= end + MAX_OUTSIDE_US:
             raise RecordingError(self._describe_outside(at, begin, end))
-        snapshot = self._given_model or self._contents.snapshot
-        knowledge = MirrorReceiver(self._prefix, snapshot, self._given_model is not None)
+        snapshot = self._given or self._contents.snapshot
+        knowledge = MirrorReceiver(self._prefix, snapshot, self._given is not None)
         channels = set(knowledge.channels)
         # messages on these channels may be of any age
         any_age = (f"{self._prefix}MODEL_SNAPSHOT", f"{self._prefix}JOINTS_HELD")
@@ -132,7 +131,7 @@ class LogPlatform(LocalPlatform):
             for event in log.read_from(self._find_start(oldest)):
                 if event.channel not in channels:
                     continue
-                stamp = _stamp(event)
+                stamp = read_stamp(event.data)
                 if event.channel not in any_age and stamp < oldest:
                     continue
                 if at and policy is Policy.LATEST and stamp > at:
@@ -148,7 +147,7 @@ class LogPlatform(LocalPlatform):
 
     def _is_of_other_geometry(self, event: LogEvent, known: MirrorState) -> bool:
         """Return whether a pose or snapshot is of another geometry: after a reload, or of a service started later."""
-        if known.view is None or self._given_model is not None:
+        if known.view is None or self._given is not None:
             return False
         try:
             if event.channel == f"{self._prefix}MODEL_SNAPSHOT":
@@ -191,28 +190,26 @@ class LogPlatform(LocalPlatform):
         return f"{text}; +SECONDS counts from its start"
 
 
-def _stamp(event: LogEvent) -> int:
-    """Return the stamp of a pose, snapshot part or joints (after the fingerprint), 0 for a message too short."""
-    return int.from_bytes(event.data[8:16], "big", signed=True) if len(event.data) >= 16 else 0
-
-
 def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -> LogContents:
     """Return the contents of a log; `with_geometry` includes the snapshot."""
     offsets: list[tuple[int, int]] = []
     first: PoseAnswer | None = None
-    poses: list[int] = []
-    others: dict[str, list[int]] = {}
-    received_at: list[int] = []
+    spans: dict[str, tuple[int, int]] = {}
     parts = ""
     snapshot: ModelSnapshot | None = None
     assembler, received = SnapshotAssembler(), set[tuple[str, int]]()
+
+    def extend(what: str, stamp: int) -> None:
+        low, high = spans.get(what, (stamp, stamp))
+        spans[what] = (min(low, stamp), max(high, stamp))
+
     for event in log:
-        _extend(received_at, event.utime)
+        extend("", event.utime)
         try:
             if event.channel == f"{prefix}POSE":
                 first = first or decode("pose_transform_t", event.data)
-                stamp = _stamp(event)
-                _extend(poses, stamp)
+                stamp = read_stamp(event.data)
+                extend(event.channel, stamp)
                 if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
                     offsets.append((stamp, event.end))
             elif event.channel == f"{prefix}MODEL_SNAPSHOT":
@@ -225,18 +222,12 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
             else:
-                _extend(others.setdefault(event.channel, []), _stamp(event))
+                extend(event.channel, read_stamp(event.data))
         except WireError:
             continue
-    joints = others.get(f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel)
-    begin, end = poses or joints or received_at or [0, 0]
-    transformation = None if first is None else first.transformation
-    base_frame, revision = (
-        ("", "") if transformation is None else (transformation.frame_of_interest, transformation.model_revision)
-    )
+    joints = f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel
+    begin, end = spans.get(f"{prefix}POSE") or spans.get(joints) or spans.get("") or (0, 0)
+    base_frame = revision = ""
+    if first is not None:
+        base_frame, revision = first.transformation.frame_of_interest, first.transformation.model_revision
     return LogContents(snapshot, begin, end, base_frame, revision, parts, tuple(offsets))
-
-
-def _extend(span: list[int], stamp: int) -> None:
-    """Extend a time range, empty or of two, by a stamp."""
-    span[:] = [min(span[0], stamp), max(span[1], stamp)] if span else [stamp, stamp]

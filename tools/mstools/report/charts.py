@@ -16,12 +16,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
 
 from modelserver.errors import ModelServerError
+from modelserver.transforms.so3 import Array
 
 WIDTH = 1060
 """Width of a chart in pixels for which its height is chosen; it follows the page's."""
@@ -48,12 +48,12 @@ class Axis:
     high: float
     is_logarithmic: bool = False
 
-    def fraction(self, value: float) -> float:
-        """Return the position of a value on the axis, 0 at the low end and 1 at the high end; nan if it has none."""
+    def fraction(self, values: Array) -> Array:
+        """Return the positions of values on the axis, 0 at the low end and 1 at the high end; nan without one."""
         low, high = self.low, self.high
         if self.is_logarithmic:
-            value, low, high = math.log10(value) if value > 0.0 else math.nan, math.log10(low), math.log10(high)
-        return (value - low) / (high - low)
+            values, low, high = np.log10(np.where(values > 0.0, values, np.nan)), math.log10(low), math.log10(high)
+        return (values - low) / (high - low)
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +251,7 @@ def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
     if series.shape == "band":
         upper = np.column_stack([points[:, 0], np.asarray(series.high, float)])
         edge = {"mode": "lines", "line": {"width": 0, "color": series.color}, "hoverinfo": "skip"}
-        fill = {"fill": "tonexty", "fillcolor": _make_translucent(series.color)}
+        fill = {"fill": "tonexty", "fillcolor": f"rgba({','.join(map(str, bytes.fromhex(series.color[1:])))},0.22)"}
         shown = {"showlegend": False, "legendgroup": series.name}
         return [
             _make_trace(_decimate(points, x)) | edge | shown,
@@ -260,30 +260,22 @@ def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
     line = {"color": series.color, "width": series.width, "dash": "dash" if series.shape == "dashes" else "solid"}
     if series.times:
         # a track goes to and fro: no column of it can be decimated
-        return [_make_trace(points) | name | {"mode": "lines", "line": line} | _make_times(series)]
+        # a point that interrupts a line has no time
+        times = [None if math.isnan(each) else round(each, 2) for each in series.times]
+        hover = "%{customdata} s<br>%{x:.2f}, %{y:.2f} m<extra>%{fullData.name}</extra>"
+        name |= {"customdata": times, "hovertemplate": hover}
+        return [_make_trace(points) | name | {"mode": "lines", "line": line}]
     return [_make_trace(_decimate(points, x)) | name | {"mode": "lines", "line": line}]
 
 
-def _make_trace(points: np.ndarray[Any, Any]) -> dict[str, Any]:
+def _make_trace(points: Array) -> dict[str, Any]:
     return {"type": "scatter", "x": _encode(points[:, 0]), "y": _encode(points[:, 1])}
 
 
-def _make_times(series: Series) -> dict[str, Any]:
-    # a point that interrupts a line has no time
-    times = [None if math.isnan(each) else round(each, 2) for each in series.times]
-    hover = "%{customdata} s<br>%{x:.2f}, %{y:.2f} m<extra>%{fullData.name}</extra>"
-    return {"customdata": times, "hovertemplate": hover}
-
-
-def _encode(values: np.ndarray[Any, Any]) -> dict[str, str]:
+def _encode(values: Array) -> dict[str, str]:
     """Return numbers as plotly.js reads them: base64 of single precision, whose nan interrupts a line."""
     finite = np.where(np.isfinite(values), values, np.nan).astype("<f4")
     return {"dtype": "f4", "bdata": base64.b64encode(finite.tobytes()).decode()}
-
-
-def _make_translucent(color: str) -> str:
-    red, green, blue = (int(color[n : n + 2], 16) for n in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.22)"
 
 
 def _to_text(words: str) -> str:
@@ -291,37 +283,29 @@ def _to_text(words: str) -> str:
     return html.escape(words, quote=False)
 
 
-def _select_dots(points: np.ndarray[Any, Any], x: Axis, y: Axis) -> list[int]:
+def _select_dots(points: Array, x: Axis, y: Axis) -> list[int]:
     """Return the numbers of the finite points, one of each cell of the panel."""
-    cells: dict[tuple[int, int], int] = {}
-    for number, (a, b) in enumerate(points.tolist()):
-        column, row = x.fraction(a) * COLUMNS, min(max(y.fraction(b), 0.0), 1.0) * ROWS
-        if math.isfinite(column) and math.isfinite(b) and math.isfinite(row):
-            cells.setdefault((round(column), round(row)), number)
-    return list(cells.values())
+    rows = np.clip(y.fraction(points[:, 1]), 0.0, 1.0) * ROWS
+    cells = np.round(np.column_stack([x.fraction(points[:, 0]) * COLUMNS, rows]))
+    finite = np.flatnonzero(np.isfinite(cells).all(axis=1) & np.isfinite(points[:, 1]))
+    _, first = np.unique(cells[finite], axis=0, return_index=True)
+    chosen: list[int] = finite[np.sort(first)].tolist()
+    return chosen
 
 
-def _decimate(points: np.ndarray[Any, Any], x: Axis) -> np.ndarray[Any, Any]:
-    if len(points) <= COLUMNS:
-        return points
-    columns = [(x.fraction(a) * COLUMNS, a, b) for a, b in points.tolist()]
-    return np.array([each[1:] for each in decimate(columns)])
+def _decimate(points: Array, x: Axis) -> Array:
+    return points if len(points) <= COLUMNS else decimate(points, np.floor(x.fraction(points[:, 0]) * COLUMNS))
 
 
-def decimate(points: Iterable[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """Return at most the first, lowest, highest and last point of each run within one column; nan stays a gap.
-
-    A point is column, x, y.
-    """
-    drawn: list[tuple[float, float, float]] = []
-    for _, group in groupby(
-        points, lambda each: (math.floor(each[0]) if math.isfinite(each[0]) else -1, each[2] == each[2])
-    ):
-        run = list(group)
-        heights = [each[2] for each in run]
-        chosen = {0, heights.index(min(heights)), heights.index(max(heights)), len(run) - 1}
-        drawn += run if len(run) <= 4 else [run[n] for n in sorted(chosen)]
-    return drawn
+def decimate(points: Array, columns: Array) -> Array:
+    """Return at most the first, lowest, highest and last point (x, y) of each run in one column; nan stays a gap."""
+    gaps = np.isnan(points[:, 1])
+    begins = np.flatnonzero((columns[1:] != columns[:-1]) | (gaps[1:] != gaps[:-1])) + 1
+    chosen: list[int] = []
+    for run in np.split(np.arange(len(points)), begins):
+        y = points[run, 1]
+        chosen += sorted({run[0], run[y.argmin()], run[y.argmax()], run[-1]})
+    return points[chosen]
 
 
 def _render_figure(

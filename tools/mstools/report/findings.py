@@ -1,12 +1,17 @@
 """Findings of a replay: what its decisions and states reveal about vehicle file, sensors and settings. Pure.
 
 Each check is a function of `ReplayData` and yields findings: what was observed, the probable cause, and what to do. It
-yields nothing where there is too little data. Tests of consistency compare the mean NIS per degree of freedom with 1
-(consistency.py). The GNSS latency tau is a least-squares fit of the horizontal residuals r to the velocity v, both
+yields nothing where there is too little data. A sensor's unit, sign or name is verified by comparison with another
+sensor, without any pose: turn rates of gyro, wheels and fixes; distances of wheels and fixes; mean specific force
+against gravity. The GNSS latency tau is a least-squares fit of the horizontal residuals r to the velocity v, both
 high-pass filtered by subtracting a running mean: a fix that is tau old lies at -tau v, so tau = -sum(r v) / sum(v^2);
 its sigma is from the scatter over parts of the drive.
-Order: causes from the raw sensor data (sensor_checks.py) first; with one of them, checks that would only repeat its
-consequences are left out, and so are checks of the state of a filter that diverged.
+Order: causes from the raw sensor data first; with one of them, checks that would only repeat its consequences are left
+out, and so are checks of the state of a filter that diverged.
+
+Consistency of the innovations: NIS is a decision's statistic y' S^-1 y of the innovation y with covariance S. In a
+consistent filter it is chi-square distributed with as many degrees of freedom as y has components: its mean per degree
+of freedom is 1, and 5 % exceed the 95 % limit (Bar-Shalom, Li and Kirubarajan (2001) 5.4).
 """
 
 from __future__ import annotations
@@ -14,22 +19,51 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 
 import numpy as np
 
-from modelserver.messages import Decision, Invalid, Verdict
+from modelserver.errors import Severity
+from modelserver.estimation.filter.eskf import chi_square_gate
+from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.transforms.so3 import Array
-from mstools.report import consistency
-from mstools.report.replay_data import ReplayData, ReportFinding, error, note, warning
-from mstools.report.sensor_checks import SENSOR_CHECKS
+from mstools.report.replay_data import ReplayData, compare_turn_rates
 from mstools.terminal.output import format_count
 
 MOVING_SPEED = 0.3
 """Speed, m/s, above which the errors of wheels and fixes are evaluated."""
 
-MIN_WHEEL_SAMPLES = 20
-"""Fewest samples in motion to evaluate a wheel."""
+MIN_SAMPLES = 20
+"""Fewest samples to evaluate a sensor, or a wheel in motion."""
+
+UNUSED_SHARE = 0.05
+"""Share of accepted samples up to which a sensor counts as unused."""
+
+MODES_WITHOUT = {
+    "gps": (Mode.NO_GPS, Mode.DEAD_RECKONING),
+    "imu": (Mode.NO_IMU,),
+    "wheels": (Mode.NO_WHEELS, Mode.RAW),
+}
+"""Modes that need no such sensor."""
+
+REVERSE_WHEEL = "Reverse the sign of this wheel in its driver, or swap its encoder's two channels."
+
+DEGREES_PER_RADIAN = math.degrees(1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFinding:
+    """One finding: a headline, the observation, and what to do."""
+
+    level: Severity
+    title: str
+    observation: str
+    advice: str
+
+
+error, warning, note = (partial(ReportFinding, level) for level in Severity)
 
 
 def collect_findings(data: ReplayData) -> list[ReportFinding]:
@@ -43,7 +77,207 @@ def collect_findings(data: ReplayData) -> list[ReportFinding]:
         checks.append(check_rejected_fixes)
     found = causes + [finding for check in (*checks, check_stamps, check_gaps) for finding in check(data)]
     found += check_validity(data, has_cause=bool(causes))
-    return sorted(found, key=lambda each: each.level)
+    return sorted(found, key=lambda each: list(Severity).index(each.level))
+
+
+def _to_sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+# --- missing and unused sensors -----------------------------------------------------------------------------
+
+
+def check_missing(data: ReplayData) -> Iterable[ReportFinding]:
+    for key, channel in data.missing_channels:
+        if data.mode in MODES_WITHOUT.get(key, ()):
+            continue
+        remedy = "Correct the channel."
+        if key in MODES_WITHOUT:
+            mode = MODES_WITHOUT[key][0].name.lower()
+            remedy = f"Correct the channel; a vehicle without it: localization.mode: {mode}, or no sensors.{key}."
+        yield error(
+            f"No messages on channel {channel} (sensors.{key})",
+            f"The log has {', '.join(data.channels)}." if data.channels else "The log is empty.",
+            remedy,
+        )
+
+
+def check_clocks(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find stamps that are on another axis than the log's times: of one source, or of all."""
+    level, advice = (
+        (note, "As it should be for a simulation; else the clock of the recorder was off.")
+        if data.axis.common
+        else (error, "Correct the clock of its driver: utime is microseconds since 1970, UTC.")
+    )
+    for sentence in data.axis.describe():
+        title, _, observation = sentence.rpartition(": ")
+        yield level(_to_sentence(title)[:-1], _to_sentence(observation), advice)
+
+
+RANGE_ADVICE = {
+    "wheels": "Check the units in the driver: speed in m/s and travel in m; mm are too large by 1000.",
+    "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters.",
+    "imu": "Check the units in the driver: rates in rad/s, specific force in m/s2.",
+}
+"""What to do about samples of a sensor that are out of range."""
+
+REASONS = {
+    "gate": "fixes disagree with the motion, see the track",
+    "nan": "the driver sends non-finite numbers: check its input",
+    "no_fix": "the receiver reports no fix, or a type below localization.filter.minimum_fix_type: check its antenna",
+    "satellites": "fewer than localization.filter.minimum_satellites",
+    "dilution": "hdop above localization.filter.maximum_hdop",
+    "sigma": "the sigma of its fixes is above localization.filter.maximum_sigma",
+    "range": "no position on Earth, or outside the origin's UTM zone",
+    "too_old": "its stamps are older than localization.filter.horizon: check its clock and its latency",
+    "duplicate": "a driver sends samples twice, or two sensors share one header.source",
+    "future": "its clock is ahead of the others': synchronize them",
+}
+"""Explanation of the reasons for which samples are rejected, and what to do."""
+
+
+def check_unused(data: ReplayData) -> Iterable[ReportFinding]:
+    used: dict[str, set[tuple[int, int]]] = {}
+    rejected: dict[str, dict[tuple[int, int], str]] = {}
+    for each in data.decisions:
+        stamp = (each.utime, each.seq)
+        if each.verdict is Verdict.REJECTED:
+            rejected.setdefault(each.source, {}).setdefault(stamp, each.reason or "rejected")
+        else:
+            used.setdefault(each.source, set()).add(stamp)
+    for source, key in sorted(data.sensor_keys.items()):
+        reasons = rejected.get(source, {})
+        # accepted IMU samples have no decisions
+        good = data.count_samples(source) - len(reasons) if key == "imu" else len(used.get(source, ()))
+        if len(reasons) < MIN_SAMPLES or good > UNUSED_SHARE * (good + len(reasons)):
+            continue
+        ((reason, _),) = Counter(reasons.values()).most_common(1)
+        if reason == "gate":
+            continue  # fixes disagree with the motion; other checks find which of them is wrong
+        observation = (
+            f"Of {format_count(len(reasons), 'sample')} of {source} with a decision, nearly all were rejected."
+        )
+        advice = _to_sentence(REASONS.get(reason, "docs/words.md explains the reason"))
+        known = data.sensor_motion.lateral_offsets
+        if key == "wheels" and reason in ("names", "nan") and data.wheel_names and not known.keys() & data.wheel_names:
+            observation += (
+                f" The log's wheels are {', '.join(data.wheel_names)}; sensors.wheels.frames has {', '.join(known)}."
+            )
+            advice = "Use the log's names in sensors.wheels.frames, or the vehicle file's names in the driver."
+        elif reason == "range":
+            advice = RANGE_ADVICE.get(key, "Check the units in the driver: meters, seconds and radians.")
+            if key == "wheels":
+                speeds = [abs(v) for wheel in data.sensor_motion.wheels.values() for v in wheel.values()]
+                observation += (
+                    f" The fastest second is {max(speeds, default=math.nan):.0f} m/s; "
+                    f"localization.filter.maximum_speed is {data.settings.maximum_speed:.0f}."
+                )
+        yield error(f"No sample of sensors.{key} is used: {reason}", observation, advice)
+
+
+# --- units, signs and names: comparison of sensors ----------------------------------------------------------
+
+
+def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a gyro in degrees per second: its rate is 57 times that of wheels, without them that of fixes."""
+    motion = data.sensor_motion
+    pairs = (
+        (compare_turn_rates(motion.gyro, motion.wheel_turn_rate), "wheels"),
+        (motion.compare_with_course(motion.gyro), "fixes"),
+    )
+    known = [(found.ratio, what) for found, what in pairs if found is not None and abs(found.correlation) > 0.5]
+    for ratio, what in known[:1]:
+        # wheels that skid through a turn measure up to twice its rate
+        if 0.4 * DEGREES_PER_RADIAN < ratio < 1.6 * DEGREES_PER_RADIAN:
+            yield error(
+                "The gyro is in degrees per second",
+                f"Its rate is {ratio:.0f} times that of the {what}; a radian is 57.3 degrees.",
+                "angular_velocity must be in rad/s: check the unit in its driver.",
+            )
+
+
+def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
+    raw = data.sensor_motion
+    by_gyro = bool(raw.gyro)
+    reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
+    if any(check_gyro_unit(data)):
+        reference = {second: math.radians(rate) for second, rate in raw.gyro.items()}
+    against, straight = raw.count_opposed(reference)
+    if straight >= 5 and against > 0.8 * straight:
+        backward = raw.backward_wheels()
+        names = ", ".join(backward)
+        yield error(
+            f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
+            f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
+            REVERSE_WHEEL,
+        )
+        return
+    course = raw.compare_with_course(raw.wheel_turn_rate)
+    compared = compare_turn_rates(raw.gyro, raw.wheel_turn_rate) if by_gyro else course
+    if compared is None or compared.correlation > -0.6:
+        return
+    if by_gyro and course is not None and course.correlation > 0.6:
+        yield error(
+            "The gyro's rate has the opposite sign of wheels and fixes",
+            f"Its correlation with the wheels' turn rate is {compared.correlation:.2f}).",
+            "Check the IMU mount in the geometry, and the signs in its driver.",
+        )
+        return
+    yield error(
+        "Left and right wheels are swapped",
+        f"The correlation of the wheels' turn rate with the {what} is {compared.correlation:.2f}).",
+        "Swap the names in sensors.wheels.frames, or the frames' positions in the geometry; where all wheels count "
+        "backward, reverse their signs.",
+    )
+
+
+def check_distances(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find fixes and wheels with different distances: one of them has the wrong unit."""
+    found = data.sensor_motion.compare_distances()
+    if found.wheels < 20.0:
+        return
+    ratio = found.wheels / max(found.fixes, 1e-6)
+    if 1.0 / 3.0 < ratio < 3.0:
+        return
+    if 0.5 * DEGREES_PER_RADIAN < ratio < 2.0 * DEGREES_PER_RADIAN:
+        advice = "57 is degrees per radian: the receiver's driver must give degrees, not radians."
+    elif 500.0 < ratio < 2000.0:
+        advice = "1000 is mm per m: the wheels' driver must give travel in m and speed in m/s."
+    else:
+        advice = "Check the units in both drivers (m and m/s; degrees), and the wheel radius."
+    yield error(
+        f"Fixes moved {found.fixes:.1f} m while the wheels rolled {found.wheels:.0f} m",
+        f"The distance by the wheels is {ratio:.3g} times that of the fixes.",
+        advice,
+    )
+
+
+def check_gravity(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a mean specific force that differs from gravity in size or direction."""
+    if data.mean_force is None:
+        return
+    x, y, z = data.mean_force
+    angle = math.atan2(math.hypot(x, y), z)
+    size = math.sqrt(x * x + y * y + z * z)
+    if angle > 0.3 and size > 0.5:
+        yield error(
+            "The IMU mount differs from the geometry",
+            f"The mean specific force is {math.degrees(angle):.0f} degrees from the vehicle's up axis "
+            f"({x:+.1f}, {y:+.1f}, {z:+.1f} m/s2 along x, y, z).",
+            "Run modelserver calibrate imu LOG -c VEHICLE: it finds the mount that fits.",
+        )
+    if 0.9 < size < 1.1:
+        yield error(
+            "Specific force is in g, not in m/s2",
+            f"Its mean is {size:.2f}, and gravity is 9.81 m/s2.",
+            "specific_force must be in m/s2: check the unit in its driver.",
+        )
+    elif not 9.0 < size < 10.6:
+        yield error(
+            f"The mean specific force is {size:.2f} m/s2",
+            "In any drive its mean is close to 9.8 m/s2.",
+            "Check the unit of acceleration in the driver, and whether gravity is subtracted there.",
+        )
 
 
 # --- wheels -------------------------------------------------------------------------------------------------
@@ -54,7 +288,7 @@ def check_wheels(data: ReplayData) -> Iterable[ReportFinding]:
     by_name = sorted(data.wheels, key=lambda each: each.name)
     for name, turns in groupby(by_name, lambda each: each.name):
         moving = [each for each in turns if abs(each.expected) > MOVING_SPEED]
-        if len(moving) < MIN_WHEEL_SAMPLES:
+        if len(moving) < MIN_SAMPLES:
             continue
         against = sum(abs(each.measured + each.expected) < 0.3 * abs(each.expected) for each in moving)
         runs = [list(run) for is_silent, run in groupby(moving, lambda each: abs(each.measured) < 0.02) if is_silent]
@@ -63,7 +297,7 @@ def check_wheels(data: ReplayData) -> Iterable[ReportFinding]:
             yield error(
                 f"Wheel {name} counts backward",
                 f"In {against} of {len(moving)} samples in motion it measured the negative of the expected speed.",
-                "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
+                REVERSE_WHEEL,
             )
         elif silent > 0.5 * len(moving) or longest > 5.0:
             yield error(
@@ -77,7 +311,7 @@ def check_direction(data: ReplayData) -> Iterable[ReportFinding]:
     """Find a vehicle that drives backward nearly all the time: front and rear are swapped."""
     moving = [each for each in data.snapshots if abs(each.speed) > MOVING_SPEED]
     backward = sum(each.speed < 0.0 for each in moving)
-    if len(moving) >= 2 * MIN_WHEEL_SAMPLES and backward > 0.8 * len(moving):
+    if len(moving) >= 2 * MIN_SAMPLES and backward > 0.8 * len(moving):
         yield warning(
             "The vehicle drives backward nearly all the time",
             f"Forward speed is negative in {backward / len(moving):.0%} of the time in motion.",
@@ -109,7 +343,6 @@ def check_wheel_scale(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find an IMU that repeats one sample."""
     if data.frozen:
         total = sum(b - a for a, b in data.frozen)
         begin = data.frozen[0][0]
@@ -123,7 +356,6 @@ def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_biases(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find biases far outside the data sheet."""
     for kind, words, unit, factor in (
         ("gyro_bias", "Gyro bias about", "deg/s", math.degrees(1.0)),
         ("accelerometer_bias", "Accelerometer bias along", "m/s2", 1.0),
@@ -165,7 +397,7 @@ def check_stated_sigma(data: ReplayData) -> Iterable[ReportFinding]:
     """Find kinds of measurement with inconsistent innovations (NIS far from 1)."""
     # the noise of constraints without a sensor is inflated on purpose
     constraints = {each.kind for each in data.decisions if each.source == "filter"}
-    for each in consistency.compute_consistency(data.decisions):
+    for each in compute_consistency(data.decisions):
         if each.count < 30:
             continue
         seen = (
@@ -235,25 +467,12 @@ def _smooth(t: Array, series: Array) -> Array:
     return means
 
 
-REJECT_REASONS = {
-    "gate": "gate: fixes disagree with the motion, see the track",
-    "nan": "nan: the driver sent a non-finite number",
-    "no_fix": "no_fix: the receiver reports none, or a fix type below localization.filter.minimum_fix_type",
-    "satellites": "satellites: fewer than localization.filter.minimum_satellites",
-    "dilution": "dilution: hdop above localization.filter.maximum_hdop",
-    "sigma": "sigma: above localization.filter.maximum_sigma",
-    "range": "range: no position on Earth, or outside the origin's UTM zone",
-}
-"""Explanation of the reasons for which fixes are rejected."""
-
-
 def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find a large share of rejected fixes, with the reasons."""
     reasons = Counter(each.reason or each.verdict for each in data.fixes if each.verdict == "rejected")
     rejected, total = sum(reasons.values()), len(data.fixes)
     if total >= 20 and rejected > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
-        known = [REJECT_REASONS.get(reason, f"{reason}: docs/words.md") for reason, _ in reasons.most_common(3)]
+        known = [f"{reason}: {REASONS.get(reason, 'docs/words.md')}" for reason, _ in reasons.most_common(3)]
         yield warning(
             f"{rejected / total:.0%} of the fixes were rejected",
             f"Of {format_count(total, 'fix', 'fixes')} as positions: {words}.",
@@ -265,12 +484,7 @@ def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find delayed, duplicate and future samples."""
-    for reason, advice in (
-        ("too_old", "Their latency exceeds localization.filter.horizon: check clock and link."),
-        ("duplicate", "A driver sends samples twice, or two sensors share one header.source."),
-        ("future", "The sensor's clock is ahead of the host's: synchronize them."),
-    ):
+    for reason in ("too_old", "duplicate", "future"):
         by_source: Counter[str] = Counter()
         for (source, why), count in data.rejected.items():
             if why == reason:
@@ -280,12 +494,11 @@ def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
                 yield warning(
                     f"{source}: {format_count(count, 'sample')} {reason}",
                     "They were not used.",
-                    advice,
+                    _to_sentence(REASONS[reason]),
                 )
 
 
 def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find sensors with gaps that cost accuracy."""
     for sensor in data.sensors:
         found = [(a, b) for a, b in sensor.find_gaps() if b - a > max(1.0, 5.0 * sensor.period)]
         if found:
@@ -349,6 +562,17 @@ def check_divergence(data: ReplayData) -> Iterable[ReportFinding]:
 
 Check = Callable[[ReplayData], Iterable[ReportFinding]]
 
+SENSOR_CHECKS: tuple[Check, ...] = (
+    check_missing,
+    check_clocks,
+    check_unused,
+    check_gravity,
+    check_gyro_unit,
+    check_wheel_signs,
+    check_distances,
+)
+"""In the order of the report."""
+
 CHECKS: tuple[Check, ...] = (check_frozen_imu, check_divergence)
 
 SENSOR_RESIDUAL_CHECKS: tuple[Check, ...] = (check_wheels, check_direction)
@@ -362,3 +586,54 @@ def _get_state(data: ReplayData, name: str) -> tuple[float, float]:
     """Return the value and sigma of a state at the end, nan where there is none."""
     last = next((each for each in reversed(data.snapshots) if each.values), None)
     return (math.nan, math.nan) if last is None else (last.values.get(name, math.nan), last.sigmas.get(name, math.nan))
+
+
+# --- consistency of the innovations -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Innovations of one kind of measurement.
+
+    Attributes
+    ----------
+    count : number of innovations
+    rejected : innovations that the gate rejected; included in `mean` and `beyond`
+    mean : mean NIS per degree of freedom
+    beyond : share of innovations beyond the 95 % limit
+    """
+
+    kind: str
+    count: int
+    rejected: int
+    mean: float
+    beyond: float
+
+
+def has_nis(decision: Decision) -> bool:
+    """Return whether a decision has an innovation and was not set aside on purpose."""
+    return decision.dof > 0 and math.isfinite(decision.statistic) and decision.verdict is not Verdict.MONITORED
+
+
+def compute_consistency(decisions: Iterable[Decision]) -> list[Consistency]:
+    """Return the consistency of each kind of measurement, by name."""
+    known = sorted(filter(has_nis, decisions), key=lambda each: each.kind)
+    result = []
+    for kind, group in groupby(known, lambda each: each.kind):
+        found = list(group)
+        rejected = sum(each.verdict is Verdict.REJECTED for each in found)
+        beyond = sum(each.statistic > chi_square_gate(each.dof, 0.05) for each in found)
+        mean = sum(each.statistic for each in found) / sum(each.dof for each in found)
+        result.append(Consistency(kind, len(found), rejected, mean, beyond / len(found)))
+    return result
+
+
+def compute_running_nis(decisions: Iterable[Decision], window_s: float) -> tuple[list[int], list[float]]:
+    """Return utimes and the mean NIS per degree of freedom in the `window_s` before each."""
+    known = sorted(filter(has_nis, decisions), key=lambda decision: decision.utime)
+    utimes = np.array([each.utime for each in known], dtype=np.int64)
+    first = np.searchsorted(utimes, utimes - round(window_s * 1e6))
+    totals = np.cumsum([0.0, *(each.statistic for each in known)])
+    numbers = np.cumsum([0, *(each.dof for each in known)])
+    means = np.maximum(totals[1:] - totals[first], 0.0) / (numbers[1:] - numbers[first])
+    return utimes.tolist(), means.tolist()

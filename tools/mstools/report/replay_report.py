@@ -5,16 +5,16 @@ from __future__ import annotations
 import html
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import chain, cycle, pairwise
 
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
-from mstools.report import charts, consistency
+from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, StripRow, decade_axis, level, value_range
-from mstools.report.findings import collect_findings
-from mstools.report.replay_data import ReplayData, ReportFinding, StateSample
+from mstools.report.findings import ReportFinding, collect_findings, compute_consistency, compute_running_nis
+from mstools.report.replay_data import ReplayData, StateSample
 from mstools.terminal.output import escape, format_count
 
 HOLD_S = 1.0
@@ -45,7 +45,6 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 
 
 def render_page(data: ReplayData) -> str:
-    """Return the HTML page."""
     found = collect_findings(data)
     sections = [
         ("findings", "Findings", _render_findings(found)),
@@ -76,7 +75,7 @@ def render_page(data: ReplayData) -> str:
 def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
     """Return the lines to print: the path of the page, and the headlines of its findings."""
     lines = [f"report: {escape(path)}, {format_count(len(found), 'finding')}"]
-    return lines + [f"  {each.level.name.lower()}: {escape(each.title)}" for each in found]
+    return lines + [f"  {each.level}: {escape(each.title)}" for each in found]
 
 
 # --- parts of the page --------------------------------------------------------------------------------------
@@ -131,7 +130,8 @@ def _render_key_figures(data: ReplayData) -> str:
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
     ]
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    return f'<div class="figures">{cells}</div>\n<p>{_escape(_describe_key_figures(data))}</p>'
+    words = " ".join(_describe_key_figures(data, verdicts))
+    return f'<div class="figures">{cells}</div>\n<p>{_escape(words)}</p>'
 
 
 def _valid_share(data: ReplayData) -> float:
@@ -140,33 +140,30 @@ def _valid_share(data: ReplayData) -> float:
     return min(sum(held) / data.duration, 1.0) if data.duration > 0.0 else 0.0
 
 
-def _describe_key_figures(data: ReplayData) -> str:
-    """Return an explanation of the key figures and of the fixes that were not used."""
-    verdicts = Counter(each.verdict for each in data.fixes)
-    words = ["Valid: share of the recorded time, from the log's first event on."]
-    if data.fixes:
-        rest = [
-            f"{format_count(verdicts[verdict], 'fix', 'fixes')} {what}"
-            for verdict, what in (
-                ("monitored", "monitored (stationary or unused)"),
-                ("reset", "reset the position"),
-                ("", "without a decision (before heading alignment, or pending at the end)"),
-            )
-            if verdicts[verdict]
-        ]
-        if rest:
-            words.append(f"Of the fixes not used as positions (gps_position): {', '.join(rest)}.")
-        heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in data.decisions)
-        if heights:
-            words.append(f"{format_count(heights, 'height')} (gps_height) of fixes rejected.")
-    return " ".join(words)
+def _describe_key_figures(data: ReplayData, verdicts: Mapping[str, int]) -> Iterator[str]:
+    """Yield explanations of the key figures and of the fixes that were not used."""
+    yield "Valid: share of the recorded time, from the log's first event on."
+    rest = [
+        f"{format_count(verdicts[verdict], 'fix', 'fixes')} {what}"
+        for verdict, what in (
+            ("monitored", "monitored (stationary or unused)"),
+            ("reset", "reset the position"),
+            ("", "without a decision (before heading alignment, or pending at the end)"),
+        )
+        if verdicts[verdict]
+    ]
+    if rest:
+        yield f"Of the fixes not used as positions (gps_position): {', '.join(rest)}."
+    heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in data.decisions)
+    if heights:
+        yield f"{format_count(heights, 'height')} (gps_height) of fixes rejected."
 
 
 def _render_findings(found: Sequence[ReportFinding]) -> str:
     if not found:
         return '<p class="good">No findings. Compare the charts below with docs/tuning.md.</p>'
     return "\n".join(
-        f'<div class="finding {each.level.name.lower()}"><h3><span>{each.level.name.lower()}</span> '
+        f'<div class="finding {each.level}"><h3><span>{each.level}</span> '
         f"{_escape(each.title)}</h3><p>{_escape(each.observation)}</p><p>{_escape(each.advice)}</p></div>"
         for each in found
     )
@@ -340,7 +337,7 @@ def _epochs(data: ReplayData) -> list[tuple[float, str]]:
 
 
 def _render_consistency(data: ReplayData) -> str:
-    found = consistency.compute_consistency(data.decisions)
+    found = compute_consistency(data.decisions)
     if not found:
         return f"<p>No innovations: {_explain_no_decisions(data)}.</p>"
     rows = []
@@ -352,7 +349,7 @@ def _render_consistency(data: ReplayData) -> str:
     drawn = [level("expected", x, 1.0)]
     for each, color in zip([each for each in found if each.count >= 10], cycle(charts.PALETTE), strict=False):
         of_kind = (decision for decision in data.decisions if decision.kind == each.kind)
-        utimes, means = consistency.compute_running_nis(of_kind, NIS_WINDOW_S)
+        utimes, means = compute_running_nis(of_kind, NIS_WINDOW_S)
         drawn.append(Series(each.kind, list(map(data.to_seconds, utimes)), means, color))
     axis = Axis("NIS / dof", 0.01, 100.0, is_logarithmic=True)
     panel = Panel(f"NIS, mean of {NIS_WINDOW_S:.0f} s", axis, drawn, 220.0)
@@ -496,7 +493,6 @@ def _render_verdicts(data: ReplayData) -> str:
 
 
 def _explain_no_decisions(data: ReplayData) -> str:
-    """Return why the filter decided nothing."""
     if data.mode is Mode.RAW:
         return "raw mode"
     if data.missing_channels:

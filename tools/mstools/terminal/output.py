@@ -8,8 +8,9 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from pathlib import Path
 from typing import Any, TextIO
 
 import typer
@@ -34,6 +35,15 @@ def print_problems(problems: Iterable[Problem], err: bool = True) -> None:
         for name, value in (("in", each.element), ("fix", each.fix), ("nearest", ", ".join(each.nearest))):
             if value:
                 typer.echo(f"    {name + ':':<9}{escape(value)}", err=err)
+
+
+def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
+    """Load a geometry file, and print its problems. Raises GeometryError, OSError."""
+    from modelserver.formats import load_model
+
+    model = load_model(path, variables=variables)
+    print_problems(model.problems)
+    return model
 
 
 def format_count(count: int, one: str, several: str = "") -> str:

@@ -46,7 +46,7 @@ from modelserver.server.offline import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.report.consistency import Consistency, compute_consistency
+from mstools.report.findings import Consistency, compute_consistency
 
 SKIP_S = 30.0
 """Seconds from the first fix that are not scored, for heading alignment; at most a quarter of the log."""

@@ -1,31 +1,50 @@
 """The page's editor of a geometry file: what is selected, its fields, the gizmo, problems, saving and applying.
 
-All changes go through an `EditSession`. Callbacks of the page run in threads of their own; they only queue an action,
-which the viewer executes between two pictures.
+All changes go through an `EditSession`. Callbacks of the page only queue an action, which the viewer executes between
+two pictures. `ItemFields` sets the numbers and texts of an item together: each number has a text field, so that what is
+typed stays as it is typed, and a number that was not changed in its field is as exact as it was given. `PlacePanel`
+computes a pose from a frame with which it coincides, or from distances to others.
 """
 
 from __future__ import annotations
 
-import queue
-from collections.abc import Callable
+import html
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from modelserver.client.remote import Platform
-from modelserver.errors import ModelServerError, Problem, QueryError, Severity
+from modelserver.errors import ModelServerError, Problem, QueryError, Severity, quote
+from modelserver.formats.reading import parse_number
+from modelserver.formats.writing import format_number
 from modelserver.geometry import names
+from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
-from modelserver.geometry.placement import PlacementError
+from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
+from modelserver.geometry.placement import (
+    DistanceFit,
+    Placement,
+    PlacementError,
+    list_measured_points,
+    locate_by_distances,
+    place_constraint,
+    place_frame,
+)
 from modelserver.messages import ReloadReply
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
+from modelserver.transforms.so3 import Vector3
+from mstools.edit.document import SAME_RADIANS, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.session import EditSession
-from mstools.view.item_fields import ItemFields, Snap, list_frames
-from mstools.view.panels import escape_markdown
-from mstools.view.placing import PlacePanel
+from mstools.edit.yaml_text import EditError
+from mstools.terminal.output import format_count
+from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
@@ -33,7 +52,25 @@ MAX_LABEL: Final = 60
 LOOK_PERIOD_S: Final = 2.0
 """Period at which the file is compared with what was read, seconds."""
 
+MAX_DISTANCES: Final = 6
+NO_CHOICE: Final = "-"
+
+PRECISION: Final = 6
+"""Decimals of a field and of a computed placement: micrometers, and millionths of a degree."""
+
+SAME: Final = 10.0**-PRECISION
+"""A drag by less has not moved, or turned, what is dragged."""
+
+_INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
+
+_MINUS: Final = str.maketrans(dict.fromkeys("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d", "-"))
+"""Minus signs and dashes that keyboards and other programs write."""
+
+_RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
+
 Change = Callable[[GeometryDocument], GeometryDocument]
+ChangeItem = Callable[[Change, GeometryItem | None], bool]
+"""Makes a change and selects an item; returns whether it could be made."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +104,7 @@ class Editor:
         server: viser.ViserServer,
         scene: VehicleScene,
         editing: Editing,
-        actions: queue.SimpleQueue[Callable[[], None]],
+        actions: Actions,
         show: Callable[[Model], None],
     ):
         self._gui = gui = server.gui
@@ -78,7 +115,7 @@ class Editor:
         self._actions = actions
         self._show = show
         self._shown = session.drawn
-        self._item: GeometryItem | None = None
+        self._item = self._find_first(ItemKind.FRAME)
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
         self._next_look = 0.0
@@ -89,24 +126,20 @@ class Editor:
         self._undo = self._add_button("Undo", lambda: self._step(session.undo))
         self._redo = self._add_button("Redo", lambda: self._step(session.redo))
         self._save = self._add_button("Save ...", self._ask_save)
-        self._apply = self._add_button("Apply to the service ...", self._ask_apply)
+        self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
         self._add_button("Read the file again", self._ask_read)
         self._problems = gui.add_folder("Problems")
         with self._problems:
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
-        self._kind.on_update(lambda event: self._queue(event, lambda: self._select_first(ItemKind(event.target.value))))
-        self._name.on_update(
-            lambda event: self._queue(
-                event, lambda: self.select(GeometryItem(ItemKind(self._kind.value), event.target.value))
-            )
-        )
-        self._fields = ItemFields(server, session, self._change_item, actions)
+        actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
+        actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
+        self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
             self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
-            self._gizmo.on_update(lambda event: self._queue(event, self.show_gizmo))
+            actions.on_update(self._gizmo, self.show_gizmo)
         with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
             self._add_button("Add body", lambda: self._add(ItemKind.BODY))
@@ -115,30 +148,32 @@ class Editor:
             self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
         with gui.add_folder("Place by measurement", expand_by_default=False):
-            self._place = PlacePanel(gui, session, self._change_item, actions)
+            self._place = PlacePanel(gui, session, self._item, self._change_item, actions)
         with gui.add_folder("As text", expand_by_default=False):
             self._text: Any = gui.add_text("YAML", "", multiline=True)
             self._add_button("Write text", self._write_text)
-        self._select_first(ItemKind.FRAME)
         self._refresh()
 
-    # --- from the page
+    def _add_button(self, label: str, action: Callable[[], object]) -> Any:
+        return self._actions.add_button(self._gui, label, action)
 
-    def _queue(self, event: Any, action: Callable[[], None]) -> None:
-        """Queue an action of the page; values that this program sets have no client."""
-        if event.client_id is not None:
-            self._actions.put(action)
+    def _ask(self, title: str, text: str, answer: str, action: Callable[[], object]) -> None:
+        """Show a text in a dialog, and execute an action if a person answers so."""
+        modal: Any = self._gui.add_modal(title)
 
-    def _add_button(self, label: str, action: Callable[[], None]) -> Any:
-        button = self._gui.add_button(label)
-        button.on_click(lambda _: self._actions.put(action))
-        return button
+        def confirm() -> None:
+            modal.close()
+            action()
+
+        with modal:
+            self._gui.add_markdown(text)
+            self._add_button(answer, confirm)
+            self._add_button("Cancel", modal.close)
 
     # --- selection
 
     def select(self, item: GeometryItem) -> None:
-        """Select what is edited."""
-        if self._item is not None and item != self._item and not self._fields.commit():
+        if item != self._item and not self._fields.commit():
             # what was typed is not lost: it stays until it can be set
             self._kind.value, self._name.value = self._item.kind, self._item.name
             return
@@ -149,26 +184,25 @@ class Editor:
         self._kind.value = item.kind
         self._name.options = tuple([each.name for each in items if each.kind is item.kind])
         self._name.value = item.name
-        self._show_item()
+        self._fields.show(item)
+        self._place.show(item)
+        self._text.value = self._session.document.get_yaml(item)
+        self.show_gizmo()
 
     def _select_first(self, kind: ItemKind) -> None:
-        found = next((each for each in self._session.document.list_items() if each.kind is kind), None)
-        if found is None:
+        found = self._find_first(kind)
+        if found.kind is not kind:
             self._report(f"there is no {kind} yet; add one below")
-            self._kind.value = self._item.kind if self._item is not None else ItemKind.BODY
+            self._kind.value = self._item.kind
         else:
             self.select(found)
 
-    def _show_item(self) -> None:
-        """Show the fields, the text and the gizmo of what is selected."""
-        assert self._item is not None
-        self._fields.show(self._item)
-        self._place.show(self._item)
-        self._text.value = self._session.document.get_yaml(self._item)
-        self.show_gizmo()
+    def _find_first(self, kind: ItemKind) -> GeometryItem:
+        """Return the first item of a kind, without one the first of all."""
+        items = self._session.document.list_items()
+        return next((each for each in items if each.kind is kind), items[0])
 
     def _refresh(self) -> None:
-        """Show the session as it is after a change."""
         session = self._session
         self._next_look = 0.0
         self._show_status()
@@ -181,11 +215,8 @@ class Editor:
         self._save.disabled = not session.is_changed or session.has_errors
         self._apply.disabled = session.is_changed
         self._show_problems()
-        items = session.document.list_items()
-        if self._item not in items:
-            kind = self._item.kind if self._item is not None else ItemKind.FRAME
-            self._item = next((each for each in items if each.kind is kind), items[0])
-        assert self._item is not None
+        if self._item not in session.document.list_items():
+            self._item = self._find_first(self._item.kind)
         self.select(self._item)
         if session.model is not None and session.model is not self._shown:
             self._shown = session.drawn
@@ -197,7 +228,7 @@ class Editor:
         errors = sum(each.severity is Severity.ERROR for each in session.problems)
         state = "not saved" if session.is_changed else "saved"
         if errors:
-            state += f"; {errors} error{'' if errors == 1 else 's'}: cannot be saved, and the scene shows " + (
+            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
                 "the last model" if session.model is not None else "the bodies, not joined"
             )
         if self._is_outdated:
@@ -212,10 +243,10 @@ class Editor:
         shown = [each for each in found if each.severity is not Severity.NOTE][:SHOWN_PROBLEMS]
         notes = sum(each.severity is Severity.NOTE for each in found)
         more = len(found) - len(shown) - notes
-        lines = [f"- {_describe(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
+        lines = [f"- {_describe_problem(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
         text = "\n".join(lines) or "none"
         if notes:
-            text += f"\n\n{notes} note{'' if notes == 1 else 's'}: modelserver check --notes"
+            text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
         self._problem_texts.content = text
         with self._problems:
             for number, problem in enumerate(shown, 1):
@@ -256,13 +287,11 @@ class Editor:
 
     def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
         """Make a change of what is selected; return whether it could be made."""
-        assert self._item is not None
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
         name = self._new.value.strip()
         item = self._item
-        assert item is not None
         frames = list_frames(self._session.document)
         if kind is ItemKind.BODY:
             self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
@@ -283,7 +312,6 @@ class Editor:
 
     def _duplicate(self) -> None:
         item = self._item
-        assert item is not None
         plain = item.name.rpartition(":")[2]
         name = self._new.value.strip() or _find_free_name(self._session.document, item)
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
@@ -291,13 +319,11 @@ class Editor:
 
     def _delete(self) -> None:
         item = self._item
-        assert item is not None
         in_template = self._fields.in_template
         self._change(f"delete {item.name}", lambda document: document.delete(item, in_template))
 
     def _write_text(self) -> None:
         item, text = self._item, self._text.value
-        assert item is not None
         self._change(f"write {item.name}", lambda document: document.set_yaml(item, text))
 
     # --- gizmo
@@ -318,28 +344,21 @@ class Editor:
     # --- saving and applying
 
     def _ask_save(self) -> None:
-        """Show what would be saved, with what was typed and not set yet."""
         if not self._fields.commit():
             return
         diff, shown = self._session.make_diff(), self._session.document
-        modal = self._gui.add_modal(f"Save {self._session.file.path.name}")
-        with modal:
-            # longer than what the file may have
-            fence = "`" * (3 + diff.count("`"))
-            self._gui.add_markdown(f"{fence}diff\n{diff}\n{fence}")
-            self._add_button("Save", lambda: self._confirm(modal, lambda: self._write_file(shown)))
-            self._add_button("Cancel", modal.close)
+        # longer than what the file may have
+        fence = "`" * (3 + diff.count("`"))
+        text = f"{fence}diff\n{diff}\n{fence}"
+        self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
 
     def _ask_read(self) -> None:
         """Read the file again, after a question if changes would be lost."""
         if not self._session.is_changed:
             self._step(self._session.read)
             return
-        modal = self._gui.add_modal("Read the file again")
-        with modal:
-            self._gui.add_markdown("The changes that are not saved are dropped.")
-            self._add_button("Drop them", lambda: self._confirm(modal, lambda: self._step(self._session.read)))
-            self._add_button("Cancel", modal.close)
+        text = "The changes that are not saved are dropped."
+        self._ask("Read the file again", text, "Drop them", lambda: self._step(self._session.read))
 
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
@@ -347,23 +366,12 @@ class Editor:
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
         elif self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
-        self._refresh_quietly()
-
-    def _refresh_quietly(self) -> None:
         message = self._message.content
         self._refresh()
         self._message.content = message
 
-    @staticmethod
-    def _confirm(modal: Any, action: Callable[[], None]) -> None:
-        modal.close()
-        action()
-
-    def _ask_apply(self) -> None:
-        """Ask the service what a reload would change."""
-        self._start_reload(dry_run=True)
-
     def _start_reload(self, dry_run: bool) -> None:
+        """Ask the service what a reload would change, or reload."""
         if self._reloading is None:
             self._report("asking the service ...")
             self._reloading = dry_run, self._executor.submit(self._editing.reload, dry_run)
@@ -396,17 +404,14 @@ class Editor:
             self._report(f"the service has this geometry already, revision {reply.revision}")
         else:
             self._report("")
-            modal = self._gui.add_modal("Apply to the running service")
-            with modal:
-                self._gui.add_markdown("\n".join(f"- {escape_markdown(each)}" for each in reply.changes))
-                self._add_button("Apply", lambda: self._confirm(modal, lambda: self._start_reload(dry_run=False)))
-                self._add_button("Cancel", modal.close)
+            changes = "\n".join(f"- {escape_markdown(each)}" for each in reply.changes)
+            self._ask("Apply to the running service", changes, "Apply", lambda: self._start_reload(dry_run=False))
 
     def close(self) -> None:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
-def _describe(problem: Problem) -> str:
+def _describe_problem(problem: Problem) -> str:
     fix = f"; {problem.fix}" if problem.fix else ""
     place = f" ({problem.element})" if problem.element else ""
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
@@ -418,3 +423,473 @@ def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
     plain = item.name.rpartition(":")[2]
     numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
     return next(name for name in numbers if item.name.removesuffix(plain) + name not in taken)
+
+
+# --- fields of an item ---------------------------------------------------------------------------------------
+
+
+def parse_typed(label: str, text: str) -> float:
+    """Return the number that was typed: with a sign, an exponent, a decimal comma. Raises EditError."""
+    plain = text.strip().translate(_MINUS)
+    if plain.count(",") == 1 and "." not in plain:
+        plain = plain.replace(",", ".")
+    try:
+        return parse_number(plain)
+    except ValueError as error:
+        raise EditError(f"{label}: {error}") from None
+
+
+def _format_field(value: float) -> str:
+    return format_number(round(value, PRECISION) + 0.0)
+
+
+class NumberFields:
+    """Fields of numbers with a label each. What is no number is marked in red, and stays."""
+
+    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float], actions: Actions):
+        self._labels = tuple(labels)
+        self._given = tuple(map(float, values))
+        self._texts: list[Any] = [
+            gui.add_text(label, _format_field(value)) for label, value in zip(labels, values, strict=True)
+        ]
+        self._problem: Any = gui.add_html("")
+        for each in self._texts:
+            actions.on_update(each, self.mark)
+
+    @property
+    def value(self) -> tuple[float, ...]:
+        """The numbers. Raises EditError for a text that is none."""
+        typed = [parse_typed(label, each.value) for label, each in zip(self._labels, self._texts, strict=True)]
+        return tuple(
+            [old if new == float(_format_field(old)) else new for old, new in zip(self._given, typed, strict=True)]
+        )
+
+    @value.setter
+    def value(self, numbers: Sequence[float]) -> None:
+        self.texts = tuple(map(_format_field, numbers))
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether a number differs from what was given. Raises EditError."""
+        return self.value != self._given
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        return tuple([str(each.value) for each in self._texts])
+
+    @texts.setter
+    def texts(self, words: Sequence[str]) -> None:
+        for each, word in zip(self._texts, words, strict=True):
+            each.value = word
+        self.mark()
+
+    def mark(self) -> None:
+        """Show why the numbers cannot be read, if so."""
+        problem = ""
+        try:
+            _ = self.value
+        except EditError as error:
+            problem = _RED.format(html.escape(str(error)))
+        self._problem.content = problem
+
+
+class Snap(StrEnum):
+    """Steps to which the gizmo rounds."""
+
+    NONE = "none"
+    FINE = "1 mm, 1 deg"
+    MEDIUM = "1 cm, 5 deg"
+    COARSE = "5 cm, 15 deg"
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Meters and degrees; without snap what a hand can place."""
+        return {Snap.NONE: (1e-4, 0.01), Snap.FINE: (1e-3, 1.0), Snap.MEDIUM: (0.01, 5.0)}.get(self, (0.05, 15.0))
+
+
+def list_frames(document: GeometryDocument) -> list[str]:
+    return [each.name for each in document.list_items() if each.kind is ItemKind.FRAME]
+
+
+def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint | None:
+    """Return the frame or constraint of a model that an item is; None for a body, and for one that is not there."""
+    if model is None or item.kind is ItemKind.BODY:
+        return None
+    if item.kind is ItemKind.CONSTRAINT:
+        return next((each for each in model.constraints if each.name == item.name), None)
+    try:
+        return model.frame(item.name)
+    except QueryError:
+        return None
+
+
+class ItemFields:
+    """A form with the fields of what is selected; its button sets all of them as one change."""
+
+    def __init__(
+        self, server: viser.ViserServer, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
+    ):
+        self._server = server
+        self._gui = gui = server.gui
+        self._session = session
+        self._change = change
+        self._actions = actions
+        self._item = item
+        self._form: Any = None
+        self._part: BodyFrame | Constraint | None = None
+        self._fields: dict[str, Any] = {}
+        self._given: dict[str, Any] = {}
+        self._exact: dict[str, tuple[float, ...]] = {}
+        self._place = gui.add_folder("Values")
+
+    # --- what is shown
+
+    def show(self, item: GeometryItem) -> None:
+        self._item = item
+        self._fields, self._given, self._exact = {}, {}, {}
+        self._part = find_part(self._session.drawn, item)
+        old = self._form
+        with self._server.atomic():
+            with self._place:
+                self._form = self._gui.add_form(None)
+            with self._form:
+                self._add_fields(item)
+            if old is not None:
+                # last: a page hides a folder that was empty for a moment, and may never show it again
+                old.remove()
+        self._form.on_submit(lambda _: self._actions.put(self.set))
+
+    def _add_fields(self, item: GeometryItem) -> None:
+        document = self._session.document
+        self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
+        template = document.find_template(item)
+        if template:
+            users = ", ".join(document.list_users(template))
+            hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
+            self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
+        if isinstance(self._part, Constraint):
+            self._add_ends(self._part)
+        if self._part is not None:
+            self._add_pose(self._part.pose, self._part.sigma)
+        if isinstance(self._part, Constraint):
+            self._add_joint(self._part.joint)
+        self._add("description", self._gui.add_text("Description", self._get_description(item)))
+        self._actions.add_button(self._gui, "Set", self.set)
+
+    def _get_description(self, item: GeometryItem) -> str:
+        if self._part is not None:
+            return self._part.description
+        bodies = {each.name: each for each in self._session.drawn.bodies}
+        return bodies[item.name].description if item.name in bodies else ""
+
+    def _add(self, key: str, field: Any) -> None:
+        self._fields[key], self._given[key] = field, field.value
+
+    def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
+        self._fields[key] = NumberFields(self._gui, labels, values, self._actions)
+
+    def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
+        degrees = [math.degrees(each) for each in pose.rpy]
+        self._add_vector("xyz", ("x (m)", "y (m)", "z (m)"), pose.xyz)
+        self._add_vector("rpy", ("roll (deg)", "pitch (deg)", "yaw (deg)"), degrees)
+        self._add(
+            "has_sigma", self._gui.add_checkbox("Sigma", sigma is not None, hint="Standard deviations are stated")
+        )
+        known = sigma or Sigma()
+        turns = np.degrees(known.rotation).tolist()
+        self._add_vector("sigma_xyz", [f"sigma {axis} (m)" for axis in "xyz"], known.position)
+        self._add_vector("sigma_rpy", [f"sigma {axis} (deg)" for axis in ("roll", "pitch", "yaw")], turns)
+
+    def _add_ends(self, constraint: Constraint) -> None:
+        frames = tuple(list_frames(self._session.document))
+        for key, frame in (("from", constraint.from_), ("to", constraint.to)):
+            self._add(key, self._gui.add_dropdown(key, frames, initial_value=frame if frame in frames else frames[0]))
+
+    def _add_joint(self, joint: Joint) -> None:
+        gui = self._gui
+        self._add("joint", gui.add_dropdown("Joint", tuple(JointType), initial_value=joint.type))
+        if not joint.is_movable:
+            return
+        if joint.type in TYPES_WITH_AXIS:
+            self._add_vector("axis", [f"axis {axis}" for axis in "xyz"], joint.axis)
+        if joint.count > 1:
+            gui.add_markdown("Limits and more of a joint with several coordinates: under *As text*.")
+            return
+        unit = "deg" if joint.type is JointType.REVOLUTE else "m"
+        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        limits: tuple[float, ...] = ()
+        if joint.lower or joint.upper:
+            limits = (joint.lower or (-math.inf,)) + (joint.upper or (math.inf,))
+        for key, label, values in (
+            ("limits", f"limits ({unit})", limits),
+            ("rate_limit", f"rate limit ({unit}/s)", joint.rate_limit),
+            ("default", f"default ({unit})", joint.default),
+            ("sigma", f"joint sigma ({unit})", joint.sigma),
+        ):
+            self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
+            self._exact[key] = values
+        others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
+        leaders = (NO_CHOICE, *(each for each in others if each != self._item.name))
+        mimic = joint.mimic
+        leader = mimic.joint if mimic is not None and mimic.joint in leaders else NO_CHOICE
+        self._add("leader", gui.add_dropdown("follows", leaders, initial_value=leader))
+        known = mimic or Mimic("")
+        self._add("multiplier", gui.add_text("multiplier", format_number(known.multiplier)))
+        self._add("offset", gui.add_text(f"offset ({unit})", _format_values([known.offset], scale)))
+        self._exact |= {"multiplier": (known.multiplier,), "offset": (known.offset,)}
+
+    @property
+    def in_template(self) -> bool:
+        """Whether all bodies of the template are to change."""
+        return "template" in self._fields and bool(self._fields["template"].value)
+
+    # --- what is set
+
+    def commit(self) -> bool:
+        """Set what was typed, if anything was; return whether nothing is left that cannot be set."""
+        return not self._is_typed() or self.set()
+
+    def _is_typed(self) -> bool:
+        try:
+            return any(self._differs(key) for key in self._fields if key != "template")
+        except EditError:
+            return True
+
+    def set(self) -> bool:
+        """Set what was changed in the fields; return whether that could be done."""
+        item = self._item
+        plain = item.name.rpartition(":")[2]
+        name = self._fields["name"].value.strip()
+        new = GeometryItem(item.kind, item.name.removesuffix(plain) + name) if name != plain else None
+        return self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
+
+    def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
+        in_template = self.in_template
+        if self._is_changed("xyz", "rpy"):
+            xyz, rpy = (so3.to_vector3(self._fields[key].value) for key in ("xyz", "rpy"))
+            document = document.set_pose(item, xyz, rpy, in_template)
+        if self._is_changed("has_sigma", "sigma_xyz", "sigma_rpy"):
+            # numbers that are typed are meant, whatever the checkbox has
+            is_stated = self._fields["has_sigma"].value or self._is_changed("sigma_xyz", "sigma_rpy")
+            fields = (self._fields["sigma_xyz"], self._fields["sigma_rpy"])
+            stated = [so3.to_vector3(each.value) if is_stated else None for each in fields]
+            document = document.set_sigma(item, stated[0], stated[1], in_template)
+        if self._is_changed("description"):
+            document = document.set_description(item, self._fields["description"].value.strip(), in_template)
+        if isinstance(self._part, Constraint):
+            if self._is_changed("from", "to"):
+                document = document.set_ends(item.name, self._fields["from"].value, self._fields["to"].value)
+            joint = self._read_joint(self._part.joint)
+            if joint != self._part.joint:
+                document = document.set_joint(item.name, self._part.joint, joint)
+        return document.rename(item, name, in_template) if name else document
+
+    def _is_changed(self, *keys: str) -> bool:
+        """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
+        present = [key for key in keys if key in self._fields]
+        # the fields show the model that is drawn, not what the text has
+        is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
+        return any(is_wrong or self._differs(key) for key in present)
+
+    def _differs(self, key: str) -> bool:
+        field = self._fields[key]
+        return field.is_changed if isinstance(field, NumberFields) else bool(field.value != self._given[key])
+
+    def _read_joint(self, old: Joint) -> Joint:
+        keys = ("joint", "axis", "limits", "rate_limit", "default", "sigma", "leader", "multiplier", "offset")
+        if not any(key in self._fields and self._differs(key) for key in keys):
+            return old
+        kind = JointType(self._fields["joint"].value)
+        axis = so3.to_vector3(self._fields["axis"].value) if "axis" in self._fields else (0.0, 0.0, 1.0)
+        try:
+            if kind is JointType.FIXED:
+                return Joint()
+            if kind is not old.type:
+                # its numbers had other units
+                return Joint(kind, axis)
+            if "limits" not in self._fields:
+                return replace(old, axis=axis)
+            is_angle = kind is JointType.REVOLUTE
+            limits = self._read_values("limits", 2, is_angle)
+            if limits and limits[0] > limits[1]:
+                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
+            mimic = None
+            if self._fields["leader"].value != NO_CHOICE:
+                (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)
+                (offset,) = self._read_values("offset", 1, is_angle) or (0.0,)
+                mimic = Mimic(self._fields["leader"].value, multiplier, offset)
+            return Joint(
+                kind,
+                axis,
+                limits[:1],
+                limits[1:],
+                self._read_values("rate_limit", 1, is_angle),
+                self._read_values("default", 1, is_angle) if mimic is None else (),
+                self._read_values("sigma", 1, is_angle),
+                mimic,
+            )
+        except ValueError as error:
+            raise EditError(str(error)) from None
+
+    def _read_values(self, key: str, count: int, is_angle: bool) -> tuple[float, ...]:
+        """Return the numbers in a text, none for an empty one, radians and meters."""
+        if not self._differs(key):
+            return self._exact[key]
+        text = self._fields[key].value.strip()
+        if not text:
+            return ()
+        label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
+        if len(parts) != count:
+            what = "two numbers, lower and upper" if count == 2 else "one number"
+            raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
+        numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
+        return tuple([math.radians(each) if is_angle else each for each in numbers])
+
+    # --- gizmo
+
+    def find_place(self) -> tuple[str, Pose, Pose] | None:
+        """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
+        model, part = self._session.drawn, self._part
+        if part is None:
+            return None
+        if isinstance(part, BodyFrame):
+            return names.split(self._item.name)[0], Pose.identity(), part.pose
+        return names.split(part.from_)[0], model.frame(part.from_).pose, part.pose
+
+    def set_dragged(self, pose: Pose, snap: Snap, is_end: bool) -> None:
+        """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
+        if self._part is None:
+            return
+        meters, degrees = snap.steps
+        moved, turned = self._part.pose.distance(pose)
+        if moved > SAME:
+            self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])
+        if turned > SAME:
+            rpy = [math.degrees(each) for each in so3.to_rpy(pose.wxyz)]
+            self._fields["rpy"].value = tuple([round(round(each / degrees) * degrees, PRECISION) for each in rpy])
+        if is_end:
+            self.set()
+
+
+def _format_values(values: Sequence[float], scale: float) -> str:
+    """Return numbers as a text, angles in degrees."""
+    known = {math.inf: ".inf", -math.inf: "-.inf"}
+    return ", ".join(known.get(each) or format_number(round(each * scale, 9) + 0.0) for each in values)
+
+
+# --- placing -------------------------------------------------------------------------------------------------
+
+
+class PlacePanel:
+    """Two folders: frames that coincide, and distances."""
+
+    def __init__(
+        self, gui: viser.GuiApi, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
+    ):
+        self._session = session
+        self._change = change
+        self._item = item
+        with gui.add_folder("Frames that coincide"):
+            self._hint = gui.add_markdown("")
+            self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
+            self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
+            self._position_only: Any = gui.add_checkbox("Position only", False)
+            actions.add_button(gui, "Place there", lambda: self._place(self._coincide))
+        with gui.add_folder("Distances from frames"):
+            self._rows: list[tuple[Any, NumberFields]] = []
+            for number in range(1, MAX_DISTANCES + 1):
+                frame = gui.add_dropdown(f"From {number}", (NO_CHOICE,))
+                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
+            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
+            self._mirrored: Any = gui.add_checkbox("On the other side", False, hint="Three distances fit two positions")
+            actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
+            self._result = gui.add_markdown("")
+
+    def show(self, item: GeometryItem) -> None:
+        """Offer the frames for an item."""
+        if item != self._item:
+            self._result.content = ""
+        self._item = item
+        frames = (NO_CHOICE, *list_frames(self._session.document))
+        is_constraint = item.kind is ItemKind.CONSTRAINT
+        self._frame.visible = is_constraint
+        self._hint.content = {
+            ItemKind.CONSTRAINT: "Moves the constraint so that two frames, one on each side, are the same place.",
+            ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
+        }.get(item.kind, "Select a frame or a constraint.")
+        for dropdown in (self._frame, self._target, *(frame for frame, _ in self._rows)):
+            # a frame that is not among them gives way to the first
+            dropdown.options = frames
+
+    def _place(self, compute: Callable[[Model, GeometryItem], tuple[Placement, Pose]]) -> None:
+        """Place the item where a function of the model computes it; that returns its old pose too."""
+        item = self._item
+
+        def change(document: GeometryDocument) -> GeometryDocument:
+            model = self._session.model
+            if model is None or self._session.has_errors:
+                raise EditError("fix the errors first; a pose is computed from a geometry without any")
+            return _write_placement(document, item, *compute(model, item))
+
+        self._change(change, None)
+
+    def _coincide(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
+        target, position_only = self._target.value, self._position_only.value
+        if target == NO_CHOICE:
+            raise EditError("choose the frame with which it coincides")
+        part = find_part(model, item)
+        if part is None:
+            raise EditError("select a frame or a constraint")
+        if item.kind is ItemKind.FRAME:
+            return place_frame(model, item.name, target, position_only), part.pose
+        if self._frame.value == NO_CHOICE:
+            raise EditError("choose the two frames that coincide")
+        return place_constraint(model, item.name, self._frame.value, target, position_only), part.pose
+
+    def _measure(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
+        """Place a frame by its distances from others."""
+        if item.kind is not ItemKind.FRAME:
+            raise EditError("select the frame to which the distances were measured")
+        given = [(frame.value, distance.value[0]) for frame, distance in self._rows if frame.value != NO_CHOICE]
+        points, P = list_measured_points(model, item.name, [name for name, _ in given])
+        distances = np.array([distance for _, distance in given], float)
+        (sigma_m,) = self._sigma.value
+        sigmas = np.full(len(given), sigma_m)
+        frame = model.frame(item.name)
+        fit = locate_by_distances(points, distances, sigmas, frame.pose.xyz, P)
+        if self._mirrored.value:
+            if fit.mirrored is None:
+                raise EditError("the distances fit on one side only")
+            fit = locate_by_distances(points, distances, sigmas, fit.mirrored, P)
+        self._result.content = _describe_fit(fit, [name for name, _ in given], sigma_m)
+        rotation = (frame.sigma or Sigma()).rotation
+        sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), rotation)
+        return Placement(Pose(fit.position, frame.pose.wxyz), sigma), frame.pose
+
+
+def _write_placement(document: GeometryDocument, item: GeometryItem, found: Placement, old: Pose) -> GeometryDocument:
+    """Write a placement; a rotation that is the old one stays as it is written."""
+    degrees = np.degrees(found.pose.rpy)
+    is_turned = old.distance(found.pose)[1] > SAME_RADIANS
+    placed = document.set_pose(item, _round(found.pose.xyz), _round(degrees) if is_turned else so3.to_vector3(degrees))
+    if found.sigma is None:
+        return placed
+    return placed.set_sigma(item, _round(found.sigma.position), _round(np.degrees(found.sigma.rotation)))
+
+
+def _round(values: Any) -> Vector3:
+    return so3.to_vector3(round(float(each), PRECISION) + 0.0 for each in values)
+
+
+def _describe_fit(fit: DistanceFit, frames: list[str], sigma: float) -> str:
+    deviations = np.sqrt(np.diag(fit.covariance)).tolist()
+    rows = [
+        (frame, f"{1000.0 * residual:+.1f} mm", "too large" if abs(residual) > 3.0 * sigma else "")
+        for frame, residual in zip(frames, fit.residuals.tolist(), strict=True)
+    ]
+    parts = [format_table(("from", "residual", ""), rows)]
+    parts.append("Sigma x, y, z: " + ", ".join(f"{1000.0 * each:.1f} mm" for each in deviations))
+    if fit.mirrored is not None:
+        place = ", ".join(f"{each:.4f}" for each in fit.mirrored)
+        parts.append(escape_markdown(f"They fit at {place} m too, on the other side of the plane of the frames."))
+    return "\n\n".join(parts)

@@ -17,10 +17,12 @@ from __future__ import annotations
 import hmac
 import http
 import ipaddress
+import queue
+import re
 import secrets
 import socket
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
@@ -69,20 +71,13 @@ class Guard:
         return ""
 
     def _has_token(self, request: Request) -> bool:
+        cookies = SimpleCookie()
+        with suppress(CookieError):
+            cookies.load(request.headers.get("Cookie", ""))
+        cookie = cookies[self.cookie].value if self.cookie in cookies else ""
         # the link's counts too where a cookie is there: it may be of a viewer that was served here before
-        given = (self._get_cookie_token(request), self._get_query_token(request))
+        given = (cookie, parse_qs(urlsplit(request.path).query).get("token", [""])[0])
         return any(hmac.compare_digest(each.encode(), self.token.encode()) for each in given)
-
-    def _get_cookie_token(self, request: Request) -> str:
-        try:
-            cookie = SimpleCookie(request.headers.get("Cookie", "")).get(self.cookie)
-        except CookieError:
-            return ""
-        return "" if cookie is None else cookie.value
-
-    @staticmethod
-    def _get_query_token(request: Request) -> str:
-        return parse_qs(urlsplit(request.path).query).get("token", [""])[0]
 
     def process(
         self, inner: Callable[..., Response | None] | None, connection: ServerConnection, request: Request
@@ -99,6 +94,35 @@ class Guard:
                 attributes = "HttpOnly; SameSite=Strict; Path=/"
                 response.headers["Set-Cookie"] = f"{self.cookie}={self.token}; {attributes}"
         return response
+
+
+class Actions(queue.SimpleQueue[Callable[[], object]]):
+    """Actions of the page's widgets, whose callbacks run in threads of their own: executed between two pictures."""
+
+    def on_update(self, field: Any, action: Callable[[], object]) -> None:
+        """Queue an action where a person changes a field; values that this program sets have no client."""
+        field.on_update(lambda event: self.put(action) if event.client_id is not None else None)
+
+    def add_button(self, gui: viser.GuiApi, label: str, action: Callable[[], object]) -> viser.GuiButtonHandle:
+        """Add a button that queues an action."""
+        button = gui.add_button(label)
+        button.on_click(lambda _: self.put(action))
+        return button
+
+
+# --- content of the page
+
+_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|$~])")
+
+
+def escape_markdown(text: str) -> str:
+    return _SPECIAL.sub(r"\\\1", text.replace("\n", " "))
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown; the cells are texts."""
+    lines = [header, ["---"] * len(header), *[[escape_markdown(cell) for cell in row] for row in rows]]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 class PageServer(viser.ViserServer):

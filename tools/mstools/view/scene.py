@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +32,7 @@ from modelserver.geometry.parts import Body
 from modelserver.geometry.shape import Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.view.drive import FIX_COLORS, FixColor, Picture
-from mstools.view.frames import FramePoses
+from mstools.recordings.drive import FIX_COLORS, FixColor, FramePoses, Picture
 
 MAX_MESH_BYTES: Final = 50_000_000
 MAX_TRAIL_POINTS: Final = 4_000
@@ -85,14 +84,6 @@ class NameLabels(StrEnum):
     FRAMES = "frames"
 
 
-class ConstraintLine(NamedTuple):
-    """A constraint as a line between two points, each in the coordinates of its body."""
-
-    bodies: tuple[str, str]
-    points: tuple[Vector3, Vector3]
-    is_movable: bool
-
-
 class VehicleScene:
     """Draw one model and its pictures.
 
@@ -109,16 +100,12 @@ class VehicleScene:
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._frames: FramePoses | None = None
         self._poses: dict[str, Pose] = {}
-        self._segments: list[ConstraintLine] = []
         self._labels: list[tuple[NameLabels, str, viser.LabelHandle]] = []
-        self._model: Model | None = None
-        self._positions: Mapping[str, float] = {}
         self._path: tuple[str, ...] = ()
-        self._drawn: dict[str, object] = {}
+        self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
         self.unread: list[str] = []
         """Mesh files that could not be read, with the reason."""
-        self.follow = True
         self.is_edited = False
         """Whether it has a gizmo: bodies are not clicked then, frames are."""
         # without reflections and shadows, which show nothing of a geometry: where no graphics card draws them, the
@@ -174,18 +161,13 @@ class VehicleScene:
 
     # --- geometry
 
-    @property
-    def model(self) -> Model | None:
-        return self._model
-
-    def set_model(self, model: Model, base_frame: str, labels: NameLabels) -> float:
+    def set_model(self, model: Model, base_frame: str) -> float:
         """Draw another model, and return its size in meters; `base_frame` is the frame whose pose is published."""
         for each in self._bodies.values():
             each.remove()
         # went with its body
         self._gizmo = None
-        self._bodies, self._poses, self._labels, self._segments, self.unread = {}, {}, [], [], []
-        self._model, self._positions = model, {}
+        self._bodies, self._poses, self._labels, self.unread = {}, {}, [], []
         self._frames = FramePoses(model, base_frame)
         size = self._size = _measure_model(model)
         orphans = 0
@@ -198,16 +180,11 @@ class VehicleScene:
                 orphans += 1
                 self._poses[body.name] = Pose((0.0, -size - orphans * 0.5, 0.0))
                 node.position = self._poses[body.name].xyz
-            self._draw_body(root, body, size, labels)
-        for constraint in model.constraints:
-            ends = [names.split(each) for each in (constraint.from_, constraint.to)]
-            points = [model.frame(each).pose.xyz for each in (constraint.from_, constraint.to)]
-            bodies = (ends[0][0], ends[1][0])
-            self._segments.append(ConstraintLine(bodies, (points[0], points[1]), constraint.joint.is_movable))
-        self._place_bodies(self._frames.compute_bodies({}))
+            self._draw_body(root, body, size)
+        self._place_bodies(self._frames, self._frames.compute_bodies())
         return size
 
-    def _draw_body(self, root: str, body: Body, size: float, labels: NameLabels) -> None:
+    def _draw_body(self, root: str, body: Body, size: float) -> None:
         for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
             nodes = [self._draw_shape(f"{root}/{kind}/{number}", shape, kind) for number, shape in enumerate(shapes)]
             drawn = [node for node in nodes if node is not None]
@@ -217,7 +194,7 @@ class VehicleScene:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
             if drawn:
                 break
-        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0), labels)
+        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0))
         if not body.frames:
             return
         axes = self._scene.add_batched_axes(
@@ -229,11 +206,11 @@ class VehicleScene:
         )
         self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
         for number, frame in enumerate(body.frames):
-            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz, labels)
+            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz)
 
-    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3, shown: NameLabels) -> None:
+    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3) -> None:
         label = self._scene.add_label(
-            node, text, position=place, visible=kind == shown, font_screen_scale=0.8, anchor="bottom-center"
+            node, text, position=place, visible=False, font_screen_scale=0.8, anchor="bottom-center"
         )
         self._labels.append((kind, text, label))
 
@@ -247,14 +224,9 @@ class VehicleScene:
         if shape.material is not None and shape.material.color is not None:
             red, green, blue, opacity = shape.material.color
             color = (round(255 * red), round(255 * green), round(255 * blue))
-        scene, place = self._scene, shape.pose
-        transparency = opacity if opacity < 1.0 else None
-        look: dict[str, Any] = {
-            "color": color,
-            "opacity": transparency,
-            "wxyz": place.wxyz,
-            "position": place.xyz,
-        }
+        scene = self._scene
+        look: dict[str, Any] = {"color": color, "opacity": opacity if opacity < 1.0 else None}
+        look |= {"wxyz": shape.pose.wxyz, "position": shape.pose.xyz}
         if shape.kind is ShapeKind.BOX:
             return scene.add_box(name, dimensions=np.array(shape.size), **look)
         if shape.kind is ShapeKind.CYLINDER:
@@ -278,53 +250,37 @@ class VehicleScene:
 
     # --- pictures
 
-    def show(self, picture: Picture) -> None:
-        """Move the vehicle and its joints to those of a picture."""
-        self._move_joints(picture.joints)
+    def show(self, picture: Picture, follow: bool = True) -> None:
+        """Move the vehicle and its joints to those of a picture; the vehicle stays at the origin where `follow`."""
+        if self._frames is not None and (moved := self._frames.move_joints(picture.joints)):
+            self._place_bodies(self._frames, moved)
         pose = picture.pose or Pose.identity()
-        if self._is_changed("pose", (pose, self.follow)):
-            self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
-            x, y, z = pose.xyz if self.follow else (0.0, 0.0, 0.0)
-            self._world.position = (-x, -y, -z)
+        self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
+        x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
+        self._world.position = (-x, -y, -z)
 
-    def _is_changed(self, what: str, value: object) -> bool:
-        """Return whether a value differs from the last one of that name, and store it."""
-        if what in self._drawn and self._drawn[what] == value:
-            return False
-        self._drawn[what] = value
-        return True
-
-    def _move_joints(self, positions: Mapping[str, float]) -> None:
-        if self._frames is None or positions == self._positions:
-            return
-        moved = {name for name, value in positions.items() if self._positions.get(name) != value}
-        moved |= self._positions.keys() - positions.keys()
-        self._positions = dict(positions)
-        poses = self._frames.compute_bodies(positions, moved)
-        if poses:
-            self._place_bodies(poses)
-
-    def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
+    def _place_bodies(self, frames: FramePoses, poses: Mapping[str, Pose]) -> None:
         """Move bodies to their poses in the base frame, and redraw what depends on them."""
         for name, pose in poses.items():
             node = self._bodies[name]
             node.position, node.wxyz = pose.xyz, pose.wxyz
         self._poses.update(poses)
-        for is_movable, lines in enumerate(self._edges):
-            points = [
-                [self._poses[body].transform(point) for body, point in zip(each.bodies, each.points, strict=True)]
-                for each in self._segments
-                if each.is_movable == bool(is_movable)
-            ]
+
+        def locate(frame: str) -> Array:
+            return self._poses[names.split(frame)[0]].transform(frames.model.frame(frame).pose.xyz)
+
+        for is_movable, lines in zip((False, True), self._edges, strict=True):
+            chosen = [each for each in frames.model.constraints if each.joint.is_movable == is_movable]
+            points = [(locate(each.from_), locate(each.to)) for each in chosen]
             lines.points = np.array(points, np.float32).reshape(-1, 2, 3)
         self._draw_path()
 
     def get_frame_pose(self, frame: str) -> Pose | None:
         """Return the pose of a frame in the base frame as drawn; None for an unknown or world frame."""
         body, _, name = frame.partition(":")
-        if body not in self._poses or self._model is None or not self._model.body(body).has_frame(name):
+        if body not in self._poses or self._frames is None or not self._frames.model.body(body).has_frame(name):
             return None
-        return self._poses[body] @ self._model.frame(frame).pose
+        return self._poses[body] @ self._frames.model.frame(frame).pose
 
     def highlight_path(self, frames: Sequence[str]) -> None:
         """Highlight the path through some frames, none to remove it."""
@@ -334,8 +290,7 @@ class VehicleScene:
     def _draw_path(self) -> None:
         points = [pose.xyz for frame in self._path if (pose := self.get_frame_pose(frame)) is not None]
         lines = [pair for pair in pairwise(points) if pair[0] != pair[1]]
-        if self._is_changed("path", lines):
-            self._path_lines.points = np.array(lines, np.float32).reshape(-1, 2, 3)
+        self._path_lines.points = np.array(lines, np.float32).reshape(-1, 2, 3)
 
     def show_gizmo(self, body: str, parent: Pose, pose: Pose, move: Callable[[Pose, bool], None]) -> None:
         """Show a gizmo at a pose in the frame `parent` of a body.
@@ -397,58 +352,40 @@ class VehicleScene:
 
     def show_fixes(self, points: Array, colors: npt.NDArray[np.int64]) -> None:
         """Draw fixes at points (n, 3) in World:UTM, by their index into `FIX_COLORS` (n,)."""
-        key = (len(points), tuple(points[-1]), tuple(colors[-20:])) if len(points) else ()
-        if self._is_changed("fixes", key) and len(points):
-            self._fixes.visible = True
+        self._fixes.visible = bool(len(points))
+        if len(points):
             self._fixes.points = points[-MAX_FIXES:].astype(np.float32)
             self._fixes.colors = _PALETTE[colors[-MAX_FIXES:]].reshape(-1, 3)
 
     def show_uncertainty(self, picture: Picture, confidence: int, is_shown: bool) -> None:
         """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
-        key = (picture, confidence, is_shown)
-        if self._drawn.get("uncertainty") == key[1:] and self._drawn.get("uncertain picture") is picture:
-            return
-        self._drawn["uncertainty"], self._drawn["uncertain picture"] = key[1:], picture
-        color = INVALID_COLOR if picture.invalid else VALID_COLOR
-        has_ellipsoid = is_shown and picture.covariance is not None and picture.pose is not None
-        self._ellipsoid.visible = has_ellipsoid
-        if has_ellipsoid:
-            assert picture.pose is not None
-            assert picture.covariance is not None
-            radii, pose = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
-            self._ellipsoid.position, self._ellipsoid.wxyz = picture.pose.xyz, pose.wxyz
-            self._ellipsoid.scale = radii
-            self._ellipsoid.color = color
-        self._show_levels(picture, color, is_shown)
-
-    def _show_levels(self, picture: Picture, color: Rgb, is_shown: bool) -> None:
-        """Draw the horizontal protection level, a circle, and that of the heading, a wedge."""
+        pose, color = picture.pose, INVALID_COLOR if picture.invalid else VALID_COLOR
         radius, heading = picture.horizontal_protection_level, picture.heading_protection_level
-        self._level.visible = is_shown and picture.pose is not None and math.isfinite(radius)
-        if not self._level.visible or picture.pose is None:
+        self._ellipsoid.visible = is_shown and picture.covariance is not None and pose is not None
+        self._level.visible = is_shown and pose is not None and math.isfinite(radius)
+        if pose is None or not is_shown:
             return
-        self._level.position = picture.pose.xyz
-        is_known = math.isfinite(heading)
-        if self._is_changed("levels", (round(radius, 2), is_known, color)):
-            self._circle.scale = radius
+        if picture.covariance is not None:
+            self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
+            self._ellipsoid.position, self._ellipsoid.wxyz, self._ellipsoid.color = pose.xyz, axes.wxyz, color
+        if self._level.visible:
+            self._level.position, self._circle.scale = pose.xyz, round(radius, 2)
             for lines in (self._circle, *self._wedge):
                 lines.colors = np.array(color, np.uint8)
-            for side in self._wedge:
-                side.visible = is_known
-                side.scale = max(radius, MIN_WEDGE)
-        for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
-            if is_known:
-                yaw = float(picture.pose.rpy[2]) + sign * min(heading, math.pi)
-                side.wxyz = Pose.from_rpy((0.0, 0.0, 0.0), yaw=yaw).wxyz
+            for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
+                side.visible, side.scale = math.isfinite(heading), round(max(radius, MIN_WEDGE), 2)
+                if side.visible:
+                    yaw = float(pose.rpy[2]) + sign * min(heading, math.pi)
+                    side.wxyz = Pose.from_rpy((0.0, 0.0, 0.0), yaw=yaw).wxyz
 
     def label_grid(self, picture: Picture, origin: Origin | None) -> None:
         """Label the grid around the vehicle with UTM coordinates, latitude and longitude."""
         if picture.pose is None or origin is None:
             return
         east, north = (round(each / LABEL_SPACING) for each in picture.pose.xyz[:2])
-        if not self._is_changed("labels", (east, north, origin)):
+        if self._labeled == (east, north, origin):
             return
-        geodesy = geodesy_of(origin)
+        self._labeled, geodesy = (east, north, origin), geodesy_of(origin)
         for i in range(-GRID_LABELS, GRID_LABELS + 1):
             for k in range(-GRID_LABELS, GRID_LABELS + 1):
                 x, y = (east + i) * LABEL_SPACING, (north + k) * LABEL_SPACING

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -15,7 +13,6 @@ from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
 from modelserver.formats.snapshot import ModelSnapshot
-from modelserver.geometry import names
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
@@ -23,11 +20,10 @@ from modelserver.server.stamp_axis import LOOKED_AT, measure
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.listener import iter_batches
-from mstools.commands.pose_source import load_given_model
 from mstools.edit.session import EditedFile, EditSession
+from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
-from mstools.view.drive import Drive
+from mstools.terminal.output import load_given_model
 
 FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""
@@ -52,16 +48,12 @@ class Source:
     set_model: Callable[[Model], None] | None = None
     notes: tuple[str, ...] = ()
     lock: threading.Lock = field(default_factory=threading.Lock)
-    _resources: ExitStack = field(default_factory=ExitStack)
+    close: Callable[[], None] = lambda: None
 
     @property
     def has_time(self) -> bool:
         """Whether it changes with time: a log or a running service."""
         return not isinstance(self.answers, FilePlatform)
-
-    def close(self) -> None:
-        """End the threads and leave the bus."""
-        self._resources.close()
 
 
 # --- geometry file
@@ -142,21 +134,15 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
 
     `show_progress` is called with the part that is read, 0 to 1. Raises RecordingError, GeometryError, OSError.
     """
-    given = None
-    drive = Drive(prefix)
-    if model is not None:
-        loaded = load_given_model(model, {})
-        base = names.join(loaded.root.name, loaded.root.frames[0].name)
-        given = ModelSnapshot("", loaded, base, base, HISTORY_S, f"{prefix}JOINTS")
-        drive = Drive(prefix, loaded, base, keep_geometry=True)
+    given = None if model is None else load_given_model(model, {})
+    drive = Drive(prefix, given, keep_geometry=given is not None)
     with LogFile(path) as log:
         contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
         notes = [*map(str, log.damage)]
         # reads the log from its beginning, and forgets the damage
         notes += measure(islice(log, LOOKED_AT)).describe()
     answers = LogPlatform(path, prefix, given, contents)
-    if not drive.base_frame:
-        drive.base_frame = answers.base_frame
+    drive.base_frame = drive.base_frame or answers.base_frame
     folder = model.resolve().parent if model is not None else None
     return Source(path.name, drive, answers, folder, notes=tuple(notes))
 
@@ -174,23 +160,19 @@ def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], No
 
 
 def open_live(url: str, prefix: str, timeout: float) -> Source:
-    """Follow the running service."""
     drive = Drive(prefix)
     answers = Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="view")
     source = Source("live", drive, answers, is_live=True)
     stop = threading.Event()
-    listener = threading.Thread(target=_listen, args=(source, resolve_url(url), stop), name="view", daemon=True)
+    bus = open_lcm(resolve_url(url))
+    arguments = (bus, prefix, drive.feed, stop.is_set, source.lock)
+    listener = threading.Thread(target=follow_bus, args=arguments, name="view", daemon=True)
     listener.start()
-    source._resources.callback(answers.close)
-    source._resources.callback(listener.join, 2.0)
-    source._resources.callback(stop.set)
+
+    def close() -> None:
+        stop.set()
+        listener.join(2.0)
+        answers.close()
+
+    source.close = close
     return source
-
-
-def _listen(source: Source, url: str, stop: threading.Event) -> None:
-    """Feed the messages of the bus to a drive until the event is set."""
-    for batch in iter_batches(open_lcm(url), source.drive.prefix, stop.is_set):
-        now = time.time_ns() // 1000
-        with source.lock:
-            for channel, data in batch:
-                source.drive.feed(channel, data, now)

@@ -1,21 +1,27 @@
-"""Conversion of ROS messages to samples of this project, independent of bags. Pure.
+"""Recordings of other formats: ROS bags (library rosbags) as samples, and MCAP files of `modelserver export`.
 
-Messages are read by their fields, as any ROS library presents them; ROS 1 and 2 are alike in all fields used. What a
-message leaves open (height reference, orientation reference, track width) is a `BagOptions`.
+A file has one clear error for all that can be wrong with it. ROS messages are read by their fields, as any ROS library
+presents them; ROS 1 and 2 are alike in all fields used. What a message leaves open (height reference, orientation
+reference, track width) is a `BagOptions`. The LCM messages in an MCAP file (/lcm/CHANNEL) are read as they are: the
+reverse of the export.
 """
 
 from __future__ import annotations
 
+import errno
+import itertools
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import chain, repeat
-from typing import Any
+from pathlib import Path
+from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 
+from modelserver.errors import RecordingError
 from modelserver.messages import (
     NAN,
     Direction,
@@ -34,8 +40,191 @@ from modelserver.messages import (
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Matrix3, Quaternion
 
+BAG_REMEDY: Final = "`rosbag reindex` repairs such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
+M = TypeVar("M")
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+ENCODING: Final = "lcm"
+ROS_ENCODING: Final = "cdr"
+TOPIC_PREFIX: Final = "/lcm/"
+MCAP_REMEDY: Final = "`mcap recover` repairs such files"
+
 STATIONARY_SPEED = 1e-3
 """Speed in m/s below which a wheel is stationary: averaging controllers leave residues of 1e-15."""
+
+
+# --- bags ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a bag: its name, its type in ROS 2 notation (sensor_msgs/msg/Imu), number of messages."""
+
+    name: str
+    type_name: str
+    count: int
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, path: Path, reader: Any):
+        self._path = path
+        self._reader = reader
+        counts: Counter[tuple[str, str]] = Counter()
+        for each in reader.connections:
+            counts[each.topic, each.msgtype] += each.msgcount
+        self.topics = tuple(Topic(*names, count) for names, count in sorted(counts.items()))
+
+    def messages(self, topics: set[str]) -> Iterator[tuple[str, int, Any]]:
+        """Yield topic, receive time (ns) and message of some topics in the order received. Raises RecordingError."""
+        connections = [each for each in self._reader.connections if each.topic in topics]
+        if not connections:
+            return
+        yield from explain_each(
+            (
+                (connection.topic, received_ns, self._reader.deserialize(raw, connection.msgtype))
+                for connection, received_ns, raw in self._reader.messages(connections=connections)
+            ),
+            self._path,
+        )
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag: a ROS 1 file, or the file or folder of a ROS 2 recording. Raises RecordingError, OSError."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise RecordingError(
+            f"reading bags needs the library rosbags ({error}): pip install 'modelserver[bags]'"
+        ) from None
+    if path.is_file():
+        with path.open("rb") as file:
+            if path.suffix == ".bag" and not file.read(9).startswith(b"#ROSBAG V"):
+                raise RecordingError(f"{path}: not a ROS bag: it does not begin with #ROSBAG")
+    elif not path.is_dir():
+        # reading a FIFO or a device would block
+        raise RecordingError(f"{path}: {'neither a file nor a folder' if path.exists() else 'no such file'}")
+    reader = None
+    with explain_errors(path, "on opening it"):
+        # ROS 2 bags may lack their type definitions; those of ROS itself have been stable
+        reader = AnyReader(_list_files(path), default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def _list_files(path: Path) -> list[Path]:
+    """Return what to read of a bag: itself, or the files of a folder that has lost its metadata.yaml."""
+    if path.is_file() or (path / "metadata.yaml").exists():
+        return [path]
+    for suffix in (".mcap", ".db3"):
+        if found := sorted(each for each in path.iterdir() if each.suffix == suffix and each.is_file()):
+            return found
+    raise RecordingError(f"{path}: no bag: there is no metadata.yaml, no .mcap and no .db3 file in it")
+
+
+def explain_each(messages: Iterable[M], path: Path, kind: str = "bag", remedy: str = BAG_REMEDY) -> Iterator[M]:
+    """Yield what a library reads from a file, with `explain_errors`."""
+    stream = iter(messages)
+    for count in itertools.count():
+        with explain_errors(path, f"after {count} messages", kind, remedy):
+            found = next(stream, None)
+        if found is None:
+            return
+        yield found
+
+
+@contextmanager
+def explain_errors(path: Path, place: str, kind: str = "bag", remedy: str = BAG_REMEDY) -> Iterator[None]:
+    """Convert any exception of a library on a damaged file to one readable error; OSError of the disk stays."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except MemoryError:
+        what = "it states a length that exceeds the memory"
+    except Exception as error:  # the libraries document no exceptions for damaged files
+        # EINVAL: a seek to before the begin of a file that is too short
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            raise
+        what = str(error).strip() or type(error).__name__
+    else:
+        return
+    raise RecordingError(
+        f"{path}: the {kind} cannot be read {place}: {what.rstrip('.')}. It may be cut short or never have been "
+        f"closed; {remedy}"
+    )
+
+
+# --- MCAP files ---------------------------------------------------------------------------------------------
+
+
+class McapLog:
+    """An MCAP file: `channels` has the LCM channels with their types and counts of messages.
+
+    has_ros: whether it has messages of ROS 2.
+    """
+
+    def __init__(self, path: Path, file: IO[bytes]):
+        from mcap.reader import make_reader
+
+        self._path = path
+        with explain_errors(path, "on opening it", "MCAP file", MCAP_REMEDY):
+            self._reader = make_reader(file)
+            summary = self._reader.get_summary()
+        if summary is None:
+            raise RecordingError(f"{path}: the MCAP file has no summary: it was not closed; `mcap recover` repairs it")
+        counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
+        self.has_ros = any(each.message_encoding == ROS_ENCODING for each in summary.channels.values())
+        self.channels: dict[str, tuple[str, int]] = {}
+        for number, each in summary.channels.items():
+            if each.message_encoding == ENCODING and each.topic.startswith(TOPIC_PREFIX):
+                schema = summary.schemas.get(each.schema_id)
+                name = schema.name if schema is not None else "unknown"
+                self.channels[each.topic.removeprefix(TOPIC_PREFIX)] = (name, counts.get(number, 0))
+
+    def read(self) -> Iterator[tuple[int, str, bytes]]:
+        """Yield receive time (us), channel and bytes of the messages in the order of the file."""
+        topics = [f"{TOPIC_PREFIX}{each}" for each in self.channels]
+        stream = self._reader.iter_messages(topics=topics, log_time_order=False)
+        for _, channel, message in explain_each(stream, self._path, "MCAP file", MCAP_REMEDY):
+            yield message.log_time // 1000, channel.topic.removeprefix(TOPIC_PREFIX), message.data
+
+
+def is_lcm_mcap(path: Path) -> bool:
+    """Return whether a path is an MCAP file, and not one of ROS 2, also one whose end is missing. Raises OSError."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return False
+    try:
+        with open_mcap(path) as mcap:
+            return bool(mcap.channels) or not mcap.has_ros
+    except RecordingError:
+        # the reader of bags reads one that was not closed
+        with suppress(RecordingError), open_bag(path) as bag:
+            return not bag.topics
+    return True
+
+
+@contextmanager
+def open_mcap(path: Path) -> Iterator[McapLog]:
+    """Open an MCAP file. Raises RecordingError for one that is damaged, or without the library; OSError."""
+    try:
+        import mcap  # noqa: F401
+    except ImportError:
+        raise RecordingError("reading MCAP files needs the library mcap: pip install 'modelserver[bags]'") from None
+    with path.open("rb") as file:
+        yield McapLog(path, file)
+
+
+# --- samples of ROS messages --------------------------------------------------------------------------------
 
 
 class TopicKind(StrEnum):
@@ -83,15 +272,14 @@ class BagOptions:
 DEFAULT_OPTIONS = BagOptions()
 
 
-class Converter(ABC):
+class Converter:
     """Converts the messages of one topic to samples, in their order."""
 
     def __init__(self, options: BagOptions):
         self._options = options
 
-    @abstractmethod
     def convert(self, header: SensorHeader, message: Any) -> Sample:
-        """Return the sample of a message."""
+        raise NotImplementedError
 
     def notes(self) -> list[str]:
         """Return notes on the converted messages for the user, one line each."""
@@ -115,7 +303,6 @@ class GpsConverter(Converter):
     _unknown_covariances = 0
 
     def convert(self, header: SensorHeader, message: Any) -> GpsSample:
-        """Return the fix of a NavSatFix."""
         is_msl, undulation = self._options.altitude is Altitude.MSL, self._options.undulation
         latitude, longitude, height = float(message.latitude), float(message.longitude), float(message.altitude)
         fix_type = _FIX_TYPES.get(int(message.status.status), FixType.NONE)
@@ -137,7 +324,6 @@ class GpsConverter(Converter):
         )
 
     def notes(self) -> list[str]:
-        """Return notes for the user."""
         lines = []
         if self._unknown_covariances:
             lines.append(f"{self._unknown_covariances} fixes have no covariance")
@@ -158,7 +344,6 @@ class ImuConverter(Converter):
     _oriented = 0
 
     def convert(self, header: SensorHeader, message: Any) -> ImuSample:
-        """Return the sample of an Imu."""
         rate = _vector(message.angular_velocity, message.angular_velocity_covariance)
         force = _vector(message.linear_acceleration, message.linear_acceleration_covariance)
         quaternion = _unit_quaternion(message)
@@ -184,7 +369,6 @@ class ImuConverter(Converter):
         )
 
     def notes(self) -> list[str]:
-        """Return notes for the user."""
         lines = []
         if self._count and not 8.5 < (mean := self._force / self._count) < 11.5:
             lines.append(f"the mean specific force is {mean:.2f} m/s2, not 9.81: wrong unit, or gravity removed?")
@@ -220,7 +404,6 @@ class WheelsConverter(Converter):
     _sideways = 0.0
 
     def convert(self, header: SensorHeader, message: Any) -> WheelsSample:
-        """Return the sample of an Odometry."""
         twist = message.twist.twist
         speed, turn = float(twist.linear.x), float(twist.angular.z)
         self._sideways = max(self._sideways, abs(float(twist.linear.y)))
@@ -259,7 +442,6 @@ class WheelsConverter(Converter):
         return (distance, math.atan2(cross, float(before[2][:2] @ forward[:2])))
 
     def notes(self) -> list[str]:
-        """Return notes for the user."""
         lines = []
         if self._jumps:
             lines.append(f"the odometry's pose jumped {self._jumps} times; there the travel is that of its twist")
@@ -284,8 +466,10 @@ class JointsConverter(Converter):
 
     def convert(self, header: SensorHeader, message: Any) -> JointsSample:
         # each of the other arrays may be empty
-        columns = (message.name, chain(message.position, repeat(NAN)), chain(message.velocity, repeat(NAN)))
-        rows = zip(*columns, strict=False)
+        positions, rates = (
+            itertools.chain(each, itertools.repeat(NAN)) for each in (message.position, message.velocity)
+        )
+        rows = zip(message.name, positions, rates, strict=False)
         return JointsSample(header, tuple(JointSample(str(n), float(p), rate=float(v)) for n, p, v in rows))
 
 

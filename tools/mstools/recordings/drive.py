@@ -1,29 +1,34 @@
-"""A drive as the viewer shows it: geometry, poses, joints, fixes and events over time, from a log or a running service.
+"""A drive as a viewer shows it: geometry, poses, joints, fixes and events over time, from a log or a running service.
 
 `Drive.feed` processes one message and stores what a picture needs; `Drive.get_picture` returns the picture of an
-instant. Poses and joints are stored at most once per `PICTURE_PERIOD_US`, more than a screen shows, so an hour of them
-takes some 20 MB, and is read without decoding the rest. No clock, no socket.
+instant, and `FramePoses` where the bodies of the model are in it. Poses and joints are stored at most once per
+`PICTURE_PERIOD_US`, more than a screen shows, so an hour of them takes some 20 MB, and is read without decoding the
+rest. Neither has a clock or a socket; `follow_bus` has.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
+import time
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.earth.origin import Origin
-from modelserver.errors import WireError
+from modelserver.errors import QueryError, WireError
 from modelserver.formats.snapshot import decode_snapshot
-from modelserver.geometry.joint import coordinate_names
+from modelserver.geometry.joint import Coordinates, coordinate_names
+from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
 from modelserver.messages import (
     VALID,
@@ -31,7 +36,6 @@ from modelserver.messages import (
     DriverHealth,
     FixType,
     GpsSample,
-    Health,
     Invalid,
     JointsSample,
     Mode,
@@ -41,8 +45,13 @@ from modelserver.messages import (
 )
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import SnapshotAssembler, decode, fingerprint_of
 from modelserver.wire.fields import read_text
+from modelserver.wire.provider import handle_message
+
+if TYPE_CHECKING:
+    import lcm
 
 PICTURE_PERIOD_US: Final = 30_000
 """Least time between two stored poses, and two stored messages of joints of one source, microseconds."""
@@ -84,12 +93,6 @@ class FixColor(StrEnum):
     NO_DECISION = "no decision"
 
 
-_COLOR_OF: Final = {
-    Verdict.USED: FixColor.USED,
-    Verdict.RESET: FixColor.USED,
-    Verdict.REJECTED: FixColor.REJECTED,
-    Verdict.MONITORED: FixColor.MONITORED,
-}
 FIX_COLORS: Final = tuple(FixColor)
 _NO_DECISION: Final = FIX_COLORS.index(FixColor.NO_DECISION)
 
@@ -188,7 +191,6 @@ class ChannelCount:
     _counted: int = 0
 
     def add(self, now: int) -> None:
-        """Count a message received at `now`, microseconds."""
         self.count += 1
         self.last = now
         self._first = self._first or now
@@ -235,7 +237,8 @@ MAX_INTERPOLATION_US: Final = 1_000_000
 class Drive:
     """What is known of a drive. Channels have the prefix `prefix`; `model` is the geometry, from a snapshot or given.
 
-    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel.
+    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel. `on_event` is
+    called with each new event.
     """
 
     prefix: str = ""
@@ -249,6 +252,7 @@ class Drive:
     channels: dict[str, ChannelCount] = field(default_factory=dict)
     drivers: dict[str, DriverHealth] = field(default_factory=dict)
     damaged: int = 0
+    on_event: Callable[[DriveEvent], None] | None = None
 
     def __post_init__(self) -> None:
         self._coordinates = _list_coordinates(self.model)
@@ -286,22 +290,22 @@ class Drive:
             counted = self.channels[channel] = ChannelCount()
         counted.add(now)
         name = channel[len(self.prefix) :]
-        if not 0 < int.from_bytes(data[8:16], "big", signed=True) < MAX_STAMP:
+        if not 0 < (stamp := read_stamp(data)) < MAX_STAMP:
             # every message of this project begins with its stamp; what does not is of no use here
             self.damaged += name in self._handlers
             return
         try:
             handler = self._handlers.get(name)
             if handler is not None:
-                handler(name, data, now)
+                handler(name, stamp, data)
             elif data[:8] == self._gps:
                 self._process_gps(decode("gps_t", data))
             elif channel == self.joints_channel:
-                self._process_joints(name, data, now)
+                self._process_joints(name, stamp, data)
         except (WireError, GeodesyError, struct.error):
             self.damaged += 1
 
-    def _process_snapshot(self, _: str, data: bytes, now: int) -> None:
+    def _process_snapshot(self, name: str, stamp: int, data: bytes) -> None:
         part: SnapshotPart = decode("model_snapshot_t", data)
         if self.model is not None and part.model_revision == self.model.revision:
             return
@@ -319,13 +323,11 @@ class Drive:
         self.set_model(snapshot.model)
 
     def set_model(self, model: Model) -> None:
-        """Show another geometry."""
         self.model = model
         self._coordinates = _list_coordinates(model)
 
-    def _process_pose(self, _: str, data: bytes, now: int) -> None:
+    def _process_pose(self, name: str, stamp: int, data: bytes) -> None:
         # the stamp alone decides whether the rest is read
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
         if 0 <= stamp - self._last_pose < PICTURE_PERIOD_US and self.poses.count:
             return
         answer: PoseAnswer = decode("pose_transform_t", data)
@@ -361,9 +363,8 @@ class Drive:
             self._add_event(utime, EventKind.RESET, f"the position was reset: epoch {epoch}")
         self._invalid, self._epoch = invalid, epoch
 
-    def _process_joints(self, name: str, data: bytes, now: int) -> None:
+    def _process_joints(self, name: str, stamp: int, data: bytes) -> None:
         # stamp and source alone decide whether the rest is read
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
         source = f"{name} {read_text(data, SOURCE_OFFSET)[0]}"
         if 0 <= stamp - self._sources.get(source, 0) < PICTURE_PERIOD_US:
             return
@@ -397,9 +398,9 @@ class Drive:
         position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
         self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
 
-    def _process_decisions(self, _: str, data: bytes, now: int) -> None:
-        for each in decode("decisions_t", data).decisions:
-            self._process_decision(each)
+    def _process_decisions(self, name: str, stamp: int, data: bytes) -> None:
+        for decision in decode("decisions_t", data).decisions:
+            self._process_decision(decision)
 
     def _process_decision(self, decision: Decision) -> None:
         if not 0 < decision.utime < MAX_STAMP:
@@ -408,7 +409,8 @@ class Drive:
         if decision.kind == POSITION and table is not None:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
-                table.rows[row, 3] = FIX_COLORS.index(_COLOR_OF[decision.verdict])
+                is_used = decision.verdict is Verdict.RESET
+                table.rows[row, 3] = FIX_COLORS.index(FixColor.USED if is_used else FixColor[decision.verdict.name])
         if decision.verdict in (Verdict.REJECTED, Verdict.RESET):
             is_reset = decision.verdict is Verdict.RESET
             verb = "reset by" if is_reset else "rejected"
@@ -416,13 +418,12 @@ class Drive:
             kind = EventKind.RESET if is_reset else EventKind.REJECTION
             self._add_event(decision.utime, kind, f"{verb} {decision.kind} of {decision.source}{reason}")
 
-    def _process_driver(self, _: str, data: bytes, now: int) -> None:
+    def _process_driver(self, name: str, stamp: int, data: bytes) -> None:
         health: DriverHealth = decode("driver_health_t", data)
         if health.source in self.drivers or len(self.drivers) < MAX_CHANNELS:
             self.drivers[health.source] = health
 
-    def _store_report(self, name: str, data: bytes, now: int) -> None:
-        stamp = int.from_bytes(data[8:16], "big", signed=True)
+    def _store_report(self, name: str, stamp: int, data: bytes) -> None:
         stored = self._reports.setdefault(name, [])
         if name == "LOCALIZATION_STATE":
             self._add_mode_event(stamp, data)
@@ -448,6 +449,8 @@ class Drive:
                 last.last, last.count = utime, last.count + 1
                 return
         self.events.append(DriveEvent(utime, kind, text, utime))
+        if self.on_event is not None:
+            self.on_event(self.events[-1])
         if len(self.events) > MAX_EVENTS:
             del self.events[: MAX_EVENTS // 2]
 
@@ -527,14 +530,14 @@ class Drive:
         found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
         return {name: float(table.rows[row, 0]) for name, (table, row) in found.items() if row >= 0}
 
-    def get_health(self, utime: int = 0) -> Health | None:
-        """Return the last health report at or before a time; the latest one at 0."""
-        health: Health | None = self._get_report("MODELSERVER_HEALTH", "health_t", utime)
-        return health
-
-    def get_navigation_state(self, utime: int = 0) -> Any:
-        """Return the filter's last published state at or before a time, None without one; the latest one at 0."""
-        return self._get_report("LOCALIZATION_STATE", "navigation_state_t", utime)
+    def get_report(self, name: str, utime: int = 0) -> Any:
+        """Return the last report on a channel at or before a time, None without one; the latest one at 0."""
+        stored = self._reports.get(name, [])
+        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
+        try:
+            return decode(BY_NAME[name].type_name, stored[at - 1][1]) if at else None
+        except WireError:
+            return None
 
     def get_state_course(self, state: str, utime: int = 0, seconds: float = 60.0) -> tuple[Array, Array, Array]:
         """Return times (n,), values (n,) and standard deviations (n,) of a state of the filter before a time.
@@ -557,20 +560,110 @@ class Drive:
         times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
         return times, values, sigmas
 
-    def _get_report(self, name: str, type_name: str, utime: int) -> Any:
-        stored = self._reports.get(name, [])
-        at = len(stored) if not utime else bisect_right(stored, utime, key=itemgetter(0))
-        try:
-            return decode(type_name, stored[at - 1][1]) if at else None
-        except WireError:
-            return None
+
+def read_stamp(data: bytes) -> int:
+    """Return the stamp of a message, which is behind the fingerprint; 0 for one that is too short."""
+    return int.from_bytes(data[8:16], "big", signed=True) if len(data) >= 16 else 0
 
 
 def _list_coordinates(model: Model | None) -> frozenset[str]:
-    """Return the names of the coordinates that JOINTS may drive."""
     joints = model.joints if model is not None else {}
     return frozenset(name for each in joints.values() for name in coordinate_names(each.name, each.joint))
 
 
 def _read_pose(row: Array) -> Pose:
     return Pose(tuple(row[_POSITION].tolist()), tuple(row[_QUATERNION].tolist()))
+
+
+class BodyPath(NamedTuple):
+    """How a body is reached: the path to its first frame, the body's pose in that frame, and the coordinates passed."""
+
+    path: KinematicPath
+    from_frame: Pose
+    coordinates: frozenset[str]
+
+
+class FramePoses:
+    """Where the bodies of a model are in `base_frame`, with joints where they were received.
+
+    `paths` has the bodies that are joined to the base frame.
+    """
+
+    def __init__(self, model: Model, base_frame: str):
+        self.model = model
+        self.paths: dict[str, BodyPath] = {}
+        self._joints: Mapping[str, float] = {}
+        for body in model.bodies:
+            if not body.frames:
+                continue
+            with suppress(QueryError):
+                path = model.get_kinematic_path(body.frames[0].full_name, base_frame)
+                coordinates = frozenset(name for joint in path.joints for name in model.drives[joint.name].names)
+                self.paths[body.name] = BodyPath(path, body.frames[0].pose.inverse(), coordinates)
+
+    def compute_bodies(self, moved: Collection[str] | None = None) -> dict[str, Pose]:
+        """Return the poses of the bodies by name; with `moved` only of those behind these coordinates."""
+        return {
+            name: each.path.compute_pose([self._get_position(joint.name) for joint in each.path.joints])
+            @ each.from_frame
+            for name, each in self.paths.items()
+            if moved is None or not each.coordinates.isdisjoint(moved)
+        }
+
+    def move_joints(self, joints: Mapping[str, float]) -> dict[str, Pose]:
+        """Set the coordinates that were received, and return the poses of the bodies that moved."""
+        known, self._joints = self._joints, dict(joints)
+        moved = {name for name in known.keys() | joints.keys() if known.get(name) != joints.get(name)}
+        return self.compute_bodies(moved) if moved else {}
+
+    def compute_frames(self, bodies: Mapping[str, Pose]) -> dict[str, Pose]:
+        """Return the poses of the frames of bodies by full name."""
+        return {frame.full_name: pose @ frame.pose for name, pose in bodies.items() for frame in self.model.body(name)}
+
+    def _get_position(self, joint: str) -> Coordinates:
+        """Return a joint's position: received, else its default."""
+        drive = self.model.drives[joint]
+        leader = self.model.joints[drive.leader].joint
+        found = tuple(
+            [
+                self._joints.get(name, default)
+                for name, default in zip(drive.names, leader.default_position, strict=True)
+            ]
+        )
+        if drive.leader == joint:
+            return found
+        return tuple([drive.multiplier * value + drive.offset for value in found])
+
+
+# --- bus
+
+POLL_S: Final = 0.2
+"""Longest wait for a message, seconds: a signal may have ended it."""
+
+QUEUE_CAPACITY: Final = 10_000
+"""Queued messages of all channels together."""
+
+MAX_BATCH: Final = 500
+
+
+def follow_bus(
+    bus: lcm.LCM,
+    prefix: str,
+    feed: Callable[[str, bytes, int], None],
+    is_stopped: Callable[[], bool],
+    lock: AbstractContextManager[object] | None = None,
+) -> None:
+    """Feed the messages of all channels with a prefix, in batches under the lock, until it is stopped."""
+    received: list[tuple[str, bytes]] = []
+    subscription = bus.subscribe(f"{re.escape(prefix)}.*", lambda channel, data: received.append((channel, data)))
+    subscription.set_queue_capacity(QUEUE_CAPACITY)
+    while not is_stopped():
+        handle_message(bus, int(POLL_S * 1e3))
+        while len(received) < MAX_BATCH and handle_message(bus):
+            pass
+        now = time.time_ns() // 1000
+        with lock or nullcontext():
+            for channel, data in received:
+                feed(channel, data, now)
+        received.clear()
+    bus.unsubscribe(subscription)
