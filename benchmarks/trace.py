@@ -23,6 +23,7 @@ from benchmarks.support import RAPTOR, print_verdict
 from modelserver.client import remote
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, ImuSample, Sample, WheelsSample
+from modelserver.server.bus import Inboxes
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Loop, LoopSettings
@@ -36,7 +37,7 @@ from mstools.launch.drive import make_simulation
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PRODUCT: Final = tuple(str(ROOT / name) + os.sep for name in ("modelserver", "drivers"))
-DOUBLES: Final = ("links/fake.py", "server/fake_bus.py", "server/clock.py")
+DOUBLES: Final = ("links/fake.py", "server/fake_bus.py", "server/bus.py", "server/clock.py")
 """Ends of the paths of link, bus and clocks, whose doubles run here."""
 
 START: Final = 1_700_000_000_000_000
@@ -75,6 +76,16 @@ def trace(action: Callable[[], object]) -> Way:
     return way
 
 
+class PausableBus(FakeBus):
+    """A fake bus on which no time passes while it is paused."""
+
+    is_paused = False
+
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        if not self.is_paused:
+            super().wait(seconds, inboxes)
+
+
 class Rig:
     """The loop of the Raptor on a fake bus, with the driver of its satellite receiver on a fake line."""
 
@@ -82,7 +93,7 @@ class Rig:
         self.config = load_config(RAPTOR / "vehicle.yaml")
         vehicle = load_vehicle(self.config)
         self.clock = FakeClock(START)
-        self.bus = FakeBus(self.clock)
+        self.bus = PausableBus(self.clock)
         settings = LoopSettings(round(1e9 / vehicle.tick_hz()), vehicle.sensor_channels())
         self.loop = Loop(self.bus, self.clock, vehicle.start_core(self.clock.now()), settings)
         self.time = FakeTimeSource(START, self.clock.monotonic_ns())
@@ -169,6 +180,9 @@ def trace_queries(rig: Rig) -> dict[str, Way]:
     bus = ClientBus(rig)
     with mock.patch.multiple(remote, open_lcm=lambda url: bus, open_receiver=lambda url: bus):
         platform = remote.Platform(name="TRACE")
+    # after the tick that is due, and until the next, passes serve requests only
+    rig.bus.is_paused = True
+    rig.loop.run_once()
     with platform:
         platform.get_transformation("BackSICKLaser:Scan", "World:UTM")  # after it, the modules are loaded
         static = partial(platform.get_transformation, "Digiclops:ImagePlane", "Raptor:CG")
