@@ -34,6 +34,7 @@ from scipy.stats import chi2
 
 from benchmarks import husky_nis
 from benchmarks.requirements import HEALTHY, MILD_FAULT, Required
+from benchmarks.rough_simulation import GroundMotion, RoughSimulation, SideSlip, Terrain
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
@@ -46,11 +47,8 @@ from modelserver.simulation import (
     EncoderModel,
     Event,
     GpsModel,
-    GroundMotion,
     ImuModel,
-    SideSlip,
     Simulation,
-    Terrain,
     Timing,
     Trajectory,
     TrajectoryMotion,
@@ -207,7 +205,7 @@ def run_matched(seed: int) -> DriveResult:
     trajectory = Trajectory((DrivePhase(5.0), *city(seed, SECONDS - 5.0, speed=5.0)), yaw=0.7)
     motion = GroundMotion(trajectory, None, SideSlip(), seed)
     motion._slip = _RandomSideSlip(settings.side_sigma, settings.slip_time, seed)  # type: ignore[assignment]
-    simulation = Simulation(
+    simulation = RoughSimulation(
         rig.model,
         "Car:Base",
         motion,  # type: ignore[arg-type]  # any MotionModel
@@ -241,7 +239,7 @@ def run_matched(seed: int) -> DriveResult:
 
 def _simulate_rough(seed: int, gps: GpsModel, encoder: EncoderModel) -> DriveResult:
     rig = _build_rig(0.0)
-    simulation = Simulation(
+    simulation = RoughSimulation(
         rig.model,
         "Car:Base",
         Trajectory(city(seed, SECONDS, speed=5.0), yaw=0.7),

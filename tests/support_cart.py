@@ -15,8 +15,17 @@ from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.sensor_rig import Kinematics, Mounts, SensorRig
 from modelserver.geometry import Model, ModelBuilder
-from modelserver.simulation import Event, GpsModel, ImuModel, Simulation, Timing, Trajectory, WheelsModel, figure_eight
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import (
+    START_UTIME,
+    Event,
+    GpsModel,
+    ImuModel,
+    Simulation,
+    Timing,
+    Trajectory,
+    WheelsModel,
+    figure_eight,
+)
 from modelserver.transforms import Pose, so3
 
 BASE, IMU, ANTENNA, SECOND, CAMERA = (f"Cart:{name}" for name in ("Base", "Imu", "Antenna", "Second", "Camera"))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from support_shared import SameObject, freeze, run_shared, share
 
+from benchmarks.rough_simulation import RoughSimulation
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
@@ -98,7 +99,7 @@ def simulation(
     }
 
     def simulate() -> Simulation:
-        found = Simulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
+        found = RoughSimulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
         (found._arrivals,) = itertools.tee(found._arrivals, 1)
         found.truth = cache(found.truth)
         return found

@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import TypeVar
 
 from modelserver.messages import RelativePoseSample, SensorHeader
+from modelserver.simulation import Event
 from modelserver.simulation.noise import NoiseSource
-from modelserver.simulation.scenario import Event
 
 _E = TypeVar("_E", bound=Event)
 

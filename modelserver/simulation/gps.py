@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 from modelserver.earth.geodesy import LocalFrame
 from modelserver.messages import NAN, FixType, GpsSample
-from modelserver.simulation.noise import GaussMarkov, diagonal_covariance
-from modelserver.simulation.timing import Intervals, Run, Timing, is_within
+from modelserver.simulation.noise import GaussMarkov, Intervals, Run, Timing, diagonal_covariance, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3

@@ -25,8 +25,15 @@ from dataclasses import dataclass, replace
 from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
-from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance
-from modelserver.simulation.timing import Intervals, Run, Timing, is_within
+from modelserver.simulation.noise import (
+    GaussMarkov,
+    Intervals,
+    NoiseSource,
+    Run,
+    Timing,
+    diagonal_covariance,
+    is_within,
+)
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3

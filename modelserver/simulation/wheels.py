@@ -16,8 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
-from modelserver.simulation.noise import NoiseSource, quantize
-from modelserver.simulation.timing import Run, Timing
+from modelserver.simulation.noise import NoiseSource, Run, Timing, quantize
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms.so3 import Vector3
 

@@ -34,8 +34,7 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
-from modelserver.simulation import Event
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Event
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +92,6 @@ GOOD = Sensors().events(Drive(6.0, speed=constant(2.0), yaw_rate=constant(0.2)))
 
 REASONS = {"out_of_sequence", "duplicate", "future", "nan", "range", "gap", "no_fix", "satellites", "dilution"} | {
     "sigma",
-    "jump",
     "course",
 }
 

@@ -213,8 +213,8 @@ def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_named(
         # raw mode's settings as the files of earlier versions have them
         ("minimum_fix_type: 1", "minimum_fix_type", "minimum_fix_type",
          "write minimum_fix_type under localization.raw or localization.filter"),
-        ("jump_time: 1", "jump_time", "jump_time", "write jump_time under localization.raw"),
-        ("jump_tyme: 1", "jump_tyme", "jump_time", "write jump_time under localization.raw"),
+        ("speed_window: 1", "speed_window", "speed_window", "write speed_window under localization.raw"),
+        ("speed_windw: 1", "speed_windw", "speed_window", "write speed_window under localization.raw"),
         ("hard_iron: [0, 0, 0]", "hard_iron", "hard_iron", "write hard_iron under localization.magnetometer"),
     ],
 )  # fmt: skip

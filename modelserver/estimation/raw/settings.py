@@ -32,17 +32,9 @@ class RawSettings(FixSettings):
     # --- vehicle ---
 
     maximum_speed: float = 30.0
-    """Largest speed of the vehicle, m/s. A fix farther away than this allows is a jump."""
-    maximum_acceleration: float = 4.0
-    """Largest change of speed or direction, m/s2: a friction coefficient of 0.4 on loose ground."""
+    """Largest speed of the vehicle, m/s. A receiver velocity twice as large is not used."""
     usual_acceleration: float = 0.5
     """Sigma of the unpredicted change of speed, m/s2: ordinary driving of an unmanned ground vehicle."""
-    jump_sigmas: float = 5.0
-    """Number of sigmas by which a fix may differ from its prediction before it is a jump."""
-    jump_fixes: int = 5
-    """Number of rejected fixes in a row, agreeing with each other, that replace the prediction."""
-    jump_time: float = 5.0
-    """Time for which they must agree, seconds: multipath on a moving vehicle changes within a few seconds."""
 
     # --- IMU ---
 

@@ -11,7 +11,7 @@ from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import DrivePhase, ImuModel, Trajectory
 from modelserver.simulation.imu import MagnetometerModel, simulate_imu
-from modelserver.simulation.timing import Run
+from modelserver.simulation.noise import Run
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from msdrivers.devices.gx1.driver import Gx1Driver

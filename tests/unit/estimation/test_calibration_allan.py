@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from mstools.calibration import CalibrationError
+from mstools.calibration import CalibrationError, find_gap_free_ranges, find_stationary_ranges, median_period
 from mstools.calibration.allan import (
     INSTABILITY_FLOOR,
     AllanCurve,
@@ -18,7 +18,6 @@ from mstools.calibration.allan import (
     cluster_sizes,
     fit_noise_parameters,
 )
-from mstools.calibration.sample_ranges import find_gap_free_ranges, find_stationary_ranges, median_period
 
 Series = npt.NDArray[np.float64]
 

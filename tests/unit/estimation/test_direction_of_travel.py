@@ -20,6 +20,7 @@ from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.messages import Direction, VehicleStatusSample, Verdict, WheelSample, WheelsSample
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.simulation import (
+    START_UTIME,
     DrivePhase,
     Event,
     GpsModel,
@@ -29,7 +30,6 @@ from modelserver.simulation import (
     Trajectory,
     WheelsModel,
 )
-from modelserver.simulation.scenario import START_UTIME
 
 pytestmark = pytest.mark.slow
 

@@ -53,7 +53,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME
 from modelserver.transforms import Pose, so3
 from modelserver.transforms.so3 import Vector3
 

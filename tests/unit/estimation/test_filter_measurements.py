@@ -49,7 +49,7 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME
 from modelserver.transforms import Pose, so3
 from modelserver.transforms.so3 import Quaternion, Vector3, cross
 

@@ -29,8 +29,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Leveling
 from modelserver.estimation.filter.timeline import Timeline
 from modelserver.messages import GpsSample, ImuSample, Invalid, Mode, Phase, Verdict, WheelSample, WheelsSample
-from modelserver.simulation import DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
 
 pytestmark = pytest.mark.slow

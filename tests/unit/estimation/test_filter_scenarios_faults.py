@@ -18,6 +18,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.magnetometer import magnetic_field
 from modelserver.messages import ImuSample, Invalid, Phase, Verdict, WheelsSample, YawSource
 from modelserver.simulation import (
+    START_UTIME,
     DrivePhase,
     EncoderModel,
     Event,
@@ -26,7 +27,6 @@ from modelserver.simulation import (
     figure_eight,
     stationary,
 )
-from modelserver.simulation.scenario import START_UTIME
 from modelserver.transforms.pose import Pose
 
 pytestmark = pytest.mark.slow

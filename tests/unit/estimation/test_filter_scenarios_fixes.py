@@ -12,6 +12,7 @@ import support_stream_faults as faults
 from support_filter import GPS_TIMING, ORIGIN, PLAIN_GPS, QUICK_IMU, RIG, RTK_LIKE, drive, rms, row, simulation
 from support_maneuvers import stop_and_go
 
+from benchmarks.rough_simulation import AbsolutePoseModel, RangeModel, RelativePoseModel
 from modelserver.estimation.filter import heading_step, output
 from modelserver.estimation.filter.gnss_monitor import OutputOffset
 from modelserver.estimation.filter.heading_alignment import Rotation
@@ -21,15 +22,7 @@ from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned
 from modelserver.messages import GpsSample, Invalid, Mode, Verdict
-from modelserver.simulation import (
-    AbsolutePoseModel,
-    DrivePhase,
-    Event,
-    GpsModel,
-    RangeModel,
-    RelativePoseModel,
-    figure_eight,
-)
+from modelserver.simulation import DrivePhase, Event, GpsModel, figure_eight
 
 pytestmark = pytest.mark.slow
 

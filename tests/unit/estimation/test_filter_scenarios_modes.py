@@ -16,8 +16,7 @@ from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import AbsolutePoseSample, Invalid, Mode, SensorHeader, SwitchMode, Verdict
-from modelserver.simulation import Simulation, city, figure_eight
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Simulation, city, figure_eight
 
 pytestmark = pytest.mark.slow
 

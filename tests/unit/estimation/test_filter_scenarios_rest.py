@@ -11,18 +11,9 @@ import pytest
 from support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
 from support_maneuvers import reverse_eight
 
+from benchmarks.rough_simulation import SideSlip, Terrain
 from modelserver.messages import ImuSample, Invalid, Quality, Verdict
-from modelserver.simulation import (
-    Event,
-    GpsModel,
-    SideSlip,
-    Terrain,
-    Timing,
-    WheelsModel,
-    figure_eight,
-    stationary,
-)
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Event, GpsModel, Timing, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
 
 pytestmark = pytest.mark.slow

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_nav
 
+from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave
 from modelserver.estimation.filter import eskf, propagation
 from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.error_layout import STRAPDOWN
@@ -17,8 +18,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, Common, MotionConstraints
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.messages import ImuSample
-from modelserver.simulation import ImuModel, Simulation, Terrain, Timing, Trajectory, Wave, figure_eight
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, ImuModel, Timing, Trajectory, figure_eight
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import cross
 
@@ -39,7 +39,7 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_position_i
     # the simulator's vertical is that of the origin everywhere
     monkeypatch.setattr(eskf, "EARTH_RADIUS", 1e15)
     terrain = Terrain(0.05, -0.03, (Wave(0.8, 30.0, 0.4), Wave(0.3, 17.0, -1.0, 1.0)))
-    simulation = Simulation(
+    simulation = RoughSimulation(
         model(), "Cart:Base", Trajectory(figure_eight(3.0, 8.0, stationary=1.0, ramp=2.0, laps=3), yaw=0.7), ORIGIN,
         imu_frame=IMU, imu_model=ImuModel.noise_free(Timing(200.0)), terrain=terrain,
     )  # fmt: skip

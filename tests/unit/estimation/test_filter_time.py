@@ -39,8 +39,7 @@ from modelserver.messages import (
     Verdict,
     WheelsSample,
 )
-from modelserver.simulation import Event, GpsModel, Timing
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Event, GpsModel, Timing
 
 IMU_HZ = 20.0
 WARM, CHUNK, AFTER = 12.0, 0.9, 1.5

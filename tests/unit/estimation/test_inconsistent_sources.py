@@ -14,8 +14,7 @@ import pytest
 from support_filter import MOUNT, PLAIN_GPS, RTK_LIKE, Run, Transform, drive, rig, simulation
 
 from modelserver.messages import Decision, GpsSample, ImuSample, Verdict, WheelsSample
-from modelserver.simulation import Event, GpsModel, figure_eight
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, Event, GpsModel, figure_eight
 from modelserver.transforms import so3
 
 pytestmark = pytest.mark.slow

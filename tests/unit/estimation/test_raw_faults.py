@@ -9,7 +9,7 @@ import pytest
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, angle_error, constant, final, stepwise
 
 from modelserver.estimation.raw.localizer import RawLocalizer
-from modelserver.messages import GpsSample, ImuSample, Invalid, Rejected, SensorHeader
+from modelserver.messages import GpsSample, ImuSample, Invalid, OrientationReference, Rejected, SensorHeader
 from modelserver.transforms.pose import Pose
 
 
@@ -109,37 +109,6 @@ def test_creeping_along_a_curve_is_not_stationary(velocity_sigma, speed, rate):
     assert worst(rows, 2) < 1.5
 
 
-@pytest.mark.parametrize("degrees", [5.0, 14.0])
-def test_a_rejected_fix_changes_no_pose(degrees):
-    drive = Drive(20.0, speed=constant(2.0))
-    samples = Sensors().events(drive)
-    localizer = final(RawLocalizer.start(MOUNTS), samples)
-    fix = next(s for s in reversed(samples) if is_gps(s))
-    before = localizer.estimate(localizer.utime)
-    for outlier in ({"longitude_deg": fix.longitude_deg + 0.9}, {"latitude_deg": fix.latitude_deg - degrees}):
-        after, events = localizer.process(delay_stamp(replace(fix, **outlier), 0.2))
-        assert events == (Rejected("sensor:gps", "jump"),)
-        estimate = after.estimate(localizer.utime)
-        assert (estimate.enu, estimate.utm, estimate.invalid) == (before.enu, before.utm, 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("gps_hz", [1.0, 20.0])
-def test_a_jump_is_confirmed_only_after_a_time(gps_hz):
-    drive = Drive(40.0, speed=constant(2.0), yaw_rate=constant(0.05))
-    samples = [
-        replace(s, latitude_deg=s.latitude_deg + 50 / 111e3) if is_gps(s) and seconds(s) > 25.0 else s
-        for s in Sensors(gps_hz=gps_hz, imu_hz=25.0).events(drive)
-    ]
-    rows, _, localizer = follow(drive, [(seconds(s), s) for s in samples])
-    during = [row for row in rows if 25.0 + 3.0 / gps_hz < row[0] < 29.9]
-    assert during
-    assert all(Invalid.GPS_REJECTED in row[1].invalid for row in during)
-    assert {row[1].pose_epoch for row in rows if row[0] < 29.9} == {0}
-    assert localizer.pose_epoch == 1
-    assert rows[-1][1].invalid == 0
-
-
 def test_height_above_mean_sea_level_alone_is_used_with_its_uncertainty():
     drive = Drive(15.0, speed=constant(2.0))
     samples = [
@@ -179,3 +148,16 @@ def test_a_vehicle_on_its_side_is_invalid(roll, tilted):
         header = SensorHeader(START + n * 10_000, "imu")
         level, _ = level.process(ImuSample(header, (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665)))
     assert (Invalid.TILTED in level.estimate(level.utime).invalid) == tilted
+
+
+def test_an_orientation_with_the_wrong_reference_is_tilted():
+    # the right orientation of a level vehicle in ENU, stated as one in NED: upside down
+    q = MOUNTS.X_base_imu.wxyz
+    for reference in (OrientationReference.ENU, OrientationReference.NED):
+        localizer = RawLocalizer.start(MOUNTS, None, ORIGIN)
+        for n in range(10):
+            header = SensorHeader(START + n * 10_000, "imu")
+            sample = ImuSample(header, (0.0, 0.0, 0.0), orientation=q, orientation_reference=reference)
+            localizer, _ = localizer.process(sample)
+        tilted = Invalid.TILTED in localizer.estimate(localizer.utime).invalid
+        assert tilted == (reference is OrientationReference.NED)

@@ -19,18 +19,27 @@ from modelserver.estimation.filter.clock_monitor import StampVerdict
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_factors, compute_longest_axis
 from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.origin import OriginCapture
-from modelserver.estimation.raw import output, track
-from modelserver.estimation.raw.heading import CourseResult, Heading
+from modelserver.estimation.raw.localizer import (
+    StampMonitor,
+    compute_covariance,
+    compute_growth,
+    compute_seconds_to_limit,
+)
 from modelserver.estimation.raw.motion import (
+    MAX_TRACK_FIXES,
+    CourseResult,
+    Heading,
     RawMotion,
+    TrackFix,
+    append_fix,
     compute_attitude,
     compute_roll_pitch,
+    fit_best_speed,
+    fit_course,
     read_raw_imu,
     to_level_axes,
 )
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.raw.stamps import StampMonitor
-from modelserver.estimation.raw.track import TrackFix, compute_growth
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.estimation.settings import FixSettings
 from modelserver.geometry.model import Model
@@ -250,22 +259,6 @@ def test_the_vertical_of_the_unit_is_read_with_any_reference_and_mount(roll, pit
     assert found.rate == pytest.approx(tuple(R_base_imu.apply([0.1, 0.2, 0.3])), abs=1e-12)
 
 
-def test_a_unit_whose_vertical_contradicts_its_specific_force_is_rejected():
-    # the right orientation of a level vehicle with the wrong reference: upside down
-    R = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
-    force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
-    level = tuple(R.as_quat(scalar_first=True))
-    right = imu_sample(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
-    wrong = replace(right, orientation_reference=OrientationReference.NED)
-    assert read_raw_imu(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
-    assert read_raw_imu(wrong, MOUNTS.X_base_imu) == "orientation"
-    # hard braking tilts the force, but not that far; the force of a shock is not near g and shows no vertical
-    braking = tuple(R.inv().apply([-6.0, 0.0, 9.8]))
-    assert read_raw_imu(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
-    shock = tuple(R.inv().apply([0.0, 0.0, -30.0]))
-    assert read_raw_imu(replace(right, specific_force=shock), MOUNTS.X_base_imu).up is not None
-
-
 @pytest.mark.parametrize("q", [(0.0,) * 4, (math.nan,) * 4, (2.0, 0.0, 0.0, 0.0)])
 def test_an_orientation_that_is_not_a_rotation_is_ignored(q):
     sample = imu_sample(orientation=q, orientation_reference=OrientationReference.ENU)
@@ -351,26 +344,26 @@ def path_fixes(speed, turn, offset, n=12, dt=0.5, lever=0.4 - 0.3j):
 @given(st.floats(0.5, 10), st.floats(-0.4, 0.4).filter(lambda w: abs(w) > 1e-3) | st.just(0.0), st.floats(-3, 3))
 def test_speed_and_course_of_an_arc_are_exact(speed, turn, offset):
     made = path_fixes(speed, turn, offset)
-    found = track.fit_course(made, None, S)
+    found = fit_course(made, None, S)
     assert found is not None
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=0.05)  # the arm's phase is iterated
-    found = track.fit_course(made, cmath.rect(1.0, offset), S)
+    found = fit_course(made, cmath.rect(1.0, offset), S)
     assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=1e-9)
-    fit = track.fit_best_speed(made, cmath.rect(1.0, offset), S)
+    fit = fit_best_speed(made, cmath.rect(1.0, offset), S)
     assert abs(fit.velocity) == pytest.approx(speed, abs=1e-6)
 
 
 def test_precise_fixes_give_the_speed_from_a_short_segment_and_noisy_ones_from_a_long_one():
-    precise = track.fit_best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
-    noisy = track.fit_best_speed(tuple(f._replace(sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
+    precise = fit_best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
+    noisy = fit_best_speed(tuple(f._replace(sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
     assert precise.seconds < noisy.seconds <= S.speed_window
 
 
 def test_a_segment_is_limited_in_fixes_and_time():
     fixes = ()
     for i in range(500):
-        fixes = track.append_fix(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
-        assert len(fixes) <= track.MAX_TRACK_FIXES
+        fixes = append_fix(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
+        assert len(fixes) <= MAX_TRACK_FIXES
         assert fixes[-1].utime - fixes[0].utime <= 30 * SECOND
 
 
@@ -411,15 +404,15 @@ def test_protection_levels_are_exceeded_with_the_stated_probability():
 
 def test_the_time_to_the_limit_ends_where_the_position_is_beyond_it_with_the_stated_probability():
     variance, sigma_v = 4.0, 0.3
-    t = output.compute_seconds_to_limit(variance, 0.0, sigma_v, S)
+    t = compute_seconds_to_limit(variance, 0.0, sigma_v, S)
     level = compute_factors(LIMIT_RISK)[0] * math.sqrt(variance + compute_growth(t, sigma_v, S))
     assert level == pytest.approx(S.horizontal_limit)
-    assert output.compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
+    assert compute_seconds_to_limit(1e6, 0.0, sigma_v, S) == 0.0
 
 
 def test_an_error_of_yaw_moves_the_base_about_the_antenna():
     good = evaluate_fix(fix(), S)
-    cov = output.compute_covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
+    cov = compute_covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
     assert cov[0] == pytest.approx(good.east_variance + 0.16)
     assert cov[7] == pytest.approx(good.north_variance + 0.09)
     assert cov[1] == cov[6] == pytest.approx(0.12)

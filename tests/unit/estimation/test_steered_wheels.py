@@ -38,8 +38,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.simulation import DrivePhase
-from modelserver.simulation.scenario import START_UTIME
+from modelserver.simulation import START_UTIME, DrivePhase
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import cross
 

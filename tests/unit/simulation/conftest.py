@@ -6,18 +6,10 @@ import math
 
 import pytest
 
+from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave
 from modelserver.earth.geodesy import origin_at
 from modelserver.geometry import Model, ModelBuilder
-from modelserver.simulation import (
-    GpsModel,
-    ImuModel,
-    Simulation,
-    Terrain,
-    Trajectory,
-    Wave,
-    WheelsModel,
-    figure_eight,
-)
+from modelserver.simulation import GpsModel, ImuModel, Simulation, Trajectory, WheelsModel, figure_eight
 from modelserver.transforms.pose import Pose
 
 WHEELS = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
@@ -64,7 +56,7 @@ def simulate(car, origin, eight):
             "wheel_frames": WHEELS if "wheels_model" in more else None,
             "rolling_frame": "Car:RearAxle",
         }
-        return Simulation(car, "Car:CG", trajectory or eight, origin, **(settings | more))
+        return RoughSimulation(car, "Car:CG", trajectory or eight, origin, **(settings | more))
 
     return make
 

@@ -8,18 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.rough_simulation import AbsolutePoseModel, RangeModel, RelativePoseModel, SideSlip
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
-from modelserver.simulation import (
-    AbsolutePoseModel,
-    DrivePhase,
-    GpsModel,
-    ImuModel,
-    RangeModel,
-    RelativePoseModel,
-    SideSlip,
-    Trajectory,
-    WheelsModel,
-)
+from modelserver.simulation import DrivePhase, GpsModel, ImuModel, Trajectory, WheelsModel
 from modelserver.transforms import so3
 
 BEACONS = {"mast": (30.0, 10.0, 8.0), "gate": (-20.0, -40.0, 3.0), "far": (900.0, 0.0, 0.0)}

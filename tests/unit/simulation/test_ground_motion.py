@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from modelserver.simulation import DrivePhase, SideSlip, Terrain, Trajectory, Wave, figure_eight, make_motion
+from benchmarks.rough_simulation import SideSlip, Terrain, Wave, make_motion
+from modelserver.simulation import DrivePhase, Trajectory, figure_eight
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 

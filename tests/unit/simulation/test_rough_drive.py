@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.rough_simulation import SideSlip
 from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import Geodesy
-from modelserver.simulation import GpsModel, ImuModel, SideSlip, Timing, WheelsModel
+from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
 from modelserver.transforms import so3
 
 SLIDING = SideSlip(cornering=0.02, random_sigma=0.1)

@@ -32,7 +32,7 @@ from modelserver.simulation import (
     figure_eight,
     straight,
 )
-from modelserver.simulation.timing import Timing
+from modelserver.simulation.noise import Timing
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 

@@ -14,14 +14,18 @@ import typer
 
 from modelserver.errors import ModelServerError
 from modelserver.transforms.so3 import Vector3
-from mstools.calibration import CalibrationError, mount
-from mstools.calibration import imu_recording as calibrate_log
+from mstools.calibration import (
+    CalibrationError,
+    ImuRecording,
+    SampleRange,
+    find_stationary_ranges,
+    finite_rows,
+    read_recording,
+)
 from mstools.calibration import report as calibrate_report
 from mstools.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
 from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
-from mstools.calibration.imu_recording import ImuRecording
-from mstools.calibration.report import AxisNoise, ImuNoise
-from mstools.calibration.sample_ranges import SampleRange, find_stationary_ranges
+from mstools.calibration.report import AxisNoise, ImuNoise, MountCheck, axis_name, check_mount
 from mstools.report import charts
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, write_file
@@ -71,8 +75,8 @@ def imu(
     Example: modelserver calibrate imu stationary.lcm --plot allan.html -o imu.yaml
     """
     _check_options(begin, end, log, plot, output, as_json, force)
-    recorded = calibrate_log.read_recording(log, channel, "", begin, end)
-    good = calibrate_log.finite_rows(recorded.rates, recorded.forces)
+    recorded = read_recording(log, channel, "", begin, end)
+    good = finite_rows(recorded.rates, recorded.forces)
     if not good.any():
         why = "none with angular velocity and specific force: it is no IMU's channel, or its driver publishes neither"
         raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
@@ -131,8 +135,8 @@ def magnetometer(
     """
     _check_options(begin, end, log, plot, output, as_json, force)
     given = _parse_place(place)
-    recorded = calibrate_log.read_recording(log, channel, gps_channel, begin, end)
-    good = calibrate_log.finite_rows(recorded.fields)
+    recorded = read_recording(log, channel, gps_channel, begin, end)
+    good = finite_rows(recorded.fields)
     if not good.any():
         why = "none with a magnetic field: it has no magnetometer, or its driver does not publish it"
         raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
@@ -178,7 +182,7 @@ def _drop_bias_figures(figures: NoiseParameters, seconds: float) -> NoiseParamet
     return dataclasses.replace(figures, instability=None, random_walk=None, missing=(*others, why))
 
 
-def _mount_advice(config: Path, forces: Any) -> mount.MountCheck:
+def _mount_advice(config: Path, forces: Any) -> MountCheck:
     # imported here: without --config no configuration libraries and no geodesy are needed
     from modelserver.config.vehicle_file import load_config
     from modelserver.server.vehicle import load_vehicle
@@ -187,13 +191,13 @@ def _mount_advice(config: Path, forces: Any) -> mount.MountCheck:
     if vehicle.rig is None or not vehicle.rig.imu_frame:
         raise ModelServerError(f"{escape(str(config))}: no IMU under sensors, so there is no mount to compare")
     x, y, z = (float(each) for each in forces.mean(axis=0))
-    return mount.check_mount((x, y, z), vehicle.rig.pose(vehicle.rig.imu_frame).wxyz)
+    return check_mount((x, y, z), vehicle.rig.pose(vehicle.rig.imu_frame).wxyz)
 
 
 def _print_up_axis(config: Path | None, recorded: ImuRecording, as_json: bool, on_stderr: bool) -> None:
     """Print which axis of the IMU points up, from the mean specific force of a drive, whose accelerations cancel."""
     x, y, z = (float(each) for each in recorded.forces.mean(axis=0))
-    up, strength = mount.axis_name((x, y, z)), math.hypot(x, y, z)
+    up, strength = axis_name((x, y, z)), math.hypot(x, y, z)
     angle = math.nan
     if strength > 0.0:
         angle = math.degrees(math.acos(min(max(abs(x), abs(y), abs(z)) / strength, 1.0)))
@@ -215,7 +219,7 @@ def _fit(log: Path, recorded: ImuRecording, fields: Any, field: Vector3 | None, 
     try:
         if all_axes:
             return fit_all_axes(fields, math.nan if field is None else math.hypot(*field), horizontal)
-        forces = recorded.forces[calibrate_log.finite_rows(recorded.forces)]
+        forces = recorded.forces[finite_rows(recorded.forces)]
         if not len(forces):
             why = "the IMU has no specific force, so up is unknown; turn it about all axes and give --all-axes"
             raise CalibrationError(why)

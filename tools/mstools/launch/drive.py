@@ -11,7 +11,7 @@ from modelserver.formats import load_model
 from modelserver.geometry import Model
 from modelserver.messages import GpsSample, ImuSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel
-from modelserver.simulation import maneuvers as figures
+from modelserver.simulation import trajectory as figures
 from modelserver.simulation.trajectory import DrivePhase
 
 SUFFIELD = (50.27, -111.18, 700.0)
