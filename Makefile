@@ -3,7 +3,7 @@
 #   make test     the same for the tests
 #   make deb      a Debian package of it in build/
 # and: make test-quick (without processes and long drives, for the inner loop: a minute on two cores),
-#      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean,
+#      make check (format, lint, types), make docs (the generated parts of docs/; the site in build/site), make bench (ratio benchmarks), make clean,
 #      make screenshots (of the viewer, for the docs).
 
 PYTHON ?= python3
@@ -68,6 +68,7 @@ screenshots: $(DEV_STAMP)
 
 # The variable silences an announcement of the theme about a later mkdocs; it is no warning about these pages.
 docs: $(DOCS_STAMP)
+	$(BIN)/python tools/docs_pages.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 types: $(DEV_STAMP)

@@ -33,9 +33,8 @@ from modelserver.messages import (
     Origin,
     SensorHeader,
 )
-from modelserver.query import PlatformView
 from modelserver.query.answers import DeferredAnswer
-from modelserver.query.steps import complete
+from modelserver.query.view import PlatformView, complete
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url

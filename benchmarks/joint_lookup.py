@@ -24,7 +24,7 @@ from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
 from modelserver.joints.history import JointHistory
 from modelserver.messages import JointSample, JointsSample, SensorHeader, TimeQuery
-from modelserver.query import PlatformView
+from modelserver.query.view import PlatformView
 from modelserver.transforms.pose import Pose
 
 JOINTS, SAMPLES, STEP_US = 9, 2000, 20_000

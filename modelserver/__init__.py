@@ -56,9 +56,9 @@ from modelserver.errors import UnknownFrameError as UnknownFrameError
 from modelserver.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from modelserver.client.commander import VehicleCommander as VehicleCommander
     from modelserver.client.mirror import PlatformMirror as PlatformMirror
     from modelserver.client.publisher import SensorPublisher as SensorPublisher
+    from modelserver.client.publisher import VehicleCommander as VehicleCommander
     from modelserver.client.remote import Platform as Platform
     from modelserver.formats import load_model as load_model
     from modelserver.geometry.builder import ModelBuilder as ModelBuilder
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     from modelserver.transforms.transformation import Transformation as Transformation
 
 _LAZY = {
-    "VehicleCommander": "modelserver.client.commander",
+    "VehicleCommander": "modelserver.client.publisher",
     "PlatformMirror": "modelserver.client.mirror",
     "Platform": "modelserver.client.remote",
     "SensorPublisher": "modelserver.client.publisher",

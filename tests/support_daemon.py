@@ -32,8 +32,7 @@ from modelserver.client.remote import Platform
 from modelserver.errors import ModelServerError
 from modelserver.messages import Health, PoseAnswer
 from modelserver.simulation import Event
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.encoded import restamp
+from modelserver.wire.codec import decode, encode, restamp
 
 ELAPSED_S = 8.0
 """The real daemon under faults: fed with a simulated drive in real time, observed, queried, killed, restarted."""

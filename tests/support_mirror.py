@@ -8,14 +8,13 @@ from dataclasses import replace
 from support_moving import BASE, ODOM, T0, UTM, S, estimate, joints_at, rover
 from support_moving import view as exact_view
 
-from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import MirrorReceiver, MirrorState
 from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry.model import Model
 from modelserver.messages import Estimate, SnapshotPart
-from modelserver.query import PlatformView
-from modelserver.wire.codec import encode
-from modelserver.wire.snapshot import PART_BYTES
+from modelserver.query.view import PlatformView
+from modelserver.wire.codec import PART_BYTES, encode
 
 Message = tuple[str, bytes]
 Event = tuple[int, str, bytes]

@@ -14,7 +14,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Sigma
 from modelserver.joints.history import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, Origin, SensorHeader, VehicleMotion
-from modelserver.query import PlatformView
+from modelserver.query.view import PlatformView
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 

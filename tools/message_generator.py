@@ -39,8 +39,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
@@ -58,7 +57,6 @@ CODES: Final = {
 }
 SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "d": 8, "f": 4, "s": 1}
 VECTORS: Final = {3: "Vector3", 4: "Quaternion", 9: "Matrix3"}
-WIDTH: Final = 120
 
 
 @dataclass(frozen=True)
@@ -254,17 +252,14 @@ class _Values:
         if not each.constants or not name or name in self.names or name == "Status":
             return []
         self.names.append(name)
-        lines = [f"class {name}(IntEnum):", _docstring(_first_sentence(each.comment), "    "), ""]
-        for constant in each.constants:
-            lines.append(f"    {_strip_prefix(constant.name, prefix)} = {constant.value}")
-            if constant.comment:
-                lines.append(_docstring(constant.comment, "    "))
+        about = each.comment.partition(": one of")[0].partition(". ")[0].rstrip(".:")
+        lines = [f"class {name}(IntEnum):", _docstring(f"{about}."), ""]
+        lines += [f"    {_strip_prefix(constant.name, prefix)} = {constant.value}" for constant in each.constants]
         return ["\n".join(lines)]
 
     def _write_classes(self, struct: Struct) -> list[str]:
         """Return the class of a struct, behind those of its rows and of its answer."""
         parts: list[str] = []
-        about = dict[str, str]()
         attributes = dict[str, tuple[str, str]]()
         answer = struct.answer
         for each in struct.fields:
@@ -275,49 +270,34 @@ class _Values:
                 name, _, row = count.options["rows"].partition(" ")
                 columns = struct.columns(count)
                 if row:
-                    parts.append(self._write_row(row, f"One row of `{name}` of {struct.value}.", columns))
+                    entries = [
+                        (each.value_name, self.annotation(each, element=True), self.default(each)) for each in columns
+                    ]
+                    parts.append(self._write_class(row, False, f"One row of `{name}` of {struct.value}.", entries))
                 element = row or f"tuple[{', '.join(self.annotation(column, element=True) for column in columns)}]"
                 attributes[name] = (f"tuple[{element}, ...]", count.options.get("default", ""))
             elif count is None and not struct.is_column_of_rows(each):
                 name = each.value_name
-                about[name] = f"{about[name]} {each.comment}" if name in about else each.comment
                 kind = each.of.partition(" ")[2] or self.annotation(each)
                 if name in attributes and not each.of.endswith(kind):
                     kind = f"tuple[{attributes[name][0]}, {kind}]"
                 attributes[name] = (kind, self.default(each))
         if answer is not None:
             parts += self._write_classes(answer)
-            about["answer"] = "None unless the status is OK."
             attributes["answer"] = (f"{answer.value} | None", "None")
         ordered = [(name, *attributes[name]) for name in struct.in_order({name: name for name in attributes})]
-        lines = [self._write_class(struct.value, struct.is_tuple, struct.comment, about, ordered)]
+        lines = [self._write_class(struct.value, struct.is_tuple, struct.comment, ordered)]
         for each in struct.fields:
             if "property" in each.options:
                 counted = struct.columns(each)[0].value_name
                 lines += ["", "    @property", f"    def {each.options['property']}(self) -> int:"]
-                lines += [_docstring(each.comment, "        "), f"        return len(self.{counted})"]
+                lines.append(f"        return len(self.{counted})")
         return [*parts, "\n".join(lines)]
 
-    def _write_row(self, name: str, text: str, columns: Sequence[Field]) -> str:
-        attributes = [(each.value_name, self.annotation(each, element=True), self.default(each)) for each in columns]
-        return self._write_class(name, False, text, {each.value_name: each.comment for each in columns}, attributes)
-
-    def _write_class(
-        self,
-        name: str,
-        is_tuple: bool,
-        text: str,
-        about: Mapping[str, str],
-        attributes: Iterable[tuple[str, str, str]],
-    ) -> str:
+    def _write_class(self, name: str, is_tuple: bool, text: str, attributes: Iterable[tuple[str, str, str]]) -> str:
         self.names.append(name)
-        lines = (
-            [f"class {name}(NamedTuple):"] if is_tuple else ["@dataclass(frozen=True, slots=True)", f"class {name}:"]
-        )
-        body = [*_wrap(f'"""{text}', 116), "", "Attributes", "----------"]
-        for attribute, comment in about.items():
-            body += [attribute, *(f"    {line}" for line in _wrap(comment, 112))]
-        lines += [f"    {line}".rstrip() for line in [*body, '"""', ""]]
+        lines = [f"class {name}(NamedTuple):" if is_tuple else f"@dataclass(frozen=True, slots=True)\nclass {name}:"]
+        lines += [_docstring(text), ""]
         lines += [f"    {each}: {kind}" + (f" = {default}" if default else "") for each, kind, default in attributes]
         return "\n".join(lines)
 
@@ -633,8 +613,7 @@ class _Reader:
         value = f"({', '.join(numbers)})"
         if "optional" not in each.options:
             return self._check_expression(each, value)
-        partial = "partial_" if "partial" in each.options else ""
-        known = f"read_{partial}{VECTORS[each.size].lower()}({value})"
+        known = f"read_{'partial' if 'partial' in each.options else 'known'}({value})"
         if "check" not in each.options:
             return known
         return f"None if ({name} := {known}) is None else {self._check_expression(each, name)}"
@@ -690,23 +669,9 @@ def _strip_prefix(name: str, prefix: str) -> str:
     return stripped if stripped.isidentifier() else name
 
 
-def _first_sentence(text: str) -> str:
-    return " ".join(text.split()).partition(": one of")[0].partition(". ")[0].rstrip(".:") + "."
-
-
-def _wrap(text: str, width: int) -> list[str]:
-    """Return the lines of a text; paragraphs and indented blocks stay."""
-    lines: list[str] = []
-    for paragraph in text.split("\n\n"):
-        lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""] if paragraph else [""]
-    return lines[:-1]
-
-
-def _docstring(text: str, indent: str) -> str:
-    lines = _wrap(text.strip(), WIDTH - len(indent) - 6)
-    if len(lines) == 1:
-        return f'{indent}"""{lines[0]}"""'
-    return "\n".join([f'{indent}"""{lines[0]}', *(f"{indent}{line}".rstrip() for line in lines[1:]), f'{indent}"""'])
+def _docstring(text: str) -> str:
+    """Return the docstring of a class; the page of the message types has the comment of each field and constant."""
+    return f'    """{" ".join(text.split())}"""'
 
 
 def generate(folder: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:

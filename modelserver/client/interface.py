@@ -1,4 +1,4 @@
-"""The queries that clients have in common: their signatures and documentation.
+"""The queries that clients have in common: their signatures, their documentation, and how arguments are checked.
 
 A client defines only how a request is answered: `Platform` sends it to the server, a `LocalPlatform` such as
 `PlatformMirror` computes the answer from a replica.
@@ -6,16 +6,17 @@ A client defines only how a request is answered: `Platform` sends it to the serv
 
 from __future__ import annotations
 
+import reprlib
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, NamedTuple, Self, TypeAlias, TypeVar
 
+import numpy as np
 import numpy.typing as npt
 
-from modelserver.client.batch_reply import BatchQuery, check_batch
-from modelserver.client.times import Time, to_utime
 from modelserver.errors import MalformedRequestError, WireError
 from modelserver.messages import (
     DynamicsAnswer,
@@ -37,6 +38,7 @@ from modelserver.messages import (
     Policy,
     PoseAnswer,
     PoseBatch,
+    PoseBatchReply,
     PoseDemand,
     RequestHeader,
     StateVectorReply,
@@ -44,7 +46,125 @@ from modelserver.messages import (
     TransformReply,
 )
 from modelserver.transforms.transformation import Transformation
+from modelserver.wire.fields import MAX_PAIRS
 from modelserver.wire.generated import pack_pose_demand, unpack_pose_demand
+
+Time: TypeAlias = int | datetime | np.datetime64
+"""An instant: microseconds since the Unix epoch, a datetime with a time zone, or a numpy.datetime64 (UTC)."""
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def to_utime(time: Time) -> int:
+    """Return an instant in microseconds since the Unix epoch.
+
+    Raises MalformedRequestError for a datetime without a time zone, and for anything else, such as seconds.
+    """
+    if isinstance(time, int | np.integer) and not isinstance(time, bool):
+        return int(time)
+    if isinstance(time, datetime):
+        if time.tzinfo is None:
+            raise MalformedRequestError(f"{time!r} has no time zone; write datetime.now(UTC), or .astimezone()")
+        return (time - _EPOCH) // timedelta(microseconds=1)
+    if isinstance(time, np.datetime64) and not np.isnat(time):
+        return int(time.astype("datetime64[us]").astype(np.int64))
+    hint = "; write int(1e6 * seconds)" if isinstance(time, float) else ""
+    raise MalformedRequestError(
+        f"a time is integer microseconds since 1970, a datetime or a numpy.datetime64, got {time!r}{hint}"
+    )
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+class BatchQuery(NamedTuple):
+    """A query of `PlatformClient.get_transformations`, with checked pairs and times."""
+
+    pairs: tuple[tuple[str, str], ...]
+    utimes: npt.NDArray[np.int64]
+    fixed_frame: str
+    reference_at: int
+    covariance: bool
+
+
+def check_batch(
+    pairs: Sequence[tuple[str, str]], at: Sequence[Time] | npt.NDArray[Any]
+) -> tuple[tuple[tuple[str, str], ...], npt.NDArray[np.int64]]:
+    """Return the pairs and times of a batch query. Raises MalformedRequestError where the wire cannot hold them."""
+    wanted = tuple((interest, reference) for interest, reference in pairs)
+    try:
+        given = np.asarray(at)
+        if given.dtype.kind == "M" or (given.dtype.kind == "O" and given.ndim == 1):
+            given = np.array([to_utime(each) for each in at], dtype=np.int64)
+        utimes = given.astype(np.int64)
+        is_integer = given.ndim == 1 and bool((utimes == given).all())
+    except (TypeError, ValueError, OverflowError):
+        is_integer = False
+    if not is_integer:
+        raise MalformedRequestError(
+            f"times must be integer microseconds since 1970, datetime or datetime64, got {reprlib.repr(at)}"
+        )
+    if not 1 <= len(wanted) <= MAX_PAIRS:
+        raise MalformedRequestError(f"a batch query has 1 to {MAX_PAIRS} pairs, got {len(wanted)}")
+    return wanted, utimes
+
+
+class BatchReplyAssembler:
+    """Collect the parts of one batch reply, received in any order and possibly more than once.
+
+    A retried request is answered again from newer data: parts of two replies are not mixed.
+    """
+
+    def __init__(self, decode: Callable[[bytes], PoseBatchReply]):
+        self._decode = decode
+        self._answers: dict[tuple[int, int], dict[int, PoseBatchReply]] = {}
+        self._parts: dict[int, PoseBatchReply] = {}
+
+    def add(self, data: bytes) -> bool:
+        """Add a part; return whether the reply is complete. Raises the QueryError in the reply, WireError."""
+        part = self._decode(data)
+        self._parts = self._answers.setdefault((part.header.utime, part.parts), {})
+        self._parts[part.part] = part
+        return len(self._parts) >= part.parts
+
+    def join(self, pairs: tuple[tuple[str, str], ...], utimes: npt.NDArray[np.int64]) -> list[PoseBatch]:
+        """Return the poses of each pair. Raises WireError where they are not those of `utimes`."""
+        of_pair: dict[int, list[PoseBatchReply]] = {}
+        for part in self._parts.values():
+            of_pair.setdefault(part.pair, []).append(part)
+        joined = []
+        for number, (interest, reference) in enumerate(pairs):
+            parts = sorted(of_pair.get(number, []), key=lambda part: part.first)
+            held = 0
+            for part in parts:
+                if part.first != held:
+                    raise WireError(
+                        "malformed", f"a part starts at instant {part.first}, but the previous one ends at {held}"
+                    )
+                held += 0 if part.poses is None else len(part.poses.vectors)
+            poses = concatenate([part.poses for part in parts if part.poses is not None])
+            if len(poses.vectors) != len(utimes):
+                raise WireError("malformed", f"{len(poses.vectors)} poses received for {len(utimes)} instants")
+            joined.append(poses._replace(frame_of_interest=interest, frame_of_reference=reference, utimes=utimes))
+        return joined
+
+
+def concatenate(parts: list[PoseBatch]) -> PoseBatch:
+    """Concatenate batches of one pair's poses in time. Raises WireError for none."""
+    if not parts:
+        raise WireError("malformed", "the reply has status OK and no poses")
+    first, *more = parts
+    if not more:
+        return first
+    # an array that one part does not have is none of the whole: the covariances
+    columns = [[each for each in column if isinstance(each, np.ndarray)] for column in zip(*parts, strict=True)]
+    return PoseBatch._make(
+        np.concatenate(column) if len(column) == len(parts) else None if column else value
+        for column, value in zip(columns, first, strict=True)
+    )
+
+
+# --- the client -------------------------------------------------------------------------------------------------------
 
 R = TypeVar("R")
 A = TypeVar("A")
@@ -80,7 +200,7 @@ class FrameClient(ABC):
         max_horizontal, max_heading
             The errors, m and rad, may be beyond them with a probability of 1 - min_integrity at most.
         max_age
-            Largest age of the newest data, s.
+            Largest age of the newest data, s; in a `PlatformMirror` that of the newest published pose.
         min_integrity
             0 for 0.99. If it is stated the pose must be valid; without limits above the configured ones must hold with
             it.

@@ -28,7 +28,7 @@ from modelserver.core.state import (
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
 from modelserver.named_tuples import new_tuple
-from modelserver.query import PlatformView
+from modelserver.query.view import PlatformView
 
 COMMAND_FUTURE_LIMIT_S: Final = 1.0
 """A command stamped this far ahead of the host's clock is rejected: one of the two clocks is wrong."""

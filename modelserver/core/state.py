@@ -16,8 +16,8 @@ from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
 from modelserver.joints.history import JointHistory
 from modelserver.named_tuples import new_tuple
-from modelserver.query import PlatformView
 from modelserver.query.answers import DeferredAnswer
+from modelserver.query.view import PlatformView
 
 MAX_COUNTERS: Final = 256
 """Distinct causes of rejection with a counter of their own; further ones share one."""

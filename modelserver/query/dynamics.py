@@ -32,10 +32,8 @@ from modelserver.messages import (
     StabilityHealth,
     TimeQuery,
 )
-from modelserver.query.joint_lookup import JointReadings
-from modelserver.query.motion import compute_motion
-from modelserver.query.steps import Steps
-from modelserver.query.view import PlatformView
+from modelserver.query.path import compute_motion
+from modelserver.query.view import JointReadings, PlatformView, Steps
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array

@@ -29,8 +29,14 @@ from modelserver.errors import BusError, WireError, quote
 from modelserver.messages import Gauges, GetBodyList, Health, RequestHeader
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, to_subscription_pattern
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, handle_message, open_lcm
-from modelserver.wire.urls import UdpAddress, make_route_command, parse_udp_address
+from modelserver.wire.provider import (
+    RECEIVE_BUFFER_BYTES,
+    UdpAddress,
+    handle_message,
+    make_route_command,
+    open_lcm,
+    parse_udp_address,
+)
 
 if TYPE_CHECKING:
     import lcm

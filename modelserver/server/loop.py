@@ -45,11 +45,10 @@ from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.reloading import PollReload
 from modelserver.server.requests import LATE_TICK_NS, RequestHandler
-from modelserver.wire.codec import encode, fingerprint_of
+from modelserver.wire.codec import encode, fingerprint_of, split_snapshot
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
-from modelserver.wire.snapshot import split_snapshot
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,7 @@ from modelserver import messages
 from modelserver.core.source_clocks import SPREAD_S, format_offset
 from modelserver.server.clock import Clock
 from modelserver.server.ingress import peek_sample_id
-from modelserver.wire.codec import fingerprint_of, get_type_name
-from modelserver.wire.encoded import restamp
+from modelserver.wire.codec import fingerprint_of, get_type_name, restamp
 from modelserver.wire.eventlog import LogEvent
 
 LARGEST_DELAY_S: Final = 5.0

@@ -27,9 +27,8 @@ from modelserver.core import CoreState, Instant
 from modelserver.errors import Status, WireError
 from modelserver.messages import GetDynamics, GetHistory, GetTransformations, Request
 from modelserver.named_tuples import new_tuple
-from modelserver.query import HISTORY_LIMIT
 from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer, effort_of, is_deferred
-from modelserver.query.steps import Steps, complete
+from modelserver.query.view import HISTORY_LIMIT, Steps, complete
 from modelserver.server.bus import Bus, Handler
 from modelserver.server.clock import Clock
 from modelserver.server.ingress import CommandVerifier

@@ -30,7 +30,7 @@ from modelserver.server.ingress import MODE_TYPE, CommandVerifier, SensorChannel
 from modelserver.signing import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import get_type_name
-from modelserver.wire.urls import leaves_machine
+from modelserver.wire.provider import leaves_machine
 
 if TYPE_CHECKING:
     from modelserver.estimation.modes import LocalizerConfig

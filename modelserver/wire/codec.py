@@ -1,4 +1,7 @@
-"""Codec: bytes of a wire type, and the values that the core exchanges; with shortcuts on the hot path of a query."""
+"""Codec: bytes of a wire type, and the values that the core exchanges; with shortcuts on the hot path of a query.
+
+Behind it: what can be read and changed in a message without decoding it, and the parts of the geometry's snapshot.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from modelserver.errors import Status, WireError
-from modelserver.messages import Policy, PoseAnswer, PoseDemand, Reply, RequestHeader, TransformReply
+from modelserver.messages import Policy, PoseAnswer, PoseDemand, Reply, RequestHeader, SnapshotPart, TransformReply
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.fields import LENGTH, MAX_UTIME, Codec, check_end, pack_text, read_text
 from modelserver.wire.generated import CODECS, FINGERPRINTS
+from modelserver.wire.journal import MAGIC
 from modelserver.wire.poses import PLAIN, UTIME, read_transform_numbers
 
 _BY_TYPE_NAME: Final[Mapping[str, Codec]] = {codec.type_name: codec for codec in CODECS}
@@ -207,3 +212,96 @@ class StaticReplyCache:
         if len(self._entries) >= self._capacity:
             self._entries.popitem(last=False)
         self._entries[pair] = encoded[_AFTER_UTIME:]
+
+
+# --- encoded messages, without decoding them --------------------------------------------------------------------------
+
+_INPUTS: Final = frozenset(
+    FINGERPRINTS[channel.type_name]
+    for channel in CHANNELS
+    # signed commands are no inputs for playback: signatures protect against replayed commands
+    if channel.use in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.type_name != "signed_t"
+)
+_SERVICE: Final = frozenset(codec.fingerprint for codec in CODECS) - _INPUTS | {MAGIC}
+_STAMPED: Final = frozenset(
+    codec.fingerprint for codec in CODECS if codec.value.__annotations__.get("header") == "SensorHeader"
+)
+_TYPES: Final = {fingerprint: name for name, fingerprint in FINGERPRINTS.items()}
+
+
+def type_name_of(data: bytes) -> str:
+    """Return the name of the wire type of a message, empty for a foreign type."""
+    return _TYPES.get(data[:8], "")
+
+
+def is_stamped(data: bytes) -> bool:
+    """Return whether a message begins with a sensor header: a sample, or a localization mode command."""
+    return data[:8] in _STAMPED
+
+
+def is_of_service(data: bytes) -> bool:
+    """Return whether a message is a report, request, signed command or reply of the service, or a journal section."""
+    return data[:8] in _SERVICE
+
+
+_STAMPS = struct.Struct(">qdq")
+"""First fields of the sensor header, behind the fingerprint: utime, utime_sigma, host_utime."""
+
+_SINCE = struct.Struct(">q")
+_SOURCE_AT: Final = 48
+"""Offset of the source, the last field of the sensor header."""
+
+_RELATIVE: Final = FINGERPRINTS["relative_pose_t"]
+
+
+def restamp(data: bytes, shift: int) -> bytes:
+    """Return a stamped message with its stamps shifted by `shift` microseconds; other messages are returned unchanged.
+
+    The stamps are utime, host_utime, and since_utime of a relative pose.
+    """
+    if not is_stamped(data) or len(data) < 8 + _STAMPS.size:
+        return data
+    utime, sigma, host_utime = _STAMPS.unpack_from(data, 8)
+    restamped = bytearray(data)
+    try:
+        _STAMPS.pack_into(restamped, 8, utime + shift, sigma, host_utime + shift if host_utime else 0)
+        if data[:8] == _RELATIVE:
+            # since_utime is the first field behind the header
+            _, at = read_text(data, _SOURCE_AT)
+            (since,) = _SINCE.unpack_from(data, at)
+            _SINCE.pack_into(restamped, at, since + shift)
+    except (WireError, struct.error):
+        return data  # damaged: the receiver counts it
+    return bytes(restamped)
+
+
+# --- the geometry's snapshot ------------------------------------------------------------------------------------------
+
+PART_BYTES: Final = 1200
+"""Of payload: with its header a part fits an Ethernet frame, so that none is lost for a piece of it."""
+
+
+def split_snapshot(data: bytes, revision: str, utime: int) -> list[SnapshotPart]:
+    """Return the parts of a snapshot's bytes."""
+    pieces = [data[start : start + PART_BYTES] for start in range(0, len(data), PART_BYTES)]
+    return [SnapshotPart(utime, revision, number, len(pieces), piece) for number, piece in enumerate(pieces)]
+
+
+class SnapshotAssembler:
+    """Puts the parts of snapshots together, in whatever order they come; holds one revision at a time."""
+
+    def __init__(self) -> None:
+        self._revision = ""
+        self._count = 0
+        self._parts: dict[int, bytes] = {}
+
+    def add(self, part: SnapshotPart) -> bytes | None:
+        """Take a part; return the whole when it is complete, None before."""
+        if (part.model_revision, part.parts) != (self._revision, self._count):
+            self._revision, self._count, self._parts = part.model_revision, part.parts, {}
+        self._parts[part.part] = part.data
+        if len(self._parts) < self._count:
+            return None
+        whole = b"".join(self._parts[number] for number in range(self._count))
+        self._parts = {}
+        return whole

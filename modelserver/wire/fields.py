@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from modelserver.errors import WireError, quote
 from modelserver.messages import RelativePoseSample, SnapshotPart
-from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3
+from modelserver.transforms.so3 import Quaternion, Vector3
 
 NAN3 = (math.nan,) * 3
 NAN4 = (math.nan,) * 4
@@ -65,6 +65,7 @@ ROTATION_TOLERANCE = 1e-6
 
 E = TypeVar("E", bound=IntEnum)
 T = TypeVar("T")
+V = TypeVar("V", bound=tuple[float, ...])
 
 
 class Codec(NamedTuple):
@@ -77,30 +78,20 @@ class Codec(NamedTuple):
     unpack: Callable[[bytes, int], tuple[Any, int]]
 
 
-def read_vector3(values: Sequence[float]) -> Vector3 | None:
-    """Return three numbers, or None where one is nan."""
-    x, y, z = values
-    return None if x != x or y != y or z != z else (x, y, z)
+def read_known(values: V) -> V | None:
+    """Return numbers, or None where one is nan."""
+    for value in values:
+        if value != value:
+            return None
+    return values
 
 
-def read_partial_vector3(values: Sequence[float]) -> Vector3 | None:
-    """Return three numbers, or None where all are nan."""
-    x, y, z = values
-    return None if x != x and y != y and z != z else (x, y, z)
-
-
-def read_quaternion(values: Sequence[float]) -> Quaternion | None:
-    """Return four numbers, or None where one is nan."""
-    w, x, y, z = values
-    return None if w != w or x != x or y != y or z != z else (w, x, y, z)
-
-
-def read_matrix3(values: Sequence[float]) -> Matrix3 | None:
-    """Return nine numbers, or None where one is nan."""
-    a, b, c, d, e, f, g, h, i = values
-    if a != a or b != b or c != c or d != d or e != e or f != f or g != g or h != h or i != i:
-        return None
-    return (a, b, c, d, e, f, g, h, i)
+def read_partial(values: V) -> V | None:
+    """Return numbers, or None where all are nan."""
+    for value in values:
+        if value == value:
+            return values
+    return None
 
 
 def check_finite(values: Sequence[float], what: str) -> tuple[float, ...]:

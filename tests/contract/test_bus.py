@@ -239,7 +239,7 @@ def test_given_a_bus_that_cannot_be_joined_then_the_error_names_what_to_check(
     def reject(url: str) -> None:
         raise OSError("no way out")
 
-    monkeypatch.setattr("modelserver.wire.provider.lcm.LCM", reject)
+    monkeypatch.setattr("lcm.LCM", reject)
     url = "udpm://239.1.2.3:7667?ttl=0"
     with pytest.raises(BusError, match=r"sudo ip route replace 239\.1\.2\.3/32 dev lo") as caught:
         LcmBus(url)

@@ -18,8 +18,7 @@ from support_lcm import TIMEOUT_S, reserved_url
 from modelserver import Platform, PlatformMirror, SensorPublisher
 from modelserver.errors import BusError
 from modelserver.server.bus import LcmBus
-from modelserver.wire.provider import SELECT_LIMIT, handle_message, open_lcm
-from modelserver.wire.urls import find_url_problem
+from modelserver.wire.provider import SELECT_LIMIT, find_url_problem, handle_message, open_lcm
 from mstools.commands.status import DaemonListener
 
 WAIT_MS = 1000

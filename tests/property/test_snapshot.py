@@ -14,7 +14,7 @@ from modelserver.errors import WireError
 from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot, encode_snapshot
 from modelserver.geometry.model import Model
 from modelserver.messages import SnapshotPart
-from modelserver.wire.snapshot import SnapshotAssembler, split_snapshot
+from modelserver.wire.codec import SnapshotAssembler, split_snapshot
 
 
 def snapshot(model: Model) -> ModelSnapshot:

@@ -19,8 +19,7 @@ import modelserver as ms
 from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader
 from modelserver.transforms import Pose, Transformation
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.snapshot import SnapshotAssembler
+from modelserver.wire.codec import SnapshotAssembler, decode, encode
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "moving-geometry.md"
 StartDaemon = Callable[..., Daemon]

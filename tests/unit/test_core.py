@@ -71,7 +71,7 @@ from modelserver.messages import (
     WheelsSample,
 )
 from modelserver.query.answers import DeferredAnswer
-from modelserver.query.steps import complete
+from modelserver.query.view import complete
 from modelserver.wire.codec import encode
 
 S = 1_000_000

@@ -27,10 +27,9 @@ from modelserver.joints.track import (
     Provenance,
 )
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
-from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
-from modelserver.query.motion import compute_motion
-from modelserver.query.steps import complete
+from modelserver.query.path import compute_motion
+from modelserver.query.view import PlatformView, complete
 
 
 def at(seconds: float) -> int:

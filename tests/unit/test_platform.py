@@ -23,8 +23,7 @@ from modelserver.errors import (
 from modelserver.estimation.history import History
 from modelserver.geometry import names
 from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
-from modelserver.query import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
-from modelserver.query.steps import complete
+from modelserver.query.view import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView, complete
 from modelserver.transforms import Pose, so3
 
 S = 1_000_000

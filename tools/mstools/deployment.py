@@ -28,7 +28,7 @@ from urllib.parse import parse_qs, urlsplit
 import typer
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
-from modelserver.wire.urls import group_of
+from modelserver.wire.provider import group_of
 from mstools.terminal.output import ProblemCollector, escape, make_error
 
 CONFIGURATION: Final = "/etc/modelserver"

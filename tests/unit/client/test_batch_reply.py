@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.client.batch_reply import BatchReplyAssembler, concatenate
+from modelserver.client.interface import BatchReplyAssembler, concatenate
 from modelserver.errors import WireError
 from modelserver.messages import GetTransformations, PoseBatchReply, RequestHeader
 from modelserver.query.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.query.batch import lookup_batch
-from modelserver.query.steps import complete
+from modelserver.query.view import complete
 from modelserver.wire.codec import decode, encode
 
 PAIRS = ((SCAN, UTM), (DEEP, BASE))

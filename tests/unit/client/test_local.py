@@ -14,12 +14,11 @@ from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, estimate, truth
 
 import modelserver as ms
 from modelserver.client.interface import PlatformClient
-from modelserver.client.local import LocalPlatform
-from modelserver.client.mirror import PlatformMirror
+from modelserver.client.mirror import LocalPlatform, PlatformMirror
 from modelserver.client.mirror_state import MirrorReceiver
 from modelserver.client.remote import Platform
 from modelserver.messages import MAX_REQUEST_INSTANTS, Policy, PoseDemand, TimeQuery, Unmet
-from modelserver.query.demand import check_demand
+from modelserver.query.answers import check_demand
 
 NOW = T0 + 2 * S + 5_000
 QUESTIONS = [*sorted(name for name in dir(PlatformClient) if name.startswith("get_")), "explain", "close"]

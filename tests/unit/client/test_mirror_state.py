@@ -15,16 +15,13 @@ from support_moving import BASE, DEEP, ODOM, SCAN, SURVEY, T0, UTM, S, estimate,
 from support_moving import view as exact_view
 
 import modelserver as ms
-from modelserver.client.extrapolation import PublishedEstimate
-from modelserver.client.mirror_state import MAX_COUNTERS, MirrorReceiver
+from modelserver.client.mirror_state import MAX_COUNTERS, MirrorReceiver, PublishedEstimate
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.messages import Invalid, Policy, Quality, SnapshotPart, TimeQuery
-from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
-from modelserver.query.explanation import explain
-from modelserver.query.motion import compute_motion
-from modelserver.query.steps import complete
+from modelserver.query.path import compute_motion, explain
+from modelserver.query.view import PlatformView, complete
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import encode
 

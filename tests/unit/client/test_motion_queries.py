@@ -32,9 +32,8 @@ from modelserver.messages import (
 )
 from modelserver.query.answers import DeferredAnswer
 from modelserver.query.batch import lookup_batch
-from modelserver.query.explanation import explain
-from modelserver.query.motion import compute_motion
-from modelserver.query.steps import complete
+from modelserver.query.path import compute_motion, explain
+from modelserver.query.view import complete
 from modelserver.wire.codec import decode, encode
 
 HELD = view(2.0)

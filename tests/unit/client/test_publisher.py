@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 from support_lcm import Listener
 
 import modelserver as ms
-from modelserver.client.batch_reply import check_batch
-from modelserver.client.pose_stream import MAX_WAITING, PoseStream
-from modelserver.client.times import to_utime
+from modelserver.client.interface import check_batch, to_utime
+from modelserver.client.remote import MAX_WAITING, PoseStream
 from modelserver.earth.geodesy import origin_at
 from modelserver.errors import MalformedRequestError
 from modelserver.messages import Direction, FixType, PoseAnswer

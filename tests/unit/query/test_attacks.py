@@ -14,8 +14,8 @@ from modelserver.geometry.joint import Joint, JointType
 from modelserver.joints.history import JointHistory
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader, TimeQuery
 from modelserver.query.batch import lookup_batch
-from modelserver.query.motion import compute_motion
-from modelserver.query.steps import complete
+from modelserver.query.path import compute_motion
+from modelserver.query.view import complete
 from modelserver.transforms.pose import Pose
 
 

@@ -15,9 +15,8 @@ from modelserver.errors import LimitError, NoPoseError, QueryError, Status, Unkn
 from modelserver.estimation.history import History
 from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.messages import MAX_REQUEST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
-from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
-from modelserver.query.steps import complete
+from modelserver.query.view import PlatformView, complete
 from modelserver.transforms.pose import Pose
 
 FINGER = "Finger:Tip"

@@ -32,9 +32,8 @@ from modelserver.messages import (
     TransformReply,
     Unmet,
 )
-from modelserver.query import PlatformView
-from modelserver.query.answers import compute_replies, effort_of
-from modelserver.query.demand import check_demand, find_unmet
+from modelserver.query.answers import check_demand, compute_replies, effort_of, find_unmet
+from modelserver.query.view import PlatformView
 from modelserver.simulation import figure_eight
 from modelserver.transforms import Pose, Transformation
 from modelserver.transforms.so3 import Array

@@ -11,8 +11,8 @@ from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, view
 
 from modelserver.joints.history import JointHistory
 from modelserver.messages import JointSample, JointsSample, Policy, SensorHeader, TimeQuery
-from modelserver.query import PlatformView
-from modelserver.query.explanation import explain
+from modelserver.query.path import explain
+from modelserver.query.view import PlatformView
 from modelserver.transforms.pose import Pose
 
 NOW = T0 + 2 * S

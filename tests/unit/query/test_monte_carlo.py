@@ -15,7 +15,7 @@ from support_moving import BASE, DEEP, SCAN, T0, UTM, S, estimate, vehicle, view
 from modelserver.estimation.history import History
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.messages import TimeQuery
-from modelserver.query import PlatformView
+from modelserver.query.view import PlatformView
 from modelserver.transforms import pose_array as arrays
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.pose_array import PoseArray

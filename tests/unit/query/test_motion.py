@@ -16,8 +16,8 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.joints.history import JointHistory
 from modelserver.messages import JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
-from modelserver.query import PlatformView
-from modelserver.query.motion import compute_motion
+from modelserver.query.path import compute_motion
+from modelserver.query.view import PlatformView
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array

@@ -30,9 +30,8 @@ from modelserver.messages import (
     TimeQuery,
     TransformReply,
 )
-from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
-from modelserver.query.steps import complete
+from modelserver.query.view import PlatformView, complete
 from modelserver.transforms.pose import Pose
 
 METERS, RADIANS = 0.001, math.radians(0.02)

@@ -12,7 +12,7 @@ from modelserver.estimation.history import History
 from modelserver.formats import load_model
 from modelserver.joints.history import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, SensorHeader, TimeQuery
-from modelserver.query import PlatformView
+from modelserver.query.view import PlatformView
 from modelserver.transforms.pose import Pose
 
 RAPTOR = load_model(Path(__file__).parents[3] / "config" / "raptor" / "geometry.yaml")

@@ -28,8 +28,7 @@ from modelserver.server.diagnostics import (
     report_findings,
 )
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, resolve_url
-from modelserver.wire.urls import UdpAddress, parse_udp_address
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress, parse_udp_address, resolve_url
 
 LO = NetworkInterface("lo", multicast=True, loopback=True)
 ETH = NetworkInterface("eth0")

@@ -12,7 +12,7 @@ from modelserver.errors import BusError
 from modelserver.server import diagnostics as machine
 from modelserver.server.diagnostics import read_gauges, read_resident_bytes
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.urls import UdpAddress
+from modelserver.wire.provider import UdpAddress
 
 UDP = """  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid timeout inode ref p drops
   1: 00000000:1DF3 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 1 2 0000000000000000 5

@@ -49,8 +49,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.loop import MAX_RELOADS, Hooks, Loop, LoopSettings
 from modelserver.server.reloading import GeometryReader, PollReload, read_geometry
 from modelserver.server.vehicle import Vehicle, load_vehicle
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.snapshot import PART_BYTES, SnapshotAssembler
+from modelserver.wire.codec import PART_BYTES, SnapshotAssembler, decode, encode
 
 S = 1_000_000
 FULL, RAW = VEHICLE, VEHICLE + "localization: {mode: raw}\n"

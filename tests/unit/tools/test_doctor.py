@@ -26,8 +26,7 @@ from modelserver.server.diagnostics import (
     get_worst_level,
 )
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
-from modelserver.wire.urls import UdpAddress
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress
 from msdrivers.settings import read_drivers
 from mstools.cli import main
 from mstools.commands import doctor

@@ -21,8 +21,7 @@ from modelserver.messages import (
     PoseAnswer,
     TimeQuery,
 )
-from modelserver.query.explanation import explain
-from modelserver.query.motion import compute_motion
+from modelserver.query.path import compute_motion, explain
 from modelserver.transforms import Pose, Transformation, so3
 from mstools.cli import main
 from mstools.commands.query import (

@@ -18,8 +18,7 @@ from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.transforms import Pose
-from modelserver.wire.codec import encode
-from modelserver.wire.snapshot import split_snapshot
+from modelserver.wire.codec import encode, split_snapshot
 from mstools.cli import main
 from mstools.commands.tree import build_nodes, draw_lines, draw_svg
 from mstools.terminal.output import replace_unencodable

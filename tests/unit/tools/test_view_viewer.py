@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
-from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import MirrorState
 from modelserver.messages import VALID, ChannelHealth, Health
 from mstools.commands.demo import find_vehicle_file

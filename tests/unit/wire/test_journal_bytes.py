@@ -8,7 +8,7 @@ from pathlib import Path
 import lcm
 import pytest
 
-from modelserver.wire.encoded import is_of_service
+from modelserver.wire.codec import is_of_service
 from modelserver.wire.journal import (
     CHANNEL,
     MAGIC,

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.urls import GROUP, group_of, make_route_command
+from modelserver.wire.provider import GROUP, group_of, make_route_command
 
 
 @pytest.mark.parametrize(

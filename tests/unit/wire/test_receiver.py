@@ -18,7 +18,7 @@ from support_lcm import TIMEOUT_S, reserved_url
 
 from modelserver.errors import BusError
 from modelserver.wire import receiver as module
-from modelserver.wire.provider import resolve_url
+from modelserver.wire.provider import UdpAddress, parse_udp_address, resolve_url
 from modelserver.wire.receiver import (
     MAX_IGNORED,
     MAX_PARTIAL,
@@ -31,7 +31,6 @@ from modelserver.wire.receiver import (
     UdpReceiver,
     open_receiver,
 )
-from modelserver.wire.urls import UdpAddress, parse_udp_address
 
 
 def wait_for(receiver: Receiver) -> tuple[bytes, bytes]:

@@ -8,8 +8,7 @@ import pytest
 from support_wire import EXAMPLES
 
 from modelserver.messages import GetBodyList, RelativePoseSample, RequestHeader
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.encoded import is_of_service, is_stamped, restamp
+from modelserver.wire.codec import decode, encode, is_of_service, is_stamped, restamp
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.provider import resolve_url
-from modelserver.wire.urls import EXAMPLE, find_url_problem
+from modelserver.wire.provider import EXAMPLE, find_url_problem, resolve_url
 
 
 @pytest.mark.parametrize(

@@ -88,8 +88,7 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     from modelserver.server.diagnostics import HostClockMonitor, discover_servers, probe_delivery, read_bus_facts
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
-    from modelserver.wire.provider import resolve_url
-    from modelserver.wire.urls import find_url_problem
+    from modelserver.wire.provider import find_url_problem, resolve_url
 
     vehicle: VehicleConfig | None = None
     versions = f"modelserver {__version__}, lcm {version('lcm')}, Python {platform.python_version()}"

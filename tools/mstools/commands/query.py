@@ -412,15 +412,15 @@ class FileAnswers(FrameClient):
         )
         if not any(demand):
             return answer
-        from modelserver.query.demand import find_unmet
+        from modelserver.query.answers import find_unmet
 
         unmet, reason = find_unmet(answer, demand, age=math.inf if rests else 0.0)
         return answer._replace(unmet=unmet, unmet_reason=reason)
 
     def _query(self, request: Any, reply_type: type[R]) -> R:
         from modelserver.estimation.history import History
-        from modelserver.query import PlatformView
         from modelserver.query.answers import compute_answer
+        from modelserver.query.view import PlatformView
 
         if isinstance(request, GetMotion):
             raise ModelServerError("a geometry file has no motion; query the daemon")

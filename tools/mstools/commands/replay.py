@@ -20,7 +20,7 @@ import typer
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
-from modelserver.wire.encoded import is_of_service
+from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.terminal.options import JsonOption, UrlOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, open_atomic, show_progress, to_json

@@ -194,7 +194,7 @@ class HealthListener(DaemonListener):
 
 def probe_channels(bus: lcm.LCM, seconds: float = PROBE_S) -> dict[str, bool]:
     """Return the channels with messages, and whether each had a health report."""
-    from modelserver.wire.encoded import type_name_of
+    from modelserver.wire.codec import type_name_of
 
     found: dict[str, bool] = {}
 

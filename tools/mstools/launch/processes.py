@@ -25,7 +25,7 @@ from typing import Any, Final
 import yaml
 
 from modelserver.errors import ModelServerError
-from modelserver.wire.urls import make_route_command
+from modelserver.wire.provider import make_route_command
 from mstools.terminal.output import write_file
 
 STOP_TIMEOUT_S: Final = 3.0

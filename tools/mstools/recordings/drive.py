@@ -46,10 +46,9 @@ from modelserver.messages import (
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
 from modelserver.wire.channels import BY_NAME
-from modelserver.wire.codec import decode, fingerprint_of
+from modelserver.wire.codec import SnapshotAssembler, decode, fingerprint_of
 from modelserver.wire.fields import read_text
 from modelserver.wire.provider import handle_message
-from modelserver.wire.snapshot import SnapshotAssembler
 
 if TYPE_CHECKING:
     import lcm

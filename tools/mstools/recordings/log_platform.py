@@ -10,17 +10,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.errors import QueryError, RecordingError, WireError
 from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.messages import Policy, PoseAnswer, SnapshotPart, TimeQuery
-from modelserver.query import PlatformView
-from modelserver.wire.codec import decode
+from modelserver.query.view import PlatformView
+from modelserver.wire.codec import SnapshotAssembler, decode
 from modelserver.wire.eventlog import LogEvent, LogFile
-from modelserver.wire.snapshot import SnapshotAssembler
 from mstools.recordings.drive import read_stamp
 
 CORRECTION_WINDOW_US: Final = 2_000_000
