@@ -143,7 +143,9 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
         state = state._replace(gnss=state.gnss.restart(utime))
         text = "fixes are trusted again: they agree with dead reckoning"
         return state, (report_event(state, KIND, Verdict.USED, text),)
-    return _correct(setup, _suspect_path(setup, state, newest), bank)
+    assert fix is not None
+    after = after.suspect_path(utime, fix, setup.settings, begins=not bank.excludes_fixes)
+    return _correct(setup, state._replace(bank=after), bank)
 
 
 def _ends_outage(state: Aligned) -> bool:
@@ -151,28 +153,6 @@ def _ends_outage(state: Aligned) -> bool:
     rejected = state.gnss.rejected
     first = rejected[0].utime if rejected else state.nav.utime
     return first - state.gnss.used_utime >= OUTAGE_US
-
-
-def _suspect_path(setup: Setup, state: Aligned, newest: PathFix) -> Aligned:
-    """Return the state after a fix that is not used; those with the shape of the path may be right, and it was lost."""
-    bank, settings = state.bank, setup.settings
-    assert bank is not None
-    reckoning = bank.reckoning
-    lever = newest.arm * cmath.rect(1.0, -state.nav.yaw)
-    path = reckoning.path + cmath.rect(1.0, reckoning.heading) * lever
-    gnss = state.gnss.reject(newest._replace(path=path), settings, is_speed_measured=True)
-    state = state._replace(gnss=gnss)
-    fit = gnss.fit_rejected(state.nav, settings)
-    if fit is None:
-        return state
-    heading = wrap_angle(fit.rotation.angle + reckoning.heading)
-    _, limit = output.get_limits(setup, state)
-    turned = abs(wrap_angle(heading - bank.pose[2]))
-    if turned < max(limit, CERTAIN_SIGMAS * fit.rotation.sigma) and not bank.may_be_lost:
-        return state  # fixes that are off by a constant, or drift slowly, look the same
-    place = newest.position - cmath.rect(1.0, heading) * lever
-    bank = bank.suspect_path(state.nav.utime, (place.real, place.imag, heading), fit.rotation.sigma, settings)
-    return state._replace(bank=bank)
 
 
 def distrust_path(setup: Setup, state: Aligned) -> Aligned:

@@ -20,8 +20,8 @@ which one of them begins or ends, with the rate of `FAULTS` as prior. The weight
 of the fix, with shares of outliers and of fixes that show nothing, so that no single fix settles a cause. Hypotheses of
 one kind that began at about the same time are merged by their moments.
 
-Dead reckoning may have been lost itself, in an outage or by a turn that no gyro measured: where fixes that are off have
-the shape of its path, another hypothesis begins at the pose that they show (`suspect_path`).
+Dead reckoning may have been lost itself, in an outage or by a turn that no gyro measured: where fixes are off, other
+hypotheses begin at their place, in all directions (`suspect_path`).
 
 One of them is published: the likeliest, once those near it weigh `CERTAIN` together. The error of a pose is then the
 mixture sum_h w_h N(p_h - p, P_h): its tails are the levels, and the risk of a limit (`compute_bounds`). The protection
@@ -168,9 +168,15 @@ PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
 LOST_SHARE, LOST_AFTER_OUTAGE = 1e-3, 0.1
-"""Probability that dead reckoning was lost where fixes that are off have the shape of its path, turned: a tenth of the
-risk with which a pose is valid, so that it alone makes none invalid. And after an outage: gyro and wheels fail at a
-tenth of the rate at which fixes jump (`FAULTS`)."""
+"""Probability that dead reckoning was lost where fixes are off: a tenth of the risk with which a pose is valid, so that
+it alone makes none invalid. And after an outage: gyro and wheels fail at a tenth of the rate at which fixes jump
+(`FAULTS`)."""
+
+REFUTED: Final = 0.01
+"""Share of its first weight at which such a hypothesis is refuted: one fix leaves VOID_SHARE, so more than one did."""
+
+TURNS: Final = 8
+"""Directions in which dead reckoning that was lost may go on: 22.5 degrees either way, equation (3) is a line."""
 
 OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
 """Meters that a vehicle has driven by itself, four lengths of a car, and standard deviations of a rate at which
@@ -322,28 +328,34 @@ class HypothesisBank(NamedTuple):
         may_be_lost = excludes and (self.may_be_lost if self.excludes_fixes else is_outage)
         return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported, may_be_lost=may_be_lost)
 
-    def suspect_path(
-        self, utime: int, pose: tuple[float, float, float], heading_sigma: float, settings: FilterSettings
-    ) -> HypothesisBank:
-        """Return the bank beside the hypothesis that dead reckoning was lost, and that fixes are right.
+    def suspect_path(self, utime: int, fix: PlanarFix, settings: FilterSettings, *, begins: bool) -> HypothesisBank:
+        """Return the bank beside the hypotheses that dead reckoning was lost, and that fixes which are off are right.
 
-        `pose` is the one that fixes show: east, north (m), heading (rad). It is a fault of the gyro, and one at a time.
+        The vehicle is where `fix` is, in one of TURNS directions. `begins`: whether the fix is the first one that is
+        off; after an outage any direction may be right, else one that differs by more than fixes which drift show.
         """
-        share = LOST_AFTER_OUTAGE if self.may_be_lost else LOST_SHARE
-        if self.weights[(self.faults == Fault.GYRO) & (self.jumped == 0)].sum() > share:
+        is_lost = begins and self.may_be_lost
+        share = LOST_AFTER_OUTAGE if is_lost else LOST_SHARE
+        own = (self.faults == Fault.GYRO) & (self.jumped == 0)
+        # those that fixes have refuted begin again: the vehicle may turn unmeasured later
+        if self.weights[own].sum() > (share if begins else REFUTED * share):
             return self
-        mean, P = self.means[self.published].copy(), np.zeros((SIZE, SIZE))
-        mean[:3] = pose
-        mean[ERROR:] = 0.0
+        turns = np.arange(0 if is_lost else 1, TURNS) * math.tau / TURNS
+        n = len(turns)
+        means = np.repeat(self.means[self.published][None], n, axis=0)
+        means[:, HEADING] += turns
+        place = fix.position - np.exp(1j * means[:, HEADING]) * fix.lever
+        means[:, EAST], means[:, NORTH], means[:, ERROR:] = place.real, place.imag, 0.0
         variances = np.diagonal(self.covariances[self.published]).copy()
         variances[[EAST, NORTH, ERROR, ERROR + 1]] = self.sigma**2
-        variances[HEADING] = heading_sigma**2
+        variances[HEADING] = (math.pi / TURNS) ** 2
         variances[BIAS] += (0.5 * settings.gyro_bias_step) ** 2
         variances[ERROR_RATE:] = 0.0
-        P[np.diag_indices(SIZE)] = variances
-        labels = np.array(((Fault.GYRO, 0, 0),))
         bank = self._replace(weights=self.weights * (1.0 - share))
-        return bank._append(mean[None], P[None], np.array((share,)), labels, np.array((utime,)))
+        labels, onsets = np.array(((Fault.GYRO, 0, 0),) * n), np.full(n, utime)
+        return bank._append(
+            means, np.repeat(np.diag(variances)[None], n, axis=0), np.full(n, share / n), labels, onsets
+        )
 
     @property
     def offset(self) -> complex:
@@ -594,7 +606,10 @@ class HypothesisBank(NamedTuple):
         """Return the bank with like hypotheses merged, the unlikely ones removed, and the one to publish."""
         weights = self.weights / self.weights.sum()
         bins = np.where(self.onsets == NEVER, -1, np.searchsorted(AGES_US, utime - self.onsets, side="right"))
-        keys = ((self.faults * 2 + self.jumped) * len(NOISE_CLASSES) + self.noises) * (len(AGES_US) + 2) + bins + 1
+        turned = self.means[:, HEADING] - self.means[self.published, HEADING]
+        octants = np.round(turned * TURNS / math.tau).astype(np.int64) % TURNS
+        kinds = ((self.faults * 2 + self.jumped) * len(NOISE_CLASSES) + self.noises) * TURNS + octants
+        keys = kinds * (len(AGES_US) + 2) + bins + 1
         stays = weights >= LEAST_WEIGHT
         stays[self.published] = True
         left = np.flatnonzero(stays)

@@ -183,22 +183,24 @@ def test_given_extreme_fixes_then_the_weights_remain_finite() -> None:
     assert math.hypot(x - 56.0 * SPEED, y) < 3.0
 
 
-def test_given_dead_reckoning_that_was_lost_then_the_hypothesis_that_fixes_are_right_wins():
-    """A heading that is off by a radian on a circle, as after an outage with a wrong gyro."""
+@pytest.mark.parametrize(("off", "is_outage"), [(0.5, True), (1.0, True), (-2.6, True), (3.1, False), (-1.2, False)])
+def test_given_dead_reckoning_that_was_lost_then_the_hypothesis_that_fixes_are_right_wins(off: float, is_outage: bool):
+    """A heading that is off on a circle: after an outage with a wrong gyro, or turned in its sleep."""
     noise = np.random.default_rng(2)
     rate, chord = 0.1, SPEED * cmath.rect(1.0, 0.05)
     step = Increment(1.0, rate, chord, 0.5 * chord, SPEED)
     bank, place = start(0.001), 0j
     for t in range(1, 91):
-        heading = 1.0 + rate * t
+        heading = off + rate * t
         place += chord * cmath.rect(1.0, heading - rate)
         x, y = (0.15 * SIGMA * noise.standard_normal(2)).tolist()
         fix = PlanarFix(place + complex(x, y), SIGMA, 0j, complex(SPEED), rate)
-        bank = bank.advance(t * 1_000_000, step, fix, SETTINGS, SLIP).judge_fixes(LIMITS[0], is_outage=t < 30)
-        if t > 30 and bank.excludes_fixes:
-            bank = bank.suspect_path(t * 1_000_000, (place.real, place.imag, heading), 0.05, SETTINGS)
+        before = bank
+        bank = bank.advance(t * 1_000_000, step, fix, SETTINGS, SLIP).judge_fixes(LIMITS[0], is_outage=is_outage)
+        if bank.excludes_fixes:
+            bank = bank.suspect_path(t * 1_000_000, fix, SETTINGS, begins=not before.excludes_fixes)
 
     assert not bank.excludes_fixes
     x, y, heading = bank.pose
     assert abs(complex(x, y) - place) < 3.0
-    assert math.remainder(heading - 1.0 - 90 * rate, math.tau) == pytest.approx(0.0, abs=0.1)
+    assert math.remainder(heading - off - 90 * rate, math.tau) == pytest.approx(0.0, abs=0.1)
