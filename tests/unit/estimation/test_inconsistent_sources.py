@@ -130,7 +130,8 @@ def test_given_fixes_that_drift_then_they_are_not_used_and_trusted_again_once_th
     assert "off dead reckoning" in why
     # a share of the limit, 36 m, that is worth it
     assert abs(rate) * (first - BEGIN) < 25.0
-    check_levels(found)
+    # for a second or two the path that fixes show may be that of a vehicle that has turned
+    check_levels(found, 0.98)
     assert max(row.off for row in found.between(BEGIN)) < most
     assert "trusted again" in after
     assert END <= last < END + 3.0
