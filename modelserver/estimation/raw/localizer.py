@@ -72,7 +72,7 @@ from typing import Final, NamedTuple
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, rotation_about_up
 from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO
-from modelserver.estimation.filter.imu_monitor import MAX_FORCE
+from modelserver.estimation.filter.imu_monitor import MAX_FORCE, MAX_RATE
 from modelserver.estimation.filter.protection_levels import (
     LIMIT_RISK,
     compute_factors,
@@ -115,9 +115,6 @@ MAX_SECONDS: Final = 1e4
 """Seconds of an age or interval that count at most: a stamp may be wrong by years."""
 
 LEVEL: Final[Vector3] = (0.0, 0.0, 1.0)
-
-MAX_RATE: Final = 50.0
-"""rad/s: above the range of any gyro for a vehicle."""
 
 
 # --- IMU ----------------------------------------------------------------------------------------------------
@@ -686,10 +683,10 @@ class RawLocalizer(NamedTuple):
             heading, ahead = heading.propagate(ahead, settings), 0.0
             motion = motion.propagate(utime, motion.rate, settings)
         at = self.get_motion_at(utime, motion)
-        base, antenna = at.pose.xyz, (at.pose @ lever).xyz
+        antenna = (at.pose @ lever).xyz
         fix = self._complete_height(fix, utime, antenna[2], at.speed_sigma)
         work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
-        arm, since = complex(antenna[0] - base[0], antenna[1] - base[1]), utime
+        arm, since = complex(antenna[0] - at.x, antenna[1] - at.y), utime
         newest = TrackFix(utime, work.ecef, fix.sigma, at.path, arm, at.yaw)
         track = append_fix(self.track, newest, settings.course_window)
         velocity = course = read_velocity(sample, at, lever.xyz, heading, settings)
