@@ -640,12 +640,20 @@ class RawLocalizer(NamedTuple):
         # the turn rate alone: the biases of roll and pitch rates are unknown until the vehicle is stationary
         measured, force, bias_sigma = (0.0, 0.0, yaw_rate + bias), imu.force or ZERO, math.sqrt(heading.bias_variance)
         detector = self.detector.update(utime, measured, force, (0.0, 0.0, bias), bias_sigma, settings)
+        is_held = self.is_slow and detector.get_quiet_time(utime) >= settings.stationary_time
+        heading = heading.propagate((utime - before.utime) * 1e-6, settings, is_held and before.rate == ZERO)
+        if not is_held:
+            detector = detector.restart_mean()
+        elif detector.sum_time < settings.stationary_time:
+            is_held = before.rate == ZERO  # as before
+        else:
+            mean_rate = detector.mean_stationary_rate[2] - bias
+            noise = settings.gyro_noise**2 / detector.sum_time
+            is_held = not heading.is_turning(mean_rate, noise)
+            if is_held:
+                heading, detector = heading.update_stationary(mean_rate, noise), detector.restart_mean()
         self = self._replace(detector=detector, track=() if is_gap or not dt else self.track)
-        noise = detector.rate_variance + settings.gyro_noise**2 / max(step, 1e-3)
-        is_held = dt > 0.0 and self.is_stationary(utime) and not heading.is_turning(yaw_rate, noise)
-        heading = heading.propagate((utime - before.utime) * 1e-6, settings, is_held)
         if is_held:
-            heading = heading.update_stationary(yaw_rate, noise)
             gain = step / (settings.tilt_time + step)
             bx, by = bx + gain * rate[0], by + gain * rate[1]
             before, rate = before._replace(speed=0.0, speed_sigma=0.5 * settings.stationary_speed, rate=ZERO), ZERO
