@@ -49,8 +49,8 @@ a T / 2 gives the time for the speed. A course is that of the segment since the 
 `course_sigma_limit`: that of new errors in the fit, of the time-correlated rest (Gauss-Markov), and of the turn.
 
 Stationary: the gyros and accelerometers are quiet (`filter.stationary_detector`) and the vehicle is slow by the fixes,
-which resolve `stationary_speed` three times only over long enough. Then the heading is held, and the rates that are
-left of the gyros' measure their biases.
+which resolve `stationary_speed` three times only over long enough. Then the heading is held, and the mean rate of each
+`stationary_time` measures the bias, unless it is a turn: more than four sigmas of bias and noise.
 
 Position at an instant: p_base = p_antenna + exp(io) (base in Odom - antenna in Odom at the fix)                 (5)
 Its covariance is that of the fix plus the growth by its age, `compute_growth`, plus the yaw error on the arm a from the
