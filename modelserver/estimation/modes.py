@@ -16,8 +16,7 @@ from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.fix_alternation import FixAlternation
 from modelserver.estimation.fix_quality import evaluate_fix
 from modelserver.estimation.interface import LocalizerEvent
-from modelserver.estimation.raw.localizer import RawLocalizer
-from modelserver.estimation.raw.motion import Heading
+from modelserver.estimation.raw.localizer import Heading, RawLocalizer
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (

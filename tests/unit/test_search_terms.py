@@ -17,7 +17,7 @@ FILTER = "modelserver/estimation/filter"
 TERMS = {
     # Groves
     "lever arm": "modelserver/transforms/chain.py",
-    "specific force": "modelserver/estimation/raw/motion.py",
+    "specific force": "modelserver/estimation/raw/localizer.py",
     "strapdown": f"{FILTER}/eskf.py",
     "error state": f"{FILTER}/error_layout.py",
     "local level": f"{FILTER}/eskf.py",

@@ -13,7 +13,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
-from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.settings import FixSettings
 from modelserver.named_tuples import new_tuple
 
 MAX_SOURCES: Final = 256
@@ -38,10 +38,9 @@ IMU_WAIT_US: Final = 60_000
 
 
 class StampVerdict(Enum):
-    """What a stamp means for its sample. `DUPLICATE` is of raw mode, which has no buffer to find duplicates in."""
+    """What a stamp means for its sample."""
 
     GOOD = "good"
-    DUPLICATE = "duplicate"
     TOO_OLD = "too_old"
     OUT_OF_SEQUENCE = "out_of_sequence"
     FUTURE = "future"
@@ -87,25 +86,29 @@ class ClockMonitor(NamedTuple):
     sources: Mapping[SourceKey, SourceClock] = MappingProxyType({})
 
     def update(
-        self, name: SourceKey, rank: int, utime: int, seq: int, settings: FilterSettings
+        self, name: SourceKey, rank: int, utime: int, seq: int, settings: FixSettings, horizon: float
     ) -> tuple[ClockMonitor, StampVerdict]:
-        """Return the monitor after a stamp, and what the stamp means."""
+        """Return the monitor after a stamp, and what it means; `horizon` (s) is how late a sample may come."""
         newest, leading, lead_utime, sources = self
         source = sources.get(name, NEW_SOURCE)
         ahead = utime - newest
-        horizon = round(settings.horizon * 1e6) if ahead < 0 else 0
+        horizon_us = round(horizon * 1e6) if ahead < 0 else 0
         if newest and ahead > settings.clock_jump * 1e6:
             source = _count_odd(source, utime, self.lead_utime)
             if source.num_odd < settings.clock_jump_samples:
                 return self._with(name, source), StampVerdict.FUTURE
-        elif source.newest and utime < source.newest and (ahead < -horizon or 0 < seq - source.seq < MAX_SEQUENCE_STEP):
+        elif (
+            source.newest
+            and utime < source.newest
+            and (ahead < -horizon_us or 0 < seq - source.seq < MAX_SEQUENCE_STEP)
+        ):
             # its own stamps go back: a source that is merely delayed does not, or its sequence goes back too
             source = _count_odd(source, utime, 0, is_back=True)
             if source.num_odd >= settings.clock_jump_samples and rank >= self.rank:
                 return _set_back(name, rank, utime, seq), StampVerdict.STEPPED_BACK
             # within the horizon it is used while it may be chance: the result must not depend on the order of arrival
-            return self._with(name, source), StampVerdict.OUT_OF_SEQUENCE if ahead < -horizon else StampVerdict.GOOD
-        elif newest and ahead < -horizon:
+            return self._with(name, source), StampVerdict.OUT_OF_SEQUENCE if ahead < -horizon_us else StampVerdict.GOOD
+        elif newest and ahead < -horizon_us:
             if source.newest or rank < self.rank:
                 return self, StampVerdict.TOO_OLD
             # its first stamps: those before may be the wrong ones, and would keep it out forever

@@ -148,7 +148,7 @@ class FilterLocalizer(NamedTuple):
                 self = self._replace(streams=streams)
         first, kind = items[0], type(sample)
         name, rank = (kind.__name__, header.source), RANKS.get(kind, 0)
-        clocks, verdict = clocks.update(name, rank, first.utime, header.seq, setup.settings)
+        clocks, verdict = clocks.update(name, rank, first.utime, header.seq, setup.settings, setup.settings.horizon)
         if verdict is not StampVerdict.GOOD:
             if verdict is not StampVerdict.STEPPED_BACK:
                 return self._replace(clocks=clocks), (reject(first, verdict.value),)

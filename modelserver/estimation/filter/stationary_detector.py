@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.raw.settings import RawSettings
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms.so3 import Vector3
 
@@ -59,7 +60,13 @@ class StationaryDetector(NamedTuple):
     sum_time: float = 0.0
 
     def update(
-        self, utime: int, rate: Vector3, force: Vector3, bias: Vector3, bias_sigma: float, settings: FilterSettings
+        self,
+        utime: int,
+        rate: Vector3,
+        force: Vector3,
+        bias: Vector3,
+        bias_sigma: float,
+        settings: FilterSettings | RawSettings,
     ) -> StationaryDetector:
         """Return the detector after an IMU sample; `bias` is that of the gyros, with `bias_sigma` on each axis."""
         dt = (utime - self.utime) * 1e-6

@@ -1,34 +1,64 @@
-"""Raw mode: the pose directly from GPS and IMU, without odometry (report 7.2, C7).
+"""Raw mode: the pose directly from GPS and IMU, without odometry and without a filter of the pose (report 7.2, C7).
 
-Position is the last good fix, moved to the base frame by the lever arm and propagated by speed along the heading. Roll
-and pitch are the IMU's, or its gyros' corrected by the specific force. Heading is the course while moving, and the
-integrated gyro in between. A stationary vehicle shows the biases of the gyros (motion.py). Equations and limits
-together: docs/raw-mode.md.
+Position is the newest good fix, moved to the base frame by the lever arm, and propagated by speed along the heading.
+Roll and pitch are the IMU's, or its gyros' corrected by the specific force. Heading is the course while moving, the
+integrated gyro in between, and held while stationary. Limits: docs/raw-mode.md.
 
-Each sample passes its source's clock monitor first. An IMU sample propagates motion and heading; a fix updates
-position, heading and speed at its own instant, for which two seconds of motion are stored. After a step back of the
+Each sample passes the clock monitor of its source first (`filter.clock_monitor`, without a horizon: raw mode has no
+buffer to sort samples in, so a delayed one is rejected). An IMU sample propagates motion and heading; a fix updates
+position, heading and speed at its own instant, for which two seconds of motion are stored. After a step back of a
 clock all but Odom, origin and biases restarts.
 
-Clock monitor: a stamp is odd if it is not later than the last good one, or more than `clock_jump` ahead of it. A single
-one is an error of its sample; `clock_jump_samples` in a row in ascending order show that the clock was set. Delayed
-samples fill the gaps between good stamps. Those of a clock that was set back cover a time that good stamps have covered
-already, so between two of them lies a good one. `filter.clock_monitor` has the same rules for sources that share a
-horizon; here a delayed sample is rejected, because raw mode has no buffer to sort samples in.
+Motion: dead reckoning of the base frame in Odom by angular rate and speed. It never jumps. Attitude is yaw in Odom and
+the vertical u along the base frame's axes; with R = Rz(yaw) Ry(pitch) Rx(roll),
+u = R' z = (-sin pitch, cos pitch sin roll, cos pitch cos roll). With the angular rate w along the same axes
 
-Speed and course are fitted to recent fixes (motion.py), or are those of the receiver. Its antenna velocity becomes that
-of the base frame by
+    u' = -w x u,   yaw' = (w_y u_y + w_z u_z) / (u_y^2 + u_z^2)                                                 (1)
 
-    v_base = v_antenna - exp(ib) R (w x r)                                                                      (1)
+An interval of constant speed and rate is an arc, whose chord points along its middle heading. After `rate_hold` without
+a sample the turn stops. Speed is held for twice `gps_timeout` after its fix: the pose is invalid after once, and for as
+long again going on is the better guess than a stop.
 
-with the lever arm r; before b is known, its direction is that of the velocity itself.
+Roll and pitch: an IMU that reports its orientation gives u itself; its yaw is magnetic or drifts, and is ignored. Else
+the specific force f = a - g corrects u ~ f - a. Of the acceleration a of the IMU the centripetal part w x (v + w x r)
+is known, with v along the base frame's x and r the lever arm of the IMU. It is used while |f - a| is near g
+(complementary filter: R. Mahony et al., "Nonlinear complementary filters on the special orthogonal group", 2008).
 
-Position at an instant: p_base = p_antenna + exp(ib) (travel in Odom since the fix - lever arm at the fix)      (2)
+Heading: offset o from yaw in Odom to yaw from true east, and bias b of the yaw gyro, each with its variance,
+
+    do' = -db + gyro noise,   db' = random walk                                                                 (2)
+
+A course measures o, a stationary vehicle b. Both updates are written out for two states (R. Brown and P. Hwang,
+"Introduction to Random Signals and Applied Kalman Filtering", 2012, 5.5); `covariance` is that of o with b. A course
+half a turn off means reverse. One that fits neither direction is rejected; `course_rejections` of them in a row that
+agree reset o. Above a sigma of 60 degrees the two directions cannot be separated, and the course resets o too.
+
+Velocity: c = v exp(io), the speed with the direction from Odom's heading to true east. With the receiver's velocity it
+is, with the lever arm r of the antenna (before o is known, its direction is that of the velocity itself)
+
+    c = exp(-i yaw) (v_antenna - exp(io) R (w x r))                                                             (3)
+
+Else it is fitted to fixes p with lever arms l along Odom's axes: with s the integral of the unit vector along Odom's
+heading (`RawMotion.path`), least squares of p - exp(io) l = p_0 + c s over a segment, on curves as on straights,
+
+    c = sum conj(s_i - mean s) (p_i - exp(io) l_i - mean) / sum |s_i - mean s|^2                                (4)
+
+with the sigma of two ends, sqrt(2) sigma_p / |s|, as errors of fixes last. A long segment has less noise, but shows the
+speed of half its time T ago, which has changed by a T / 2 since with a = `usual_acceleration`: sqrt(2) sigma_p / T =
+a T / 2 gives the time for the speed. A course is that of the segment since the last one, once its sigma is within
+`course_sigma_limit`: that of new errors in the fit, of the time-correlated rest (Gauss-Markov), and of the turn.
+
+Stationary: the gyros and accelerometers are quiet (`filter.stationary_detector`) and the vehicle is slow by the fixes,
+which resolve `stationary_speed` three times only over long enough. Then the heading is held, and the mean rate of each
+`stationary_time` measures the bias, unless it is a turn: more than four sigmas of bias and noise.
+
+Position at an instant: p_base = p_antenna + exp(io) (base in Odom - antenna in Odom at the fix)                 (5)
 Its covariance is that of the fix plus the growth by its age, `compute_growth`, plus the yaw error on the arm a from the
 antenna at the fix to the base frame: yaw variance times (-a_n, a_e)(-a_n, a_e)', which also correlates position with
-yaw. Protection levels are those of `filter.protection_levels`, at probability `risk`. World:UTM and World:ENU are each
-computed from the earth-centered position.
+yaw. Protection levels are those of `filter.protection_levels`, at probability `risk`.
 
-Read top-down from the end of the file: `RawLocalizer.process` -> `_process_imu`, `_process_gps`; `compute_estimate`.
+Horizontal vectors are complex numbers, east + i north or along Odom's x + iy. Limits: pitch below 84 degrees; the base
+frame moves along its own x. Read top-down from `RawLocalizer.process` -> `_process_imu`, `_process_gps`; `estimate`.
 """
 
 from __future__ import annotations
@@ -36,18 +66,13 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import replace
+from enum import Enum
 from typing import Final, NamedTuple
 
-from modelserver.earth.geodesy import (
-    Geodesy,
-    GeodesyError,
-    LocalFrame,
-    ecef_from_geodetic,
-    geodetic_from_ecef,
-    rotation_about_up,
-)
-from modelserver.estimation.filter.clock_monitor import RECENT_STAMPS, StampVerdict, has_covered
-from modelserver.estimation.filter.eskf import ZERO
+from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, rotation_about_up
+from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
+from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO
+from modelserver.estimation.filter.imu_monitor import MAX_FORCE, MAX_RATE
 from modelserver.estimation.filter.protection_levels import (
     LIMIT_RISK,
     compute_factors,
@@ -55,34 +80,13 @@ from modelserver.estimation.filter.protection_levels import (
     compute_limit_risks,
     compute_longest_axis,
 )
+from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
 from modelserver.estimation.interface import LocalizerEvent
 from modelserver.estimation.origin import OriginCapture, OriginProjection
-from modelserver.estimation.raw.motion import (
-    UNKNOWN_VARIANCE,
-    CourseResult,
-    Heading,
-    QuietDetector,
-    RawImuSample,
-    RawMotion,
-    StationaryPlace,
-    TrackFix,
-    append_fix,
-    compute_yaw_rate,
-    correct_up,
-    fit_best_speed,
-    fit_course,
-    get_first_up,
-    interpolate_motion,
-    is_slow_by_fixes,
-    read_raw_imu,
-    to_level_axes,
-    update_stationary,
-)
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
-    NAN,
     STALE_SENSORS,
     Estimate,
     GpsSample,
@@ -91,6 +95,7 @@ from modelserver.messages import (
     LocalizerSummary,
     Mode,
     NavigationState,
+    OrientationReference,
     Origin,
     PersistOrigin,
     Quality,
@@ -100,293 +105,407 @@ from modelserver.messages import (
 )
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Quaternion, Vector3, cross
+from modelserver.transforms.so3 import Quaternion, Vector3, add, cross, scale
 
 HISTORY_STEP_US: Final = 20_000
 HISTORY_LENGTH_US: Final = 2_000_000
 """Microseconds between the motions stored for delayed fixes, and how far back they reach."""
 
+MAX_SECONDS: Final = 1e4
+"""Seconds of an age or interval that count at most: a stamp may be wrong by years."""
 
-# --- stamps ----------------------------------------------------------------------------------------------------
+LEVEL: Final[Vector3] = (0.0, 0.0, 1.0)
 
 
-class StampMonitor(NamedTuple):
-    """The last good stamp of a source, and a run of odd stamps.
+# --- IMU ----------------------------------------------------------------------------------------------------
 
-    Attributes
-    ----------
-    last: the last good stamp; None: none yet.
-    odd_utime, num_odd, odd_since: the last odd stamp of the run, their number, and the first one.
-    recent: the last good stamps, the oldest first.
+
+class RawImuSample(NamedTuple):
+    """Angular rate, specific force and the unit's own vertical along the base axes; None: not measured."""
+
+    rate: Vector3
+    force: Vector3 | None
+    up: Vector3 | None
+
+
+def read_raw_imu(sample: ImuSample, X_base_imu: Pose) -> RawImuSample | str:
+    """Return the sample along the base axes, or in one word why it cannot be used.
+
+    Unlike `imu_monitor.read_imu` it accepts a unit without accelerometers: rates alone give the heading.
     """
-
-    last: int | None = None
-    odd_utime: int = 0
-    num_odd: int = 0
-    odd_since: int = 0
-    recent: tuple[int, ...] = ()
-
-    def update(self, utime: int, settings: RawSettings) -> tuple[StampMonitor, StampVerdict]:
-        """Return the monitor after a stamp, and what the stamp means."""
-        last = self.last
-        if last is None:
-            return StampMonitor(utime, recent=(utime,)), StampVerdict.GOOD
-        ahead = (utime - last) * 1e-6
-        if 0.0 < ahead <= settings.clock_jump:
-            return StampMonitor(utime, recent=(*self.recent[1 - RECENT_STAMPS :], utime)), StampVerdict.GOOD
-        if utime == last and not (self.num_odd and self.odd_utime < last):
-            return self, StampVerdict.DUPLICATE
-        follows = self.num_odd > 0 and 0.0 < (utime - self.odd_utime) * 1e-6 <= settings.clock_jump
-        count, since = (self.num_odd + 1, self.odd_since) if follows else (1, utime)
-        if follows and ahead <= 0.0 and not has_covered(self.recent, self.odd_utime, utime):
-            count -= 1
-        if count >= settings.clock_jump_samples:
-            confirmed = StampMonitor(utime, self.odd_utime, 0, since, (utime,))
-            return confirmed, StampVerdict.GOOD if ahead > 0.0 else StampVerdict.STEPPED_BACK
-        verdict = StampVerdict.FUTURE if ahead > 0.0 else StampVerdict.OUT_OF_SEQUENCE
-        return StampMonitor(last, utime, count, since, self.recent), verdict
-
-    @property
-    def lost_time(self) -> float:
-        """After a step back: seconds that the samples of the run took, and the one before it."""
-        return 0.0 if self.last is None else (self.last - self.odd_since + self.last - self.odd_utime) * 1e-6
+    rate, force, mount = sample.angular_velocity, sample.specific_force, X_base_imu.wxyz
+    if rate is None:
+        return "nan"
+    for v, most in ((rate, MAX_RATE), (force or ZERO, MAX_FORCE)):
+        if not max(map(abs, v)) <= most or not math.isfinite(sum(v)):
+            return "range" if math.isfinite(sum(v)) else "nan"
+    q, up = sample.orientation, None
+    if q is not None and sample.orientation_reference != OrientationReference.NONE and 0.9 < math.hypot(*q) < 1.1:
+        # the z axis of the reference; in NED it points down
+        z = -1.0 if sample.orientation_reference == OrientationReference.NED else 1.0
+        up = so3.rotate(mount, so3.rotate_back(so3.normalize(q), (0.0, 0.0, z)))
+    return RawImuSample(so3.rotate(mount, rate), None if force is None else so3.rotate(mount, force), up)
 
 
-# --- anchor -------------------------------------------------------------------------------------------------
+def correct_up(up: Vector3, force: Vector3, motion_force: Vector3, gain: float, settings: RawSettings) -> Vector3:
+    """Correct the vertical towards the specific force without that of the vehicle's motion, if that is near g."""
+    f = add(force, scale(-1.0, motion_force))
+    norm = math.hypot(*f)
+    if abs(norm - STANDARD_GRAVITY) > settings.tilt_gate:
+        return up
+    return normalize_up(add(scale(1.0 - gain, up), scale(gain / norm, f)))
 
 
-MAX_AGE: Final = 1e4
-"""Seconds of the age of a fix that count: a stamp may be wrong by years."""
+# --- attitude -----------------------------------------------------------------------------------------------
 
 
-class FixAnchor(NamedTuple):
-    """The last good fix, and the motion of the base frame at its instant.
+def normalize_up(v: Vector3) -> Vector3:
+    """Return a vector at unit length; level if it has no length."""
+    n = math.hypot(*v)
+    return scale(1.0 / n, v) if 1e-9 < n < 1e150 else LEVEL
+
+
+def _rotate_up(up: Vector3, rate: Vector3, dt: float) -> Vector3:
+    """Propagate the vertical by equation (1): exp(-[w dt]x) u to second order, at unit length."""
+    turn = scale(-dt, rate)
+    first = cross(turn, up)
+    return normalize_up(add(up, first, scale(0.5, cross(turn, first))))
+
+
+def compute_yaw_rate(rate: Vector3, up: Vector3) -> float:
+    """Return the yaw rate by equation (1), rad/s."""
+    _, b, c = up
+    return (rate[1] * b + rate[2] * c) / max(b * b + c * c, 1e-2)
+
+
+def compute_roll_pitch(up: Vector3) -> tuple[float, float]:
+    """Return fixed-axis roll and pitch of a base frame with a vertical, rad."""
+    return math.atan2(up[1], up[2]), math.atan2(-up[0], math.hypot(up[1], up[2]))
+
+
+def compute_attitude(up: Vector3, yaw: float) -> Quaternion:
+    """Return the rotation from the base axes to Odom."""
+    return so3.from_rpy(*compute_roll_pitch(up), yaw)
+
+
+# --- motion -------------------------------------------------------------------------------------------------
+
+
+class RawMotion(NamedTuple):
+    """The base frame in Odom at `utime`. A NamedTuple, because a new one is made for every IMU sample.
 
     Attributes
     ----------
-    position, up: of the antenna in the working frame, east + i north and height, m.
-    lever, lever_up: lever arm of the antenna along Odom's axes, horizontal and up, m.
+    x, y, z: position, m.
+    yaw: rad, not wrapped.
+    up: vertical along the base axes.
+    rate: angular rate along the base axes without bias, rad/s.
+    path: integral of the unit vector along the heading, seconds: the position at a speed of 1 m/s.
+    speed, speed_utime, speed_sigma: horizontal, negative in reverse, m/s, with the instant of its fix and its sigma.
+    yaw_variance, position_variance: of the drift since the start of Odom (each horizontal axis), rad2 and m2.
     """
 
     utime: int
-    position: complex
-    up: float
-    fix: AcceptedFix
-    motion: RawMotion
-    lever: complex
-    lever_up: float
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    yaw: float = 0.0
+    up: Vector3 = LEVEL
+    rate: Vector3 = ZERO
+    path: complex = 0j
+    speed: float = 0.0
+    speed_utime: int = 0
+    speed_sigma: float = 0.0
+    yaw_variance: float = 0.0
+    position_variance: float = 0.0
 
-    def propagate_base(self, motion: RawMotion, direction: complex) -> tuple[complex, float, complex]:
-        """Propagate the base frame to `motion` by equation (2): position and height in the working frame.
+    @property
+    def pose(self) -> Pose:
+        """The base frame in Odom."""
+        return Pose((self.x, self.y, self.z), compute_attitude(self.up, self.yaw))
 
-        The third value is the arm from the antenna at the fix to the base frame, which an error of heading turns.
+    @property
+    def yaw_rate(self) -> float:
+        """Yaw rate, rad/s."""
+        return compute_yaw_rate(self.rate, self.up)
+
+    def propagate(self, utime: int, rate: Vector3, settings: RawSettings) -> RawMotion:
+        """Propagate to `utime` with the mean angular rate until then."""
+        dt = (utime - self.utime) * 1e-6
+        if dt <= 0.0:
+            return self
+        turning = min(dt, settings.rate_hold)
+        gap = dt - turning
+        up = _rotate_up(self.up, rate, turning)
+        turn = compute_yaw_rate(rate, self.up) * turning
+        yaw = self.yaw + turn
+        half = 0.5 * turn
+        chord = 1.0 - half * half / 6.0 if abs(half) < 1e-2 else math.sin(half) / half
+        arc = cmath.rect(chord, self.yaw + half)
+        straight = cmath.rect(1.0, yaw)
+        age = max((self.utime - self.speed_utime) * 1e-6, 0.0)
+        driving = max(min(dt, 2.0 * settings.gps_timeout - age), 0.0)
+        first = self.speed * min(turning, driving)
+        rest = self.speed * max(driving - turning, 0.0)
+        step = arc * first + straight * rest
+        travel = first + rest
+        sigma = self.speed_sigma
+        # the error of a speed is correlated over about the segment of fixes that it was found from
+        drifted = self.position_variance + sigma * sigma * dt * settings.speed_window
+        return self._replace(
+            utime=utime,
+            x=self.x + step.real,
+            y=self.y + step.imag,
+            z=self.z + travel * up[0] / math.sqrt(max(1.0 - up[0] * up[0], 1e-2)),
+            yaw=yaw,
+            up=up,
+            path=self.path + arc * turning + straight * min(gap, MAX_SECONDS),
+            yaw_variance=min(
+                self.yaw_variance + settings.gyro_noise**2 * dt + (settings.gap_rate_sigma * gap) ** 2, 1e3
+            ),
+            position_variance=min(drifted + self.yaw_variance * travel * travel, 1e12),
+        )
+
+
+# --- heading ---------------------------------------------------------------------------------------------------
+
+
+UNKNOWN_VARIANCE: Final = (math.pi / math.sqrt(3.0)) ** 2
+"""Variance of an unknown direction, rad2: uniform over the circle."""
+
+STATIONARY_GATE: Final = 4.0
+"""Sigmas that the rate of a stationary vehicle may be off the bias."""
+
+
+class CourseResult(Enum):
+    """What the heading filter did with a course."""
+
+    USED = "used"
+    BACKWARDS = "backwards"
+    REJECTED = "rejected"
+    RESET = "reset"
+
+
+class Heading(NamedTuple):
+    """State of the heading filter: offset (rad) and bias (rad/s) with their covariance; known after the first course.
+
+    `num_rejected` counts the rejected courses in a row that agree; `rejected_offset` is the last of them.
+    """
+
+    is_known: bool = False
+    offset: float = 0.0
+    variance: float = UNKNOWN_VARIANCE
+    bias: float = 0.0
+    bias_variance: float = 0.0
+    covariance: float = 0.0
+    num_rejected: int = 0
+    rejected_offset: float = 0.0
+
+    @property
+    def direction(self) -> complex:
+        """exp(i offset), from Odom's horizontal axes to east + i north."""
+        return cmath.rect(1.0, self.offset)
+
+    def propagate(self, dt: float, settings: RawSettings, is_held: bool = False) -> Heading:
+        """Propagate by equation (2) over `dt` seconds, of which the gyro measures no more than `rate_hold`.
+
+        `is_held`: the vehicle is stationary, and an error of the bias does not turn it.
         """
-        then = self.motion
-        arm = direction * (complex(motion.x - then.x, motion.y - then.y) - self.lever)
-        return self.position + arm, self.up - self.lever_up + motion.z - then.z, arm
+        if dt <= 0.0:
+            return self
+        dt = min(dt, MAX_SECONDS)
+        gap = max(dt - settings.rate_hold, 0.0)
+        before, turning = self.bias_variance, 0.0 if is_held else dt
+        variance = self.variance - 2.0 * self.covariance * turning + before * turning * turning
+        variance += settings.gyro_noise**2 * dt + (settings.gap_rate_sigma * gap) ** 2
+        variance, covariance = max(variance, settings.heading_floor**2), self.covariance - before * turning
+        limit = max(before, settings.gyro_bias_sigma**2)
+        bias_variance = min(before + settings.gyro_bias_walk**2 * dt, limit)
+        if variance >= UNKNOWN_VARIANCE:
+            variance, covariance = UNKNOWN_VARIANCE, 0.0
+        return Heading(self.is_known, self.offset, variance, self.bias, bias_variance, covariance, *self[6:])
+
+    def is_turning(self, rate: float, variance: float) -> bool:
+        """Return whether a yaw rate without bias, rad/s, is more than the biases and its noise explain."""
+        return rate * rate > STATIONARY_GATE**2 * (self.bias_variance + variance)
+
+    def update_stationary(self, rate: float, variance: float) -> Heading:
+        """Update with the yaw rate of a stationary vehicle, rad/s, less the bias so far; `variance`: of its noise."""
+        return self._update(rate, self.covariance, self.bias_variance, self.bias_variance + variance)
+
+    def update_course(self, offset: float, variance: float, settings: RawSettings) -> tuple[Heading, CourseResult]:
+        """Update with the offset that a course measures, behind its gate; the first course is taken as forward."""
+        if not self.is_known or self.variance > 1.0:
+            return self._reset(offset, variance), CourseResult.RESET
+        innovation = math.remainder(offset - self.offset, math.tau)
+        is_backwards = abs(innovation) > 0.5 * math.pi
+        if is_backwards:
+            innovation = math.remainder(innovation - math.pi, math.tau)
+        s = self.variance + variance
+        if innovation * innovation > settings.course_gate**2 * s:
+            apart = math.remainder(offset - self.rejected_offset, math.tau)
+            agrees = self.num_rejected > 0 and apart * apart <= settings.course_gate**2 * 2.0 * variance
+            count = self.num_rejected + 1 if agrees else 1
+            if count >= settings.course_rejections:
+                return self._reset(offset, variance), CourseResult.RESET
+            return self._replace(num_rejected=count, rejected_offset=offset), CourseResult.REJECTED
+        updated = self._update(innovation, self.variance, self.covariance, s)
+        updated = updated._replace(variance=max(updated.variance, settings.heading_floor**2), num_rejected=0)
+        return updated, CourseResult.BACKWARDS if is_backwards else CourseResult.USED
+
+    def _update(self, innovation: float, p1: float, p2: float, s: float) -> Heading:
+        """Update with an innovation of variance s; p1 and p2 are the measured state's covariances with o and b."""
+        k1, k2 = p1 / s, p2 / s
+        return self._replace(
+            offset=math.remainder(self.offset + k1 * innovation, math.tau),
+            variance=max(self.variance - k1 * p1, 1e-12),
+            bias=self.bias + k2 * innovation,
+            bias_variance=max(self.bias_variance - k2 * p2, 1e-18),
+            covariance=self.covariance - k1 * p2,
+        )
+
+    def _reset(self, offset: float, variance: float) -> Heading:
+        return Heading(True, math.remainder(offset, math.tau), variance, self.bias, self.bias_variance)
 
 
-def compute_lever_arm(motion: RawMotion, lever: Vector3) -> tuple[complex, float]:
-    """Return a vector of the base axes along Odom's axes: horizontal, and up."""
-    x, y, z = to_level_axes(motion.up, lever)
-    return complex(x, y) * complex(math.cos(motion.yaw), math.sin(motion.yaw)), z
+# --- velocity ---------------------------------------------------------------------------------------------------------
 
 
-def compute_growth(age: float, speed_sigma: float, settings: RawSettings) -> float:
-    """Return the variance of each axis that a prediction over `age` seconds adds, m2: (s_v t)^2 + (a t^2 / 2)^2."""
-    t = min(age, MAX_AGE)
-    return (speed_sigma * t) ** 2 + (0.5 * settings.usual_acceleration * t * t) ** 2
+class TrackFix(NamedTuple):
+    """A fix of the antenna with the motion at its instant.
+
+    Attributes
+    ----------
+    ecef, sigma: earth-centered position, m, and the sigma of each horizontal axis.
+    path, yaw: those of `RawMotion`.
+    lever: lever arm of the antenna along Odom's horizontal axes, m.
+    """
+
+    utime: int
+    ecef: Vector3
+    sigma: float
+    path: complex
+    lever: complex
+    yaw: float
 
 
-# --- fixes -----------------------------------------------------------------------------------------------------
+class RawVelocity(NamedTuple):
+    """The c of equations (3) and (4), m/s, with the sigma of each component, and that of its direction, rad."""
+
+    c: complex
+    sigma: float
+    course_sigma: float
 
 
-WORK_RANGE: Final = 200.0
-"""Meters from the origin of the working frame within which its up and north are the vehicle's to 3e-5 rad."""
+MAX_TRACK_FIXES: Final = 64
+"""Fixes stored: of a longer track every second one is dropped."""
 
 MAX_VELOCITY_LATENCY: Final = 2.0
 """Seconds of latency of a velocity that are credible."""
 
 
-class FixMonitor(NamedTuple):
-    """State from fixes.
-
-    Attributes
-    ----------
-    work: working frame, in which the positions are.
-    anchor: the last good fix.
-    recent, segment: fixes for the speed, and for the course.
-    num_rejected: fixes rejected since the last good one, for any reason.
-    stationary: where the vehicle stopped.
-    """
-
-    work: LocalFrame | None = None
-    anchor: FixAnchor | None = None
-    recent: tuple[TrackFix, ...] = ()
-    segment: tuple[TrackFix, ...] = ()
-    num_rejected: int = 0
-    stationary: StationaryPlace | None = None
-
-    def recenter(self, fix: AcceptedFix, ecef: Vector3, heading: Heading) -> tuple[FixMonitor, Heading, LocalFrame]:
-        """Return the states in a working frame near the fix, and that frame: the present one, or a new one."""
-        old = self.work
-        if old is not None and math.dist(old.ecef, ecef) <= WORK_RANGE:
-            return self, heading, old
-        work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
-        if old is None:
-            return self, heading, work
-
-        def move(each: TrackFix) -> TrackFix:
-            return each._replace(position=_locate(work, each.ecef)[0])
-
-        place = self.stationary
-        moved = self._replace(
-            recent=tuple(map(move, self.recent)),
-            segment=tuple(map(move, self.segment)),
-            stationary=None if place is None else place._replace(fix=move(place.fix)),
-        )
-        turned = so3.logarithm(so3.normalize(work.rotation_of(old)))[2]
-        return moved, heading._replace(offset=math.remainder(heading.offset + turned, math.tau)), work
-
-    def forget_path(self) -> FixMonitor:
-        """Return the monitor without segments: their path is interrupted."""
-        return self._replace(recent=(), segment=()) if self.recent or self.segment else self
+def append_fix(track: tuple[TrackFix, ...], fix: TrackFix, window: float) -> tuple[TrackFix, ...]:
+    """Return a track with one fix more, no longer than `window` seconds, and thinned if it has too many."""
+    oldest = fix.utime - int(window * 1e6)
+    recent = tuple(each for each in track if each.utime >= oldest)
+    return (*(recent[::2] if len(recent) >= MAX_TRACK_FIXES else recent), fix)
 
 
-# --- position -----------------------------------------------------------------------------------------------
+def measure_velocity(
+    track: tuple[TrackFix, ...], since: float, work: LocalFrame, heading: Heading, settings: RawSettings
+) -> RawVelocity | None:
+    """Return the velocity by equation (4) of the fixes from `since` (utime) on, at least the last two."""
+    fixes = tuple(each for each in track if each.utime >= since)
+    fixes = fixes if len(fixes) > 1 else track[-2:]
+    first, newest = fixes[0], fixes[-1]
+    s = newest.path - first.path
+    if abs(s) < 1e-3:
+        return None
+    direction = heading.direction if heading.is_known else 0j
+    places = [complex(*work.from_ecef(each.ecef)[:2]) - direction * each.lever for each in fixes]
+    mean_place, mean_path = sum(places) / len(fixes), sum(each.path for each in fixes) / len(fixes)
+    off = [each.path - mean_path for each in fixes]
+    spread = sum(abs(u) ** 2 for u in off)
+    c = sum(u.conjugate() * (p - mean_place) for u, p in zip(off, places, strict=True)) / spread
+    sigma = max(each.sigma for each in fixes)
+    # the errors of the two ends differ by the share that is new with each fix, and as the rest has changed since
+    seconds = (newest.utime - first.utime) * 1e-6
+    changed = -2.0 * math.expm1(-seconds / settings.fix_correlation_time) * (1.0 - settings.fix_noise_share**2)
+    error = sigma * abs(s) * math.sqrt(settings.fix_noise_share**2 / spread + changed / abs(s) ** 2)
+    # the lever arm turns with the heading: before that is known, its turn is an error of the direction
+    lever = 0.0 if heading.is_known else abs(newest.lever - first.lever)
+    turn = settings.course_turn_share * (newest.yaw - first.yaw)
+    course = math.hypot(math.hypot(error, lever) / max(abs(c * s), 1e-3), turn)
+    return RawVelocity(c, math.sqrt(2.0) * sigma / abs(s), max(course, settings.heading_floor))
 
 
-def _complete_height(
-    fix: AcceptedFix, before: FixAnchor | None, motion: RawMotion, arm_up: float, fallback: float, settings: RawSettings
-) -> AcceptedFix:
-    """Return the fix with a height: its own, else that of the fix before propagated, else `fallback` if not nan."""
-    if not math.isnan(fix.height):
-        return fix
-    if before is not None:
-        age = max((motion.utime - before.utime) * 1e-6, 0.0)
-        height = before.fix.height + motion.z - before.motion.z + arm_up - before.lever_up
-        variance = before.fix.up_variance + compute_growth(age, motion.speed_sigma, settings)
-        return replace(fix, height=height, up_variance=min(variance, settings.unknown_height_sigma**2))
-    if math.isnan(fallback):
-        return replace(fix, height=0.0, up_variance=settings.unknown_height_sigma**2)
-    return replace(fix, height=fallback, up_variance=settings.assumed_height_sigma**2)
-
-
-def _locate(work: LocalFrame, ecef: Vector3) -> tuple[complex, float]:
-    """Return an earth-centered position in the working frame: east + i north, and up."""
-    east, north, up = work.from_ecef(ecef)
-    return complex(east, north), up
-
-
-# --- velocity -----------------------------------------------------------------------------------------------
-
-
-class ReceiverVelocity(NamedTuple):
-    """Velocity of the antenna by the receiver.
-
-    Attributes
-    ----------
-    vector, sigma, course_sigma: east + i north and its sigma, m/s, and that of its direction, rad.
-    lever_velocity: of the antenna relative to the base frame by the angular rate, along Odom's axes, m/s.
-    yaw, measured_yaw: in Odom at the fix, and at the instant of the velocity, rad.
-    """
-
-    vector: complex
-    sigma: float
-    course_sigma: float
-    lever_velocity: complex
-    yaw: float
-    measured_yaw: float
-
-    def to_base(self, heading: Heading) -> complex:
-        """Return the velocity of the base frame by equation (1), east + i north, m/s."""
-        if heading.is_known:
-            direction = heading.direction
-        elif abs(self.vector) > 0.0:
-            direction = self.vector / abs(self.vector) * cmath.rect(1.0, -self.yaw)
-        else:
-            return self.vector
-        return self.vector - direction * self.lever_velocity
-
-
-def _read_velocity(
-    sample: GpsSample, motion: RawMotion, lever: Vector3, settings: RawSettings
-) -> ReceiverVelocity | None:
-    """Return the velocity of the receiver, or that of its speed and course; None if it reports neither.
+def read_velocity(
+    sample: GpsSample, motion: RawMotion, lever: Vector3, heading: Heading, settings: RawSettings
+) -> RawVelocity | None:
+    """Return the velocity of the receiver by equation (3), or that of its speed and course; None without either.
 
     Unlike the filter's `read_velocity`: horizontal, with one sigma for both axes, and at any speed.
     """
     sigma, course_sigma = settings.velocity_sigma, math.nan
     if sample.velocity is not None:
-        vector = complex(sample.velocity[0], sample.velocity[1])
+        antenna = complex(sample.velocity[0], sample.velocity[1])
         stated = sample.velocity_covariance
         if stated is not None and 0.0 < stated[0] < math.inf and 0.0 < stated[4] < math.inf:
             sigma = math.sqrt(max(stated[0], stated[4]))
     elif math.isfinite(sample.speed) and math.isfinite(sample.course):
-        vector = sample.speed * complex(math.cos(sample.course), math.sin(sample.course))
+        antenna = cmath.rect(sample.speed, sample.course)
         sigma = sample.speed_sigma if 0.0 < sample.speed_sigma < math.inf else sigma
         course_sigma = sample.course_sigma
     else:
         return None
     # a non-finite velocity, or one without information
-    if not (abs(vector) <= 2.0 * settings.maximum_speed and sigma <= settings.maximum_speed):
+    if not (abs(antenna) <= 2.0 * settings.maximum_speed and sigma <= settings.maximum_speed):
         return None
-    if not course_sigma > 0.0:
-        course_sigma = sigma / max(abs(vector), 1e-3)
     latency = sample.velocity_latency if 0.0 <= sample.velocity_latency <= MAX_VELOCITY_LATENCY else 0.0
-    return ReceiverVelocity(
-        vector,
-        sigma,
-        max(course_sigma, settings.heading_floor),
-        compute_lever_arm(motion, cross(motion.rate, lever))[0],
-        motion.yaw,
-        motion.yaw - motion.yaw_rate * latency,
-    )
+    c = antenna * cmath.rect(1.0, motion.yaw_rate * latency - motion.yaw)
+    x, y, _ = so3.rotate(motion.pose.wxyz, cross(motion.rate, lever))
+    direction = heading.direction if heading.is_known else c / max(abs(c), 1e-9)
+    c -= direction * complex(x, y) * cmath.rect(1.0, -motion.yaw)
+    if not course_sigma > 0.0:
+        course_sigma = sigma / max(abs(c), 1e-3)
+    return RawVelocity(c, sigma, max(course_sigma, settings.heading_floor))
 
 
-def _update_course(
-    heading: Heading,
-    velocity: ReceiverVelocity | None,
-    segment: tuple[TrackFix, ...],
-    turn_variance: float,
-    settings: RawSettings,
-) -> tuple[Heading, CourseResult | None]:
-    """Update the heading with a course, of the receiver or else of a segment; None: neither has one."""
-    if velocity is not None:
-        vector = velocity.to_base(heading)
-        if abs(vector) < settings.course_speed or velocity.course_sigma > settings.course_sigma_limit:
-            return heading, None
-        offset = cmath.phase(vector) - velocity.measured_yaw
-        return heading.update_course(offset, velocity.course_sigma**2 + turn_variance, settings)
-    found = fit_course(segment, heading.direction if heading.is_known else None, settings)
-    if found is None or found[1] > settings.course_sigma_limit:
-        return heading, None
-    # the offset is that of the middle of the segment: an error of the bias has turned it since
-    half = 0.5 * (segment[-1].utime - segment[0].utime) * 1e-6
-    variance = found[1] ** 2 + heading.bias_variance * half * half + turn_variance
-    return heading.update_course(found[0], variance, settings)
+# --- position -----------------------------------------------------------------------------------------------
 
 
-def _estimate_speed(
-    heading: Heading, velocity: ReceiverVelocity | None, recent: tuple[TrackFix, ...], settings: RawSettings
-) -> tuple[float, float]:
-    """Return the speed along the heading and its sigma, by the receiver or else by recent fixes.
+class FixAnchor(NamedTuple):
+    """The newest good fix, the tangent plane at it, and its antenna in Odom at its instant, m."""
 
-    Before the heading is known, motion is taken as forward, and speed within three sigmas as 0.
+    utime: int
+    fix: AcceptedFix
+    work: LocalFrame
+    antenna: Vector3
+
+
+def compute_growth(age: float, speed_sigma: float, settings: RawSettings) -> float:
+    """Return the variance of each axis that a prediction over `age` seconds adds, m2: (s_v t)^2 + (a t^2 / 2)^2."""
+    t = min(age, MAX_SECONDS)
+    return (speed_sigma * t) ** 2 + (0.5 * settings.usual_acceleration * t * t) ** 2
+
+
+def compute_covariance(
+    horizontal: tuple[float, float, float], up: float, arm: complex, yaw: float, settings: RawSettings
+) -> tuple[float, ...]:
+    """Return the 36 numbers of a covariance along east, north, up.
+
+    `horizontal` are the variances east and north and their covariance, `up` and `yaw` the other variances; `arm`: see
+    the theory.
     """
-    direction = heading.direction if heading.is_known else 0j
-    if velocity is not None:
-        vector, sigma = velocity.to_base(heading), velocity.sigma
-        along = (vector * cmath.rect(1.0, -velocity.yaw) * direction.conjugate()).real
-    else:
-        fit = fit_best_speed(recent, direction, settings)
-        if fit is None:
-            return 0.0, settings.maximum_speed / 2.0
-        vector, sigma = fit.velocity, fit.sigma
-        along = (vector * direction.conjugate()).real
-    if not heading.is_known:
-        along = abs(vector) if abs(vector) > 3.0 * sigma else 0.0
-    return max(-settings.maximum_speed, min(along, settings.maximum_speed)), sigma
+    (ee, nn, en), ae, an, tilt = horizontal, -arm.imag, arm.real, settings.tilt_sigma**2
+    return (
+        *(ee + yaw * ae * ae, en + yaw * ae * an, 0.0, 0.0, 0.0, yaw * ae),
+        *(en + yaw * ae * an, nn + yaw * an * an, 0.0, 0.0, 0.0, yaw * an),
+        *(0.0, 0.0, up, 0.0, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
+        *(yaw * ae, yaw * an, 0.0, 0.0, 0.0, yaw),
+    )
 
 
 # --- localizer -------------------------------------------------------------------------------------------------
@@ -400,43 +519,34 @@ class RawLocalizer(NamedTuple):
     projection, capture: of the origin; None until it is set, and the fixes collected for it.
     motion, history: newest motion, and those of the last seconds for delayed fixes.
     tilt_bias: biases of the roll and pitch gyros, rad/s.
+    detector, is_slow: whether the IMU is quiet, and whether the vehicle was slow by the newest fix.
+    anchor, track, course_utime: the newest good fix, those before it, and when a course was measured last.
+    num_rejected: fixes rejected since the last good one, for any reason.
     imu_utime: of the last IMU sample.
     is_clock_stepped: whether the clock was set back and the heading has not been found since.
-    newest: instant of the newest sample, 0 before the first.
+    utime: instant of the newest sample, 0 before the first.
     """
 
     mounts: Mounts
     settings: RawSettings
     projection: OriginProjection | None = None
+    capture: OriginCapture = OriginCapture()
     motion: RawMotion | None = None
     history: tuple[RawMotion, ...] = ()
     heading: Heading = Heading()
-    quiet: QuietDetector = QuietDetector()
     tilt_bias: tuple[float, float] = (0.0, 0.0)
-    fixes: FixMonitor = FixMonitor()
-    capture: OriginCapture = OriginCapture()
-    imu_stamps: StampMonitor = StampMonitor()
-    gps_stamps: StampMonitor = StampMonitor()
+    detector: StationaryDetector = StationaryDetector()
+    is_slow: bool = False
+    anchor: FixAnchor | None = None
+    track: tuple[TrackFix, ...] = ()
+    course_utime: int = 0
+    num_rejected: int = 0
+    imu_clock: ClockMonitor = ClockMonitor()
+    gps_clock: ClockMonitor = ClockMonitor()
     imu_utime: int | None = None
     pose_epoch: int = 0
     is_clock_stepped: bool = False
-    newest: int = 0
-
-    @property
-    def origin(self) -> Origin | None:
-        """The origin of World:UTM, None before it is set."""
-        return None if self.projection is None else self.projection.geodesy.origin
-
-    def get_motion_at(self, utime: int, newest: RawMotion) -> RawMotion:
-        """Return the motion at an instant: predicted from the newest, or from the history."""
-        if utime >= newest.utime or not self.history:
-            return newest.propagate(utime, newest.rate, self.settings)
-        after = newest
-        for motion in reversed(self.history):
-            if motion.utime <= utime:
-                return interpolate_motion(motion, after, utime)
-            after = motion
-        return after
+    utime: int = 0
 
     @classmethod
     def start(cls, mounts: Mounts, settings: RawSettings | None = None, origin: Origin | None = None) -> RawLocalizer:
@@ -450,9 +560,19 @@ class RawLocalizer(NamedTuple):
         return cls(mounts, settings, projection, heading=Heading(bias_variance=settings.gyro_bias_sigma**2))
 
     @property
-    def utime(self) -> int:
-        """The instant of the newest sample processed, 0 before the first."""
-        return self.newest
+    def origin(self) -> Origin | None:
+        """The origin of World:UTM, None before it is set."""
+        return None if self.projection is None else self.projection.geodesy.origin
+
+    def get_motion_at(self, utime: int, newest: RawMotion) -> RawMotion:
+        """Return the motion at an instant, propagated from the one before it in the history; the first before all."""
+        if utime < newest.utime and self.history:
+            newest = next((each for each in reversed(self.history) if each.utime <= utime), self.history[0])
+        return newest.propagate(utime, newest.rate, self.settings)
+
+    def is_stationary(self, utime: int) -> bool:
+        """Return whether the vehicle is stationary at an instant."""
+        return self.is_slow and self.detector.get_quiet_time(utime) >= self.settings.stationary_time
 
     def process(self, sample: Sample | SwitchMode) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
         """Return the localizer after a sample, and the events; wheels and joints are ignored.
@@ -463,19 +583,239 @@ class RawLocalizer(NamedTuple):
         """
         if not isinstance(sample, ImuSample | GpsSample):
             return self, ()
-        is_imu = isinstance(sample, ImuSample)
-        stamps = self.imu_stamps if is_imu else self.gps_stamps
-        stamps, verdict = stamps.update(sample.header.utime, self.settings)
+        utime, is_imu = sample.header.utime, isinstance(sample, ImuSample)
+        before = self.imu_clock if is_imu else self.gps_clock
+        if utime == before.newest or utime <= 0:
+            return self, _reject(sample, "duplicate" if utime > 0 else "out_of_sequence")
+        source = ("imu" if is_imu else "gps", "")
+        clock, verdict = before.update(source, 0, utime, sample.header.seq, self.settings, horizon=0.0)
         if verdict is StampVerdict.STEPPED_BACK:
-            self = self._restart(sample.header.utime, stamps.lost_time)
-        self = self._replace(imu_stamps=stamps) if is_imu else self._replace(gps_stamps=stamps)
+            # the samples until the step was confirmed were about as far apart as the last two
+            lost = self.settings.clock_jump_samples * (utime - before.sources[source].odd_utime) * 1e-6
+            self = self._restart(utime, lost)
+        self = self._replace(imu_clock=clock) if is_imu else self._replace(gps_clock=clock)
         if verdict not in (StampVerdict.GOOD, StampVerdict.STEPPED_BACK):
             return self, _reject(sample, verdict.value)
         return self._process_imu(sample) if isinstance(sample, ImuSample) else self._process_gps(sample)
 
+    def _restart(self, utime: int, lost: float) -> RawLocalizer:
+        """Return the localizer after its clock was set back: Odom, origin and biases continue, in a new epoch.
+
+        The motion during the `lost` seconds until the step was confirmed is unknown.
+        """
+        motion, heading, settings = self.motion, self.heading, self.settings
+        if motion is not None:
+            travel = max(abs(motion.speed), motion.speed_sigma) * lost
+            motion = motion._replace(
+                utime=utime,
+                rate=ZERO,
+                speed=0.0,
+                speed_utime=0,
+                yaw_variance=min(motion.yaw_variance + (settings.gap_rate_sigma * lost) ** 2, 1e3),
+                position_variance=min(motion.position_variance + travel * travel, 1e12),
+            )
+        return RawLocalizer(
+            self.mounts,
+            settings,
+            self.projection,
+            self.capture,
+            motion,
+            heading=Heading(bias=heading.bias, bias_variance=heading.bias_variance),
+            tilt_bias=self.tilt_bias,
+            pose_epoch=self.pose_epoch + 1,
+            is_clock_stepped=True,
+            utime=utime,
+        )
+
+    def _process_imu(self, sample: ImuSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
+        utime, settings, heading = sample.header.utime, self.settings, self.heading
+        imu = read_raw_imu(sample, self.mounts.X_base_imu)
+        if isinstance(imu, str):
+            return self, _reject(sample, imu)
+        before, (wx, wy, wz), (bx, by) = self.motion or RawMotion(utime), imu.rate, self.tilt_bias
+        rate = (wx - bx, wy - by, wz - heading.bias)
+        dt = 0.0 if self.imu_utime is None else (utime - self.imu_utime) * 1e-6
+        is_gap = dt > settings.rate_hold
+        step, yaw_rate, bias = min(dt, settings.rate_hold), compute_yaw_rate(rate, before.up), heading.bias
+        # the turn rate alone: the biases of roll and pitch rates are unknown until the vehicle is stationary
+        measured, force, bias_sigma = (0.0, 0.0, yaw_rate + bias), imu.force or ZERO, math.sqrt(heading.bias_variance)
+        detector = self.detector.update(utime, measured, force, (0.0, 0.0, bias), bias_sigma, settings)
+        is_held = self.is_slow and detector.get_quiet_time(utime) >= settings.stationary_time
+        heading = heading.propagate((utime - before.utime) * 1e-6, settings, is_held and before.rate == ZERO)
+        if not is_held:
+            detector = detector.restart_mean()
+        elif detector.sum_time < settings.stationary_time:
+            is_held = before.rate == ZERO  # as before
+        else:
+            mean_rate = detector.mean_stationary_rate[2] - bias
+            noise = settings.gyro_noise**2 / detector.sum_time
+            is_held = not heading.is_turning(mean_rate, noise)
+            if is_held:
+                heading, detector = heading.update_stationary(mean_rate, noise), detector.restart_mean()
+        self = self._replace(detector=detector, track=() if is_gap or not dt else self.track)
+        if is_held:
+            gain = step / (settings.tilt_time + step)
+            bx, by = bx + gain * rate[0], by + gain * rate[1]
+            before, rate = before._replace(speed=0.0, speed_sigma=0.5 * settings.stationary_speed, rate=ZERO), ZERO
+        a, b, c = before.rate
+        mean = before.rate if is_gap else (0.5 * (a + rate[0]), 0.5 * (b + rate[1]), 0.5 * (c + rate[2]))
+        motion = before.propagate(utime, mean if dt else ZERO, settings)
+        up = imu.up or motion.up
+        if imu.up is None and imu.force is not None:
+            gain = step / (settings.tilt_time + step) if dt else 1.0
+            v = add((motion.speed, 0.0, 0.0), cross(rate, self.mounts.X_base_imu.xyz))
+            up = correct_up(up, imu.force, cross(rate, v), gain, settings)
+        motion = motion._replace(up=up, rate=rate)
+        after = self._replace(
+            motion=motion,
+            history=_append_motion(self.history, motion),
+            heading=heading,
+            tilt_bias=(bx, by),
+            imu_utime=utime,
+            utime=max(self.utime, utime),
+        )
+        return after, _reject(sample, "gap") if is_gap else ()
+
+    def _process_gps(self, sample: GpsSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
+        utime, settings, lever = sample.header.utime, self.settings, self.mounts.X_base_antenna
+        fix = evaluate_fix(sample, settings)
+        if not isinstance(fix, str) and self.projection is not None and not self.projection.is_in_zone(fix):
+            fix = "range"
+        if isinstance(fix, str):
+            return self._replace(num_rejected=self.num_rejected + 1), _reject(sample, fix)
+        motion, heading = self.motion or RawMotion(utime), self.heading
+        ahead = (utime - motion.utime) * 1e-6
+        if ahead > settings.imu_timeout:
+            # without IMU samples Odom continues by the prediction. If they are merely delayed they must still be
+            # integrated from the last one: until the timeout the prediction is for the fix alone
+            heading, ahead = heading.propagate(ahead, settings), 0.0
+            motion = motion.propagate(utime, motion.rate, settings)
+        at = self.get_motion_at(utime, motion)
+        antenna = (at.pose @ lever).xyz
+        fix = self._complete_height(fix, utime, antenna[2], at.speed_sigma)
+        work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
+        arm, since = complex(antenna[0] - at.x, antenna[1] - at.y), utime
+        newest = TrackFix(utime, work.ecef, fix.sigma, at.path, arm, at.yaw)
+        track = append_fix(self.track, newest, settings.course_window)
+        velocity = course = read_velocity(sample, at, lever.xyz, heading, settings)
+        if velocity is not None:
+            # the speed up to which one velocity may be a stationary vehicle's
+            limit = min(settings.stationary_speed + 3.0 * velocity.sigma, settings.course_speed)
+            is_slow = abs(velocity.c) <= max(velocity.sigma, limit)
+            has_course = abs(velocity.c) >= settings.course_speed
+        else:
+            noise = math.sqrt(2.0) * fix.sigma
+            seconds = min(math.sqrt(2.0 * noise / settings.usual_acceleration), settings.speed_window)
+            velocity = measure_velocity(track, utime - seconds * 1e6, work, heading, settings)
+            seconds = max(3.0 * noise / settings.stationary_speed, settings.stationary_time)
+            slow = measure_velocity(track, utime - seconds * 1e6, work, heading, settings)
+            is_slow = slow is not None and max(slow.sigma, 0.5 * abs(slow.c)) <= settings.stationary_speed
+            course = measure_velocity(track, since := max(track[0].utime, self.course_utime), work, heading, settings)
+            has_course = True
+        result, was_known = None, heading.is_known
+        speed, speed_sigma = 0.0, settings.stationary_speed / 2.0
+        if not (is_slow and self.is_stationary(utime)):
+            if course is not None and has_course and course.course_sigma <= settings.course_sigma_limit:
+                turn_sigma = settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)
+                # a course is that of the middle of its segment: an error of the bias has turned it since
+                drift = 0.5e-6 * (utime - since) * math.sqrt(heading.bias_variance)
+                variance = course.course_sigma**2 + turn_sigma**2 + drift**2
+                heading, result = heading.update_course(cmath.phase(course.c), variance, settings)
+            speed, speed_sigma = _compute_speed(velocity, heading, settings)
+        projection, capture = self.projection, self.capture
+        events: tuple[LocalizerEvent, ...] = ()
+        if projection is None:
+            capture, origin = capture.add_fix(utime, work.ecef, fix.sigma, settings)
+            if origin is not None:
+                projection, events = OriginProjection(Geodesy(origin)), (PersistOrigin(origin),)
+        if projection is not None:
+            projection = projection.at(fix.latitude_deg, fix.longitude_deg, work)
+        after = self._replace(
+            projection=projection,
+            capture=capture,
+            motion=motion._replace(speed=speed, speed_utime=utime, speed_sigma=speed_sigma),
+            heading=heading,
+            is_slow=is_slow,
+            anchor=FixAnchor(utime, fix, work, antenna),
+            track=track,
+            # the path at 1 m/s continues while the vehicle is stationary: no course must reach back into that
+            course_utime=self.course_utime if result is None and not is_slow else utime,
+            num_rejected=0,
+            # the first course turns no pose that was valid
+            pose_epoch=self.pose_epoch + int(result is CourseResult.RESET and was_known),
+            is_clock_stepped=self.is_clock_stepped and not heading.is_known,
+            utime=max(self.utime, utime),
+        )
+        return after, (_reject(sample, "course") if result is CourseResult.REJECTED else ()) + events
+
+    def _complete_height(self, fix: AcceptedFix, utime: int, antenna_up: float, speed_sigma: float) -> AcceptedFix:
+        """Return the fix with a height: its own, else that of the fix before propagated, else the origin's, else 0."""
+        before, settings = self.anchor, self.settings
+        if not math.isnan(fix.height):
+            return fix
+        height, sigma = 0.0, settings.unknown_height_sigma
+        if before is not None:
+            height = before.fix.height + antenna_up - before.antenna[2]
+            growth = compute_growth((utime - before.utime) * 1e-6, speed_sigma, settings)
+            sigma = min(math.sqrt(before.fix.up_variance + growth), sigma)
+        elif self.origin is not None:
+            height, sigma = self.origin.height, settings.assumed_height_sigma
+        return replace(fix, height=height, up_variance=sigma * sigma)
+
     def estimate(self, utime: int) -> Estimate:
         """Return the pose of the base frame at an instant: predicted after the newest sample, held before history."""
-        return compute_estimate(self, utime)
+        settings, newest, anchor, heading = self.settings, self.motion, self.anchor, self.heading
+        invalid = self._find_invalid(utime)
+        if newest is None:
+            return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=self.pose_epoch, origin=self.origin)
+        motion = self.get_motion_at(utime, newest)
+        odom, position, yaw = motion.pose, motion.position_variance, motion.yaw_variance
+        in_odom = Estimate(
+            utime,
+            odom,
+            odom_covariance=compute_covariance((position, position, 0.0), position, 0j, yaw, settings),
+            invalid=invalid,
+            quality=self._find_quality(utime, motion),
+            pose_epoch=self.pose_epoch,
+            origin=self.origin,
+            is_odom_random_walk=True,
+        )
+        if anchor is None:
+            return in_odom
+        q, direction, heading_variance = odom.wxyz, 1.0 + 0j, UNKNOWN_VARIANCE
+        if heading.is_known:
+            q, direction = so3.multiply(rotation_about_up(heading.offset), q), heading.direction
+            is_held = self.is_stationary(utime)
+            heading_variance = heading.propagate((utime - newest.utime) * 1e-6, settings, is_held).variance
+        x, y, z = anchor.antenna
+        arm = direction * complex(motion.x - x, motion.y - y)
+        growth = compute_growth(max((utime - anchor.utime) * 1e-6, 0.0), newest.speed_sigma, settings)
+        fix = anchor.fix
+        horizontal = (fix.east_variance + growth, fix.north_variance + growth, fix.cross)
+        covariance = compute_covariance(horizontal, fix.up_variance + growth, arm, heading_variance, settings)
+        sigma = math.sqrt(compute_longest_axis(covariance[0], covariance[7], covariance[1]))
+        heading_sigma = math.sqrt(heading_variance)
+        k_horizontal, k_heading = compute_factors(settings.risk)
+        levels = compute_level(sigma, 0.0, heading_sigma)
+        risks = compute_limit_risks(sigma, heading_sigma, settings.horizontal_limit, settings.heading_limit)
+        if heading.is_known and risks[1] > max(risks[0], LIMIT_RISK):
+            invalid |= Invalid.STATIONARY_HEADING if self.is_stationary(utime) else Invalid.LIMIT_EXCEEDED
+        elif risks[0] > LIMIT_RISK or (heading.is_known and sum(risks) > LIMIT_RISK):
+            invalid |= Invalid.LIMIT_EXCEEDED
+        enu, utm = _compute_world_poses(self.projection, anchor.work, q, (arm.real, arm.imag, motion.z - z))
+        return replace(
+            in_odom,
+            enu=enu,
+            utm=utm,
+            covariance=covariance,
+            invalid=invalid,
+            horizontal_protection_level=k_horizontal * sigma,
+            heading_protection_level=min(k_heading * heading_sigma, math.pi),
+            horizontal_level=levels[0],
+            heading_level=levels[1],
+            limit_risk=min(sum(risks), 1.0),
+            horizontal_allowance=0.0,
+        )
 
     def defer_estimate(self, utime: int) -> Estimate:
         """Return `estimate(utime)`, computed at once: it is cheap."""
@@ -487,183 +827,55 @@ class RawLocalizer(NamedTuple):
 
     def find_stale_sensors(self, utime: int) -> Invalid:
         """Return the bits of STALE_SENSORS of an estimate at an instant."""
-        return self.estimate(utime).invalid & STALE_SENSORS
+        return self._find_invalid(utime) & STALE_SENSORS
 
     def summary(self, utime: int) -> LocalizerSummary:
         """Return whether the vehicle is stationary, and when a fix was last used."""
-        anchor = self.fixes.anchor
-        is_stationary = self.quiet.is_stationary(utime, self.settings)
         return LocalizerSummary(
             Mode.RAW,
             None,
-            is_stationary,
-            0 if anchor is None else anchor.utime,
+            self.is_stationary(utime),
+            0 if self.anchor is None else self.anchor.utime,
             horizontal_limit=self.settings.horizontal_limit,
             heading_limit=self.settings.heading_limit,
         )
 
-    # --- IMU ------------------------------------------------------------------------------------------------
+    def _find_invalid(self, utime: int) -> Invalid:
+        """Return the reasons against an estimate, except for its protection levels."""
+        # numbers, not members: combining flags costs more than all else here
+        settings, anchor, imu = self.settings, self.anchor, self.imu_utime
+        invalid = 0
+        if anchor is None:
+            invalid |= 1  # NO_FIX
+        elif (utime - anchor.utime) * 1e-6 > settings.gps_timeout:
+            invalid |= 32  # STALE_GPS
+        if imu is None:
+            invalid |= 2  # NO_IMU
+        elif (utime - imu) * 1e-6 > settings.imu_timeout:
+            invalid |= 64  # STALE_IMU
+        if self.projection is None:
+            invalid |= 4  # NO_ORIGIN
+        if not self.heading.is_known:
+            invalid |= 8  # NOT_MOVED_YET
+        if self.num_rejected >= settings.fix_rejections:
+            invalid |= 128  # GPS_REJECTED
+        # so far before the newest sample that the clocks differ
+        if self.is_clock_stepped or (self.utime - utime) * 1e-6 > settings.imu_timeout:
+            invalid |= 512  # CLOCK_STEPPED
+        if self.motion is not None and self.motion.up[2] < math.cos(settings.maximum_tilt):
+            invalid |= 1024  # TILTED
+        return Invalid(invalid)
 
-    def _process_imu(self, sample: ImuSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
-        utime, settings, before = sample.header.utime, self.settings, self.motion
-        imu = read_raw_imu(sample, self.mounts.X_base_imu)
-        if isinstance(imu, str):
-            return self, _reject(sample, imu)
-        (wx, wy, wz), (bx, by) = imu.rate, self.tilt_bias
-        rate = (wx - bx, wy - by, wz - self.heading.bias)
-        if before is None or self.imu_utime is None:
-            return self._start_imu(utime, imu, rate), ()
-        dt = (utime - self.imu_utime) * 1e-6
-        is_gap = dt > settings.rate_hold
-        a, b, c = before.rate
-        mean = before.rate if is_gap else (0.5 * (a + rate[0]), 0.5 * (b + rate[1]), 0.5 * (c + rate[2]))
-        motion = before.propagate(utime, mean, settings)
-        heading = self.heading.propagate((utime - before.utime) * 1e-6, settings)
-        fixes = self.fixes.forget_path() if is_gap else self.fixes
-        up = imu.up or motion.up
-        if imu.up is None and imu.force is not None:
-            up = correct_up(up, imu.force, rate, motion.speed, self.mounts.X_base_imu.xyz, dt, settings)
-        yaw_rate = compute_yaw_rate(rate, up)
-        step = min(dt, settings.rate_hold)
-        quiet = self.quiet.update(utime, yaw_rate, step, math.sqrt(heading.bias_variance), settings)
-        speed, speed_sigma = motion.speed, motion.speed_sigma
-        if quiet.is_stationary(utime, settings):
-            place = fixes.stationary
-            if place is None or not heading.is_known or place.is_bias_certain(utime, settings):
-                heading = heading.update_stationary(yaw_rate, max(settings.gyro_noise**2 / step, quiet.variance))
-            if place is not None:
-                heading = place.inflate_heading(utime, step, heading, settings)
-            gain = step / (settings.tilt_time + step)
-            bx, by = bx + gain * rate[0], by + gain * rate[1]
-            if speed:
-                speed, speed_sigma = 0.0, 0.5 * settings.stationary_speed
-        localizer = self._replace(heading=heading, quiet=quiet, tilt_bias=(bx, by), fixes=fixes)
-        motion = motion._replace(up=up, rate=rate, speed=speed, speed_sigma=speed_sigma)
-        return localizer._with_imu(utime, motion), _reject(sample, "gap") if is_gap else ()
-
-    def _start_imu(self, utime: int, imu: RawImuSample, rate: Vector3) -> RawLocalizer:
-        """Return the localizer after a first sample: there is nothing to integrate from, but it gives the vertical."""
-        before = self.motion or RawMotion(utime)
-        motion = before.propagate(utime, ZERO, self.settings)
-        heading = self.heading.propagate((utime - before.utime) * 1e-6, self.settings, measured=False)
-        localizer = self._replace(heading=heading, fixes=self.fixes.forget_path())
-        return localizer._with_imu(utime, motion._replace(up=get_first_up(imu) or motion.up, rate=rate))
-
-    def _with_imu(self, utime: int, motion: RawMotion) -> RawLocalizer:
-        history = _append_motion(self.history, motion)
-        return self._replace(motion=motion, history=history, imu_utime=utime, newest=max(self.newest, utime))
-
-    # --- fixes ----------------------------------------------------------------------------------------------
-
-    def _process_gps(self, sample: GpsSample) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
-        utime, settings = sample.header.utime, self.settings
-        fix = evaluate_fix(sample, settings)
-        if not isinstance(fix, str) and self.projection is not None and not self.projection.is_in_zone(fix):
-            fix = "range"
-        if isinstance(fix, str):
-            fixes = self.fixes._replace(num_rejected=self.fixes.num_rejected + 1)
-            return self._replace(fixes=fixes), _reject(sample, fix)
-        motion, heading = self.motion or RawMotion(utime), self.heading
-        ahead = (utime - motion.utime) * 1e-6
-        if ahead > settings.imu_timeout:
-            # without IMU samples Odom continues by the prediction. If they are merely delayed they must still be
-            # integrated from the last one: until the timeout the prediction is for the fix alone
-            heading = heading.propagate(ahead, settings)
-            ahead = 0.0
-            motion = motion.propagate(utime, motion.rate, settings)
-        turn_variance = (settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)) ** 2
-        at, is_stationary = self.get_motion_at(utime, motion), self.quiet.is_stationary(utime, settings)
-        lever = self.mounts.X_base_antenna.xyz
-        arm, arm_up = compute_lever_arm(at, lever)
-        fallback = math.nan if self.origin is None else self.origin.height
-        fix = _complete_height(fix, self.fixes.anchor, at, arm_up, fallback, settings)
-        ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
-        fixes, heading, work = self.fixes.recenter(fix, ecef, heading)
-        position, up = _locate(work, ecef)
-        newest = TrackFix(utime, position, fix.sigma, at.path, arm, at.yaw, ecef)
-        recent = append_fix(fixes.recent, newest, settings.speed_window + settings.stationary_time)
-        segment = append_fix(fixes.segment, newest, settings.course_window)
-        velocity = _read_velocity(sample, at, lever, settings)
-        if velocity is None:
-            measured, is_slow = None, is_slow_by_fixes(recent, settings)
-        else:
-            measured = velocity.to_base(heading), velocity.sigma
-            # the speed up to which one velocity may be a stationary vehicle's; their mean over time shows more
-            limit = min(settings.stationary_speed + 3.0 * velocity.sigma, settings.course_speed)
-            is_slow = abs(measured[0]) <= max(velocity.sigma, limit)
-        least_speed = max(abs(at.speed) - 2.0 * at.speed_sigma, 0.0)
-        place, heading, is_slow = update_stationary(
-            fixes.stationary, is_slow, is_stationary, newest, measured, least_speed, heading, settings
-        )
-        course, was_known = None, heading.is_known
-        if is_stationary and is_slow:
-            # the path at 1 m/s continues while the vehicle is stationary: a segment must not reach back into that
-            segment = (newest,)
-            speed, speed_sigma = 0.0, settings.stationary_speed / 2.0
-        else:
-            heading, course = _update_course(heading, velocity, segment, turn_variance, settings)
-            if course is not None:
-                segment = (newest,)
-            speed, speed_sigma = _estimate_speed(heading, velocity, recent, settings)
-        anchor = FixAnchor(utime, position, up, fix, at, arm, arm_up)
-        localizer = self._replace(
-            motion=motion._replace(speed=speed, speed_utime=utime, speed_sigma=speed_sigma),
-            fixes=FixMonitor(work, anchor, recent, segment, stationary=place),
-            heading=heading,
-            quiet=self.quiet._replace(is_slow=is_slow),
-            # the first course turns no pose that was valid
-            pose_epoch=self.pose_epoch + int(course is CourseResult.RESET and was_known),
-            is_clock_stepped=self.is_clock_stepped and not heading.is_known,
-            newest=max(self.newest, utime),
-        )
-        localizer, captured = localizer._set_origin(utime, ecef, fix.sigma)
-        return localizer, (_reject(sample, "course") if course is CourseResult.REJECTED else ()) + captured
-
-    def _set_origin(self, utime: int, ecef: Vector3, sigma: float) -> tuple[RawLocalizer, tuple[LocalizerEvent, ...]]:
-        """Return the localizer with the origin set, if it can be, and its projection at the new fix."""
-        events: tuple[LocalizerEvent, ...] = ()
-        capture, projection = self.capture, self.projection
-        if projection is None:
-            capture, origin = capture.add_fix(utime, ecef, sigma, self.settings)
-            if origin is not None:
-                projection = OriginProjection(Geodesy(origin))
-                events = (PersistOrigin(origin),)
-        if projection is not None and self.fixes.work is not None:
-            latitude, longitude, _ = geodetic_from_ecef(ecef)
-            projection = projection.at(latitude, longitude, self.fixes.work)
-        return self._replace(capture=capture, projection=projection), events
-
-    # --- clock ----------------------------------------------------------------------------------------------
-
-    def _restart(self, utime: int, lost: float) -> RawLocalizer:
-        """Return the localizer after its clock was set back: Odom, origin and biases continue, in a new epoch.
-
-        The motion during the `lost` seconds until the step was confirmed is unknown.
-        """
-        motion, heading = self.motion, self.heading
-        if motion is not None:
-            travel = max(abs(motion.speed), motion.speed_sigma) * lost
-            motion = motion._replace(
-                utime=utime,
-                rate=ZERO,
-                speed=0.0,
-                speed_utime=0,
-                yaw_variance=min(motion.yaw_variance + (self.settings.gap_rate_sigma * lost) ** 2, 1e3),
-                position_variance=min(motion.position_variance + travel * travel, 1e12),
-            )
-        return self._replace(
-            motion=motion,
-            history=(),
-            heading=Heading(bias=heading.bias, bias_variance=heading.bias_variance),
-            quiet=QuietDetector(),
-            fixes=FixMonitor(),
-            imu_stamps=StampMonitor(),
-            gps_stamps=StampMonitor(),
-            imu_utime=None,
-            pose_epoch=self.pose_epoch + 1,
-            is_clock_stepped=True,
-            newest=utime,
-        )
+    def _find_quality(self, utime: int, motion: RawMotion) -> Quality:
+        settings = self.settings
+        quality = 0
+        if self.is_stationary(utime) or abs(motion.speed) < settings.course_speed:
+            quality |= 1  # HEADING_FROM_GYRO
+        if utime > self.utime:
+            quality |= 2  # PREDICTED
+        if motion.speed < -max(2.0 * motion.speed_sigma, settings.stationary_speed):
+            quality |= 32  # REVERSING
+        return Quality(quality)
 
 
 def _reject(sample: ImuSample | GpsSample, reason: str) -> tuple[LocalizerEvent, ...]:
@@ -672,199 +884,39 @@ def _reject(sample: ImuSample | GpsSample, reason: str) -> tuple[LocalizerEvent,
 
 def _append_motion(history: tuple[RawMotion, ...], motion: RawMotion) -> tuple[RawMotion, ...]:
     """Return the history with a motion more, thinned and limited in length."""
-    if not history:
-        return (motion,)
-    if motion.utime - history[-1].utime < HISTORY_STEP_US:
+    if history and motion.utime - history[-1].utime < HISTORY_STEP_US:
         return history
     oldest = motion.utime - HISTORY_LENGTH_US
     first = next((n for n, each in enumerate(history) if each.utime >= oldest), len(history))
     return (*history[first:], motion)
 
 
-CONVERGENCE_RANGE: Final = 100.0
-"""Meters from the last fix within which its meridian convergence is used: it changes by 1.6e-5 rad tan(latitude)."""
+def _compute_speed(velocity: RawVelocity | None, heading: Heading, settings: RawSettings) -> tuple[float, float]:
+    """Return the speed along the heading and its sigma.
 
-
-# --- estimate -----------------------------------------------------------------------------------------------
-
-
-def compute_estimate(state: RawLocalizer, utime: int) -> Estimate:
-    """Return the pose of the base frame at an instant, by the state alone."""
-    settings, newest, anchor, origin = state.settings, state.motion, state.fixes.anchor, state.origin
-    invalid = _find_invalid(state, utime)
-    if newest is None:
-        return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=state.pose_epoch, origin=origin)
-    motion = state.get_motion_at(utime, newest)
-    odom = motion.pose
-    in_odom = Estimate(
-        utime,
-        odom,
-        odom_covariance=compute_odom_covariance(motion.position_variance, motion.yaw_variance, settings),
-        invalid=invalid,
-        quality=_find_quality(state, utime, motion),
-        pose_epoch=state.pose_epoch,
-        origin=origin,
-        is_odom_random_walk=True,
-    )
-    if anchor is None:
-        return in_odom
-    heading, q, direction, heading_variance = state.heading, odom.wxyz, 1.0 + 0j, UNKNOWN_VARIANCE
+    Before the heading is known, motion is taken as forward, and speed within three sigmas as 0.
+    """
+    if velocity is None:
+        return 0.0, settings.maximum_speed / 2.0
     if heading.is_known:
-        q, direction = so3.multiply(rotation_about_up(heading.offset), q), heading.direction
-        heading_variance = heading.propagate((utime - newest.utime) * 1e-6, settings).variance
-    age = max((utime - anchor.utime) * 1e-6, 0.0)
-    growth = compute_growth(age, newest.speed_sigma, settings)
-    position, up, arm = anchor.propagate_base(motion, direction)
-    covariance = compute_covariance(anchor.fix, growth, arm, heading_variance, settings)
-    variance = compute_longest_axis(covariance[0], covariance[7], covariance[1])
-    k_horizontal, k_heading = compute_factors(settings.risk)
-    horizontal = k_horizontal * math.sqrt(variance)
-    heading_level = min(k_heading * math.sqrt(heading_variance), math.pi)
-    sigma, heading_sigma = math.sqrt(variance), math.sqrt(heading_variance)
-    levels = compute_level(sigma, 0.0, heading_sigma)
-    risks = compute_limit_risks(sigma, heading_sigma, settings.horizontal_limit, settings.heading_limit)
-    if heading.is_known and risks[1] > max(risks[0], LIMIT_RISK):
-        is_stationary = state.quiet.is_stationary(utime, settings)
-        invalid |= Invalid.STATIONARY_HEADING if is_stationary else Invalid.LIMIT_EXCEEDED
-    elif risks[0] > LIMIT_RISK or (heading.is_known and sum(risks) > LIMIT_RISK):
-        invalid |= Invalid.LIMIT_EXCEEDED
-    enu = utm = None
-    if state.projection is not None and state.fixes.work is not None:
-        is_far = abs(position - anchor.position) > CONVERGENCE_RANGE
-        enu, utm = _compute_world_poses(state.projection, state.fixes.work, q, position, up, is_far)
-    remaining = min(
-        settings.gps_timeout - age,
-        settings.imu_timeout - (utime - (state.imu_utime or utime)) * 1e-6,
-        compute_seconds_to_limit(variance - growth, age, newest.speed_sigma, settings),
-    )
-    return replace(
-        in_odom,
-        enu=enu,
-        utm=utm,
-        covariance=covariance,
-        invalid=invalid,
-        horizontal_protection_level=horizontal,
-        heading_protection_level=heading_level,
-        seconds_to_limit=NAN if invalid else max(remaining, 0.0),
-        horizontal_level=levels[0],
-        heading_level=levels[1],
-        limit_risk=min(sum(risks), 1.0),
-        horizontal_allowance=0.0,
-    )
+        along = (velocity.c * heading.direction.conjugate()).real
+    else:
+        along = abs(velocity.c) if abs(velocity.c) > 3.0 * velocity.sigma else 0.0
+    return max(-settings.maximum_speed, min(along, settings.maximum_speed)), velocity.sigma
 
 
 def _compute_world_poses(
-    projection: OriginProjection, work: LocalFrame, q: Quaternion, position: complex, up: float, is_far: bool
+    projection: OriginProjection | None, work: LocalFrame, q: Quaternion, position: Vector3
 ) -> tuple[Pose, Pose] | tuple[None, None]:
-    """Return the pose in World:ENU and in World:UTM; `q` is along the working frame. None out of range."""
-    geodesy, convergence = projection.geodesy, projection.convergence
-    ecef = work.to_ecef((position.real, position.imag, up))
+    """Return the pose in World:ENU and in World:UTM from that along a tangent plane; None out of range."""
+    if projection is None:
+        return None, None
+    geodesy, ecef = projection.geodesy, work.to_ecef(position)
     try:
         utm = geodesy.to_relative_utm(geodesy.utm_from_ecef(ecef))
-        if is_far:
-            latitude, longitude, _ = geodetic_from_ecef(ecef)
-            convergence = geodesy.convergence(latitude, longitude)
     except GeodesyError:
         return None, None
     return (
         Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(projection.tangent_from_work, q)),
-        Pose(utm, so3.multiply(rotation_about_up(convergence), q)),
+        Pose(utm, so3.multiply(rotation_about_up(projection.convergence), q)),
     )
-
-
-# --- covariance ---------------------------------------------------------------------------------------------
-
-
-def compute_covariance(
-    fix: AcceptedFix, growth: float, arm: complex, yaw_variance: float, settings: RawSettings
-) -> tuple[float, ...]:
-    """Return the 36 numbers of the covariance of the base frame along east, north, up; `arm`: see the theory."""
-    ae, an = -arm.imag, arm.real
-    ee = fix.east_variance + growth + yaw_variance * ae * ae
-    nn = fix.north_variance + growth + yaw_variance * an * an
-    en = fix.cross + yaw_variance * ae * an
-    ye, yn = yaw_variance * ae, yaw_variance * an
-    return _fill_covariance(ee, en, nn, fix.up_variance + growth, ye, yn, yaw_variance, settings)
-
-
-def compute_odom_covariance(position: float, yaw: float, settings: RawSettings) -> tuple[float, ...]:
-    """Return the 36 numbers of the covariance of the pose in Odom, from its variances of position and yaw."""
-    return _fill_covariance(position, 0.0, position, position, 0.0, 0.0, yaw, settings)
-
-
-def _fill_covariance(
-    ee: float, en: float, nn: float, uu: float, ye: float, yn: float, yy: float, settings: RawSettings
-) -> tuple[float, ...]:
-    tilt = settings.tilt_sigma**2
-    return (
-        *(ee, en, 0.0, 0.0, 0.0, ye),
-        *(en, nn, 0.0, 0.0, 0.0, yn),
-        *(0.0, 0.0, uu, 0.0, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, tilt, 0.0, 0.0),
-        *(0.0, 0.0, 0.0, 0.0, tilt, 0.0),
-        *(ye, yn, 0.0, 0.0, 0.0, yy),
-    )
-
-
-def compute_seconds_to_limit(variance: float, age: float, speed_sigma: float, settings: RawSettings) -> float:
-    """Return the seconds without fixes until the position is beyond its limit with LIMIT_RISK; 0 if it is.
-
-    `variance` is that of the longest axis without growth, which is a quadratic of x = t^2.
-    """
-    room = (settings.horizontal_limit / compute_factors(LIMIT_RISK)[0]) ** 2 - variance
-    if room <= 0.0:
-        return 0.0
-    a, b = (0.5 * settings.usual_acceleration) ** 2, speed_sigma**2
-    x = 2.0 * room / (b + math.sqrt(b * b + 4.0 * a * room))
-    return max(math.sqrt(x) - age, 0.0)
-
-
-# --- validity -----------------------------------------------------------------------------------------------
-
-
-def _find_invalid(state: RawLocalizer, utime: int) -> Invalid:
-    """Return the reasons against an estimate, except for its protection levels."""
-    # numbers, not members: combining flags costs more than all else here
-    settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
-    invalid = 0
-    if anchor is None:
-        invalid |= 1  # NO_FIX
-    elif (utime - anchor.utime) * 1e-6 > settings.gps_timeout:
-        invalid |= 32  # STALE_GPS
-    if imu is None:
-        invalid |= 2  # NO_IMU
-    elif (utime - imu) * 1e-6 > settings.imu_timeout:
-        invalid |= 64  # STALE_IMU
-    if state.projection is None:
-        invalid |= 4  # NO_ORIGIN
-    if not state.heading.is_known:
-        invalid |= 8  # NOT_MOVED_YET
-    if state.fixes.num_rejected >= settings.fix_rejections:
-        invalid |= 128  # GPS_REJECTED
-    if state.is_clock_stepped or _is_too_early(state, utime):
-        invalid |= 512  # CLOCK_STEPPED
-    if state.motion is not None and state.motion.up[2] < math.cos(settings.maximum_tilt):
-        invalid |= 1024  # TILTED
-    return Invalid(invalid)
-
-
-def _is_too_early(state: RawLocalizer, utime: int) -> bool:
-    """Return whether an instant is before the history, or so far before the newest samples that the clocks differ."""
-    settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
-    return (
-        (imu is not None and (imu - utime) * 1e-6 > settings.imu_timeout)
-        or (anchor is not None and (anchor.utime - utime) * 1e-6 > settings.gps_timeout)
-        or (bool(state.history) and utime < state.history[0].utime)
-    )
-
-
-def _find_quality(state: RawLocalizer, utime: int, motion: RawMotion) -> Quality:
-    settings = state.settings
-    quality = 0
-    if state.quiet.is_stationary(utime, settings) or abs(motion.speed) < settings.course_speed:
-        quality |= 1  # HEADING_FROM_GYRO
-    if utime > state.newest:
-        quality |= 2  # PREDICTED
-    if motion.speed < -max(motion.speed_sigma, settings.stationary_speed):
-        quality |= 32  # REVERSING
-    return Quality(quality)

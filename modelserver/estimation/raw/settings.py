@@ -68,9 +68,9 @@ class RawSettings(FixSettings):
     course_sigma_limit: float = 0.15
     """Sigma below which a course is used, rad; a course from positions waits until it is."""
     course_window: float = 30.0
-    """Longest segment of fixes for one course, seconds."""
+    """Longest time between the two fixes of a course, seconds."""
     course_turn_share: float = 0.1
-    """Added to the sigma of a course for each radian turned within its segment: speed is not constant in a turn."""
+    """Added to the sigma of a course for each radian turned between its fixes: speed is not constant in a turn."""
     course_gate: float = 4.0
     """Number of sigmas by which a course may differ from the predicted heading before it is rejected."""
     course_rejections: int = 5
@@ -81,11 +81,13 @@ class RawSettings(FixSettings):
     # --- speed, stationary detection ---
 
     speed_window: float = 5.0
-    """Longest segment of fixes for the speed, seconds."""
+    """Longest time between the two fixes of a speed, seconds."""
     stationary_speed: float = 0.15
     """Speed below which the vehicle may be stationary, m/s."""
     stationary_rate: float = 0.01
-    """Spread of the yaw rate, and its distance from the bias, below which the gyro is quiet, rad/s: 0.6 deg/s."""
+    """Spread of the gyros, and distance of the rate from the bias, below which they are quiet, rad/s: 0.6 deg/s."""
+    stationary_force: float = 0.15
+    """Spread of the specific force, m/s2, below which the accelerometers are quiet: an idling engine."""
     stationary_time: float = 2.0
     """Time for which both must last before the vehicle is stationary and the bias is measured, seconds."""
 

@@ -70,7 +70,9 @@ def update(monitor: ClockMonitor, *stamps: tuple[str, int, float, int]) -> tuple
     """Return the monitor after stamps (source, rank, seconds since T0, sequence number), and its verdicts."""
     words = []
     for name, rank, seconds, seq in stamps:
-        monitor, verdict = monitor.update(("sample", name), rank, T0 + round(seconds * 1e6), seq, SETTINGS)
+        monitor, verdict = monitor.update(
+            ("sample", name), rank, T0 + round(seconds * 1e6), seq, SETTINGS, SETTINGS.horizon
+        )
         words.append(verdict.value)
     return monitor, words
 
@@ -129,8 +131,10 @@ def test_given_one_stamp_ahead_when_the_lead_continues_then_time_does_not_step_b
 def test_given_another_type_of_sample_with_the_name_of_the_lead_then_its_stamps_are_separate():
     monitor = create_running_monitor()
     for n in range(10):
-        monitor, _ = monitor.update(("range", "imu"), 0, T0 + 10_180_000 + n, 501 + n, SETTINGS)
-        monitor, verdict = monitor.update(("sample", "imu"), 2, T0 + 10_000_000 + n * 10_000, 501 + n, SETTINGS)
+        monitor, _ = monitor.update(("range", "imu"), 0, T0 + 10_180_000 + n, 501 + n, SETTINGS, SETTINGS.horizon)
+        monitor, verdict = monitor.update(
+            ("sample", "imu"), 2, T0 + 10_000_000 + n * 10_000, 501 + n, SETTINGS, SETTINGS.horizon
+        )
         assert verdict is StampVerdict.GOOD
 
 

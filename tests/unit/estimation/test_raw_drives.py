@@ -126,7 +126,7 @@ def test_ten_minutes_stationary_hold_the_heading_and_measure_the_bias(velocity_s
     utime = START + 679_980_000
     estimate = localizer.estimate(utime)
 
-    assert localizer.quiet.is_stationary(utime, localizer.settings)
+    assert localizer.is_stationary(utime)
     assert localizer.heading.bias == pytest.approx(0.012, abs=5e-4)
     assert localizer.tilt_bias == pytest.approx((0.01, -0.01), abs=2e-3)
     assert estimate.invalid == 0

@@ -92,23 +92,6 @@ def test_a_pose_requested_by_a_clock_that_is_behind_is_invalid():
         assert Invalid.CLOCK_STEPPED in localizer.estimate(localizer.utime - round(back * 1e6)).invalid
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("velocity_sigma", "speed", "rate"),
-    [(0.03, 0.1, 0.008), (0.1, 0.1, 0.013), (None, 0.1, 0.013), (0.03, 0.25, 0.013)],
-)
-def test_creeping_along_a_curve_is_not_stationary(velocity_sigma, speed, rate):
-    drive = Drive(
-        120.0,
-        speed=stepwise((5.0, 2.0), (30.0, speed)),
-        yaw_rate=lambda t: 0.2 * math.sin(t / 3) if t < 30.0 else rate,
-    )
-    samples = Sensors(velocity_sigma=velocity_sigma, imu_hz=25.0, gyro_noise=0.005).events(drive)
-    rows, _, _ = follow(drive, [(seconds(s), s) for s in samples])
-    assert worst(rows, 3, after=15.0) < 1.2
-    assert worst(rows, 2) < 1.5
-
-
 def test_height_above_mean_sea_level_alone_is_used_with_its_uncertainty():
     drive = Drive(15.0, speed=constant(2.0))
     samples = [

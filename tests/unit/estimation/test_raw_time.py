@@ -108,12 +108,6 @@ def test_a_pose_requested_long_after_the_last_sample_is_stale():
     assert math.isnan(estimate.seconds_to_limit)
 
 
-def test_seconds_to_limit_count_down():
-    now = WARM.estimate(WARM.utime).seconds_to_limit
-    assert 0.0 < now <= WARM.settings.imu_timeout
-    assert WARM.estimate(WARM.utime + 100_000).seconds_to_limit == pytest.approx(now - 0.1, abs=1e-6)
-
-
 def test_the_recent_past_is_from_the_history():
     for back in (50_000, 500_000, 1_500_000):
         utime = WARM.utime - back
