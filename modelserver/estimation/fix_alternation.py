@@ -13,8 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.estimation.filter.eskf import EARTH_RADIUS
-from modelserver.estimation.fix_quality import AcceptedFix
+from modelserver.estimation.fix_quality import EARTH_RADIUS, AcceptedFix
 from modelserver.messages import GpsSample
 
 WINDOW: Final = 16

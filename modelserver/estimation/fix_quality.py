@@ -11,11 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 from operator import is_
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 from modelserver.earth.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
 from modelserver.estimation.settings import FixSettings
 from modelserver.messages import FixType, GpsSample
+
+EARTH_RADIUS: Final = 6_371_000.0
+"""Meters, mean (IUGG): for directions and short ways."""
 
 _MIN_VARIANCE = 1e-6
 """m2; no receiver is better than a millimeter."""

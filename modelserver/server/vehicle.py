@@ -489,7 +489,8 @@ def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem
     own = list_own_measurements(config)
     if not own:
         return problems
-    from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP, find_repeated_state
+    from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP
+    from modelserver.estimation.filter.setup import find_repeated_state
 
     for name, given in own.items():
         if given in MEASUREMENT_TYPES:

@@ -44,6 +44,7 @@ from modelserver.earth import gravity as earth_model
 from modelserver.estimation.filter.error_layout import ATTITUDE, STRAPDOWN, ErrorLayout
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filterpy_import import import_kalman_filter
+from modelserver.estimation.fix_quality import EARTH_RADIUS
 from modelserver.messages import Decision, Verdict
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
@@ -55,9 +56,6 @@ KalmanFilter: Final = import_kalman_filter()
 ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
 
 STANDARD_GRAVITY: Final = 9.80665
-EARTH_RADIUS: Final = 6_371_000.0
-"""Meters, mean (IUGG): for the direction of the vertical away from N's origin."""
-
 COVARIANCE_STEP: Final = 0.05
 """Seconds between two steps of the covariance, at least."""
 
@@ -237,6 +235,12 @@ class ProcessNoise(NamedTuple):
     accelerometer_bias: float
     gyros_drive_attitude: bool = True
     is_stationary: bool = False
+
+
+def compute_tilt(up: Vector3) -> float:
+    """Return the angle between a direction of the body and its up, rad."""
+    x, y, z = up
+    return math.atan2(math.hypot(x, y), z)
 
 
 def level_attitude(up: Vector3) -> Quaternion:

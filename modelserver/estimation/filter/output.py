@@ -11,12 +11,11 @@ import numpy as np
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, geodetic_from_ecef, rotation_about_up
 from modelserver.estimation.filter import eskf, propagation, protection_levels
 from modelserver.estimation.filter.error_layout import STRAPDOWN
-from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise
-from modelserver.estimation.filter.hypothesis_bank import Bounds
-from modelserver.estimation.filter.measurements.constraints import compute_tilt
+from modelserver.estimation.filter.eskf import ZERO, NavState, ProcessNoise, compute_tilt
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LARGEST_CORRELATED, LATENCY
 from modelserver.estimation.filter.measurements.measurement import IMU_AVERAGING, body_velocity_jacobian
 from modelserver.estimation.filter.odometry import Odometry
+from modelserver.estimation.filter.protection_levels import Bounds
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import Aligned, FilterState, Leveling, Navigating
 from modelserver.messages import NAN, Estimate, Invalid, NavigationState, Quality, VehicleMotion

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Final
 
-from modelserver.estimation.filter.error_layout import ErrorLayout
+from modelserver.estimation.filter.error_layout import ErrorLayout, ErrorState
 from modelserver.estimation.filter.eskf import ProcessNoise
 from modelserver.estimation.filter.measurements import REGISTRY, Measurement
 from modelserver.estimation.filter.measurements.gnss import gnss_states
@@ -100,3 +100,21 @@ class Setup:
     def uses_gnss(self, mode: Mode) -> bool:
         """Return whether fixes are used in a mode: the vehicle has an antenna."""
         return bool(self.rig.gps_frame) and mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
+
+
+def find_repeated_state(types: Iterable[str], settings: FilterSettings) -> tuple[str, str] | None:
+    """Return the first type with another state of a name that the filter or a type before it has, and that name.
+
+    Types may share a state that both declare alike.
+    """
+    own = [*gnss_states(settings), *wheel_states(settings)]
+    own += [state for kind in REGISTRY.values() for state in kind.states]
+    names = {*ErrorLayout().names, *(name for state in own for name in state.names)}
+    shared: set[ErrorState] = set()
+    for each in types:
+        for state in get_type(each).states:
+            if state not in shared and (repeated := names.intersection(state.names)):
+                return each, min(repeated)
+            names.update(state.names)
+            shared.add(state)
+    return None

@@ -19,9 +19,10 @@ from modelserver.estimation.filter.dead_reckoning import DeadReckoning
 from modelserver.estimation.filter.eskf import ZERO, Earth, NavState
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment
-from modelserver.estimation.filter.hypothesis_bank import Bounds, HypothesisBank
+from modelserver.estimation.filter.hypothesis_bank import HypothesisBank
 from modelserver.estimation.filter.imu_monitor import ImuMonitor
 from modelserver.estimation.filter.mount_monitor import MountMonitor
+from modelserver.estimation.filter.protection_levels import Bounds
 from modelserver.estimation.filter.receiver_monitor import ReceiverMonitor
 from modelserver.estimation.filter.stationary_detector import StationaryDetector
 from modelserver.estimation.filter.turn_monitor import TurnMonitor

@@ -66,9 +66,3 @@ def zero_rate(context: MeasurementContext, mean_rate: Vector3, earth_rate: Vecto
     variance = context.settings.gyro_noise**2 / max(dt, 1e-3)
     measured = np.subtract(mean_rate, so3.rotate(so3.conjugate(nav.attitude), earth_rate))
     return Innovation(measured - nav.gyro_bias, H, np.eye(3) * variance)
-
-
-def compute_tilt(up: Vector3) -> float:
-    """Return the angle between a direction of the body and its up, rad."""
-    x, y, z = up
-    return math.atan2(math.hypot(x, y), z)

@@ -9,22 +9,18 @@ state has only the name of the type.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 
-from modelserver.estimation.filter.error_layout import ErrorLayout, ErrorState
+from modelserver.estimation.filter.error_layout import ErrorState
 from modelserver.estimation.filter.eskf import Innovation
-from modelserver.estimation.filter.measurements.gnss import gnss_states
 from modelserver.estimation.filter.measurements.measurement import (
-    REGISTRY,
     MeasurementContext,
     choose_covariance,
     register,
 )
-from modelserver.estimation.filter.measurements.wheels import wheel_states
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.messages import MeasurementSample
@@ -79,24 +75,6 @@ def get_type(name: str) -> MeasurementType:
         why = MEASUREMENT_TYPES.problems.get(name, "no installed package defines it")
         raise LookupError(f"measurements of type {name}: {why}")
     return found
-
-
-def find_repeated_state(types: Iterable[str], settings: FilterSettings) -> tuple[str, str] | None:
-    """Return the first type with another state of a name that the filter or a type before it has, and that name.
-
-    Types may share a state that both declare alike.
-    """
-    own = [*gnss_states(settings), *wheel_states(settings)]
-    own += [state for kind in REGISTRY.values() for state in kind.states]
-    names = {*ErrorLayout().names, *(name for state in own for name in state.names)}
-    shared: set[ErrorState] = set()
-    for each in types:
-        for state in get_type(each).states:
-            if state not in shared and (repeated := names.intersection(state.names)):
-                return each, min(repeated)
-            names.update(state.names)
-            shared.add(state)
-    return None
 
 
 @register
