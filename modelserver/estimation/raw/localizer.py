@@ -55,9 +55,8 @@ from modelserver.estimation.filter.protection_levels import (
     compute_limit_risks,
     compute_longest_axis,
 )
-from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
-from modelserver.estimation.interface import LocalizerEvent
-from modelserver.estimation.origin import OriginCapture, OriginProjection
+from modelserver.estimation.fixes import AcceptedFix, OriginCapture, OriginProjection, evaluate_fix
+from modelserver.estimation.history import LocalizerEvent
 from modelserver.estimation.raw.motion import (
     UNKNOWN_VARIANCE,
     CourseResult,

@@ -74,7 +74,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO
-from modelserver.estimation.filter.imu_monitor import MAX_FORCE
+from modelserver.estimation.filter.sensor_monitors import MAX_FORCE
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.messages import ImuSample, OrientationReference
 from modelserver.transforms import so3

@@ -17,16 +17,15 @@ from modelserver.estimation.filter import (
     fusion,
     heading_alignment,
     heading_step,
-    imu_monitor,
     leveling,
     output,
-    step,
+    sensor_monitors,
 )
 from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, level_attitude
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import LatencyFit, PathFix, Rotation
-from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.localizer import FilterLocalizer, start
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.wheels import (
     WheelSpeed,
@@ -35,11 +34,10 @@ from modelserver.estimation.filter.measurements.wheels import (
     estimate_turn_rate,
     read_wheels,
 )
-from modelserver.estimation.filter.odometry import Odometry
+from modelserver.estimation.filter.output import Odometry
+from modelserver.estimation.filter.sensor_monitors import StationaryDetector
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Leveling, Unaligned
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.estimation.filter.state import Leveling, Setup, Unaligned
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     Decision,
@@ -315,15 +313,15 @@ def test_given_impossible_imu_samples_then_they_are_rejected(word):
         create_imu_sample(0.0, (wrong, 0.0, 0.0), (0.0, 0.0, 9.8)),
         create_imu_sample(0.0, ZERO, (0.0, 0.0, wrong)),
     ):
-        assert imu_monitor.read_imu(sample, SETUP.mount) == word
-    assert imu_monitor.read_imu(ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8)), SETUP.mount) == "nan"
-    found = imu_monitor.read_imu(create_imu_sample(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)), SETUP.mount)
+        assert sensor_monitors.read_imu(sample, SETUP.mount) == word
+    assert sensor_monitors.read_imu(ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8)), SETUP.mount) == "nan"
+    found = sensor_monitors.read_imu(create_imu_sample(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)), SETUP.mount)
     assert not isinstance(found, str)
     assert found[0] == pytest.approx((0.1, 0.2, 0.3))
 
 
 def test_given_the_pose_of_another_localizer_then_the_filter_starts_there_with_the_same_covariance():
-    first = step.start(Mode.FULL, GEODESY)
+    first = start(Mode.FULL, GEODESY)
     P = np.diag([0.04, 0.09, 0.16, 1e-3, 2e-3, 3e-3])
     X = Pose.from_rpy((10.0, 20.0, 1.0), 0.0, 0.1, 0.7)
     before = Estimate(T0 - 100_000, Pose((0.0, 0.0, 0.0)), X)
@@ -343,7 +341,7 @@ def test_given_no_fixes_for_long_then_they_are_stale_only_on_a_vehicle_with_an_a
     gps: bool, expected: Invalid
 ) -> None:
     setup = Setup(rig(gps=gps))
-    first = step.start(Mode.FULL, GEODESY)
+    first = start(Mode.FULL, GEODESY)
     X = Pose.identity()
     last = Estimate(T0, X, X, X, tuple(np.diag([0.01] * 6).ravel().tolist()))
     state = leveling.start_from(setup, first, last, replace(last, utime=T0 - 100_000))

@@ -17,8 +17,8 @@ from support_localization import GEODESY, MOUNTS, START
 from modelserver.errors import UnknownFrameError
 from modelserver.estimation.filter.clock_monitor import StampVerdict
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_factors, compute_longest_axis
-from modelserver.estimation.fix_quality import evaluate_fix
-from modelserver.estimation.origin import OriginCapture
+from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.fixes import OriginCapture, evaluate_fix
 from modelserver.estimation.raw.localizer import (
     StampMonitor,
     compute_covariance,
@@ -41,7 +41,6 @@ from modelserver.estimation.raw.motion import (
 )
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
-from modelserver.estimation.settings import FixSettings
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader
