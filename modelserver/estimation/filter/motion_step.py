@@ -171,14 +171,7 @@ def _fuse_turn_rate(setup: Setup, state: FilterState, item: Item, rate: float | 
     ):
         return state, NOTHING
     state = fusion.propagate_covariance(setup, state)
-    context, mean_rate = create_context(setup, state), detector.mean_stationary_rate
-    whole = wheels.zero_rate(context, mean_rate, state.earth.rotation, detector.sum_time)
-    turn = Innovation(whole.residual[2:], whole.jacobian[2:], whole.noise[2:, 2:])
-    state, more = _check_biases(setup, state, whole, detector.sum_time)
-    if more:
-        return state._replace(stationary=detector.restart_mean()), more
-    state, decision = fuse_constraint(setup, state, wheels.ZERO_RATE, turn)
-    return state._replace(stationary=detector.restart_mean()), (decision,)
+    return _fuse_zero_rate(setup, state, slice(2, 3))
 
 
 def _fuse_constraints(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, ...]]:
@@ -223,19 +216,25 @@ def _fuse_rest(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, .
     detector = state.stationary
     if detector.sum_time > 0.0:
         if detector.get_quiet_time(utime) >= setup.settings.recapture_time:
-            context = create_context(setup, state)
-            innovation = wheels.zero_rate(
-                context, detector.mean_stationary_rate, state.earth.rotation, detector.sum_time
-            )
-            state, more = _check_biases(setup, state, innovation, detector.sum_time)
-            if more:
-                return state._replace(stationary=detector.restart_mean()), decisions + more
-            state, decision = fuse_constraint(setup, state, wheels.ZERO_RATE, innovation)
-            decisions = (*decisions, decision)
-            if decision.verdict is Verdict.USED:
+            state, more = _fuse_zero_rate(setup, state)
+            if more[0].verdict is Verdict.USED:
                 state = _store_biases(setup, state)
+            return state, decisions + more
         state = state._replace(stationary=detector.restart_mean())
     return state, decisions
+
+
+def _fuse_zero_rate(setup: Setup, state: N, axes: slice = slice(0, 3)) -> tuple[N, tuple[Decision, ...]]:
+    """Return the state after ZARU along the axes that the gyro measures, or with gyro biases that have changed."""
+    detector = state.stationary
+    mean_rate, seconds = detector.mean_stationary_rate, detector.sum_time
+    whole = wheels.zero_rate(create_context(setup, state), mean_rate, state.earth.rotation, seconds)
+    state, decisions = _check_biases(setup, state, whole, seconds)
+    if not decisions:
+        measured = Innovation(whole.residual[axes], whole.jacobian[axes], whole.noise[axes, axes])
+        state, decision = fuse_constraint(setup, state, wheels.ZERO_RATE, measured)
+        decisions = (decision,)
+    return state._replace(stationary=detector.restart_mean()), decisions
 
 
 def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float) -> tuple[N, tuple[Decision, ...]]:
