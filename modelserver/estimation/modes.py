@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.state import Setup
-from modelserver.estimation.fixes import FixAlternation, evaluate_fix
 from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import FixAlternation, evaluate_fix
 from modelserver.estimation.raw.localizer import RawLocalizer
 from modelserver.estimation.raw.motion import Heading
 from modelserver.estimation.raw.settings import RawSettings

@@ -38,7 +38,7 @@ import numpy as np
 from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import Geodesy, GeodesyError
 from modelserver.errors import RecordingError
-from modelserver.estimation import fixes as gate
+from modelserver.estimation import inputs as gate
 from modelserver.estimation.filter import eskf, fusion, gnss_monitor
 from modelserver.estimation.filter.fusion import create_context
 from modelserver.estimation.filter.localizer import FilterLocalizer

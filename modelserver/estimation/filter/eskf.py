@@ -44,7 +44,7 @@ import numpy as np
 from modelserver.earth import gravity as earth_model
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filterpy_import import import_kalman_filter
-from modelserver.estimation.fixes import EARTH_RADIUS
+from modelserver.estimation.inputs import EARTH_RADIUS
 from modelserver.messages import Decision, Verdict
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3

@@ -34,7 +34,7 @@ from modelserver.estimation.filter.state import (
     PreviousSample,
     Setup,
 )
-from modelserver.estimation.fixes import AcceptedFix, evaluate_fix
+from modelserver.estimation.inputs import AcceptedFix, evaluate_fix
 from modelserver.messages import (
     AbsolutePoseSample,
     Decision,

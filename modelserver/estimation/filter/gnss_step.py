@@ -54,7 +54,7 @@ from modelserver.estimation.filter.state import (
     Unaligned,
     is_speed_known,
 )
-from modelserver.estimation.fixes import AcceptedFix
+from modelserver.estimation.inputs import AcceptedFix
 from modelserver.messages import Decision, FixType, GpsSample, Verdict
 from modelserver.transforms import so3
 

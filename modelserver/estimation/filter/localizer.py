@@ -32,7 +32,6 @@ from modelserver.estimation.filter import (
     sensor_monitors,
     warm_start,
 )
-from modelserver.estimation.filter.clock_monitor import IMU_RANK, ClockMonitor, StampVerdict
 from modelserver.estimation.filter.fusion import (
     IMU,
     MODE,
@@ -60,6 +59,7 @@ from modelserver.estimation.filter.state import (
 )
 from modelserver.estimation.filter.stream_correlation import StreamCorrelation
 from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import IMU_RANK, ClockMonitor, StampVerdict
 from modelserver.messages import (
     STALE_SENSORS,
     Decision,

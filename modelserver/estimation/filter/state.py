@@ -29,7 +29,7 @@ from modelserver.estimation.filter.measurements.wheels import WheelSpeed, wheel_
 from modelserver.estimation.filter.protection_levels import Bounds
 from modelserver.estimation.filter.sensor_monitors import ImuMonitor, MountMonitor, StationaryDetector, WheelMonitor
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.fixes import OriginCapture
+from modelserver.estimation.inputs import OriginCapture
 from modelserver.estimation.sensor_rig import SensorRig, find_unusable
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode
 from modelserver.named_tuples import new_tuple

@@ -46,7 +46,7 @@ from modelserver.estimation.filter.measurements.gnss import locate_fix, split_va
 from modelserver.estimation.filter.measurements.wheels import estimate_turn_rate
 from modelserver.estimation.filter.sensor_monitors import read_turn_rate
 from modelserver.estimation.filter.state import Setup
-from modelserver.estimation.fixes import evaluate_fix
+from modelserver.estimation.inputs import evaluate_fix
 from modelserver.messages import GpsSample, ImuSample, Mode, Sample, SensorFinding, SwitchMode, WheelsSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array

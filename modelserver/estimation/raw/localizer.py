@@ -12,7 +12,7 @@ clock all but Odom, origin and biases restarts.
 Clock monitor: a stamp is odd if it is not later than the last good one, or more than `clock_jump` ahead of it. A single
 one is an error of its sample; `clock_jump_samples` in a row in ascending order show that the clock was set. Delayed
 samples fill the gaps between good stamps. Those of a clock that was set back cover a time that good stamps have covered
-already, so between two of them lies a good one. `filter.clock_monitor` has the same rules for sources that share a
+already, so between two of them lies a good one. `ClockMonitor` has the same rules for sources that share a
 horizon; here a delayed sample is rejected, because raw mode has no buffer to sort samples in.
 
 Speed and course are fitted to recent fixes (motion.py), or are those of the receiver. Its antenna velocity becomes that
@@ -46,7 +46,6 @@ from modelserver.earth.geodesy import (
     geodetic_from_ecef,
     rotation_about_up,
 )
-from modelserver.estimation.filter.clock_monitor import RECENT_STAMPS, StampVerdict, has_covered
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.protection_levels import (
     LIMIT_RISK,
@@ -55,8 +54,16 @@ from modelserver.estimation.filter.protection_levels import (
     compute_limit_risks,
     compute_longest_axis,
 )
-from modelserver.estimation.fixes import AcceptedFix, OriginCapture, OriginProjection, evaluate_fix
 from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import (
+    RECENT_STAMPS,
+    AcceptedFix,
+    OriginCapture,
+    OriginProjection,
+    StampVerdict,
+    evaluate_fix,
+    has_covered,
+)
 from modelserver.estimation.raw.motion import (
     UNKNOWN_VARIANCE,
     CourseResult,

@@ -13,7 +13,6 @@ from support_cart import ANTENNA, GEODESY, WHEELS, localizer, model, rig, some_n
 from support_cart import IMU as IMU_FRAME
 
 from modelserver.estimation.filter import (
-    clock_monitor,
     fusion,
     heading_alignment,
     heading_step,
@@ -21,7 +20,6 @@ from modelserver.estimation.filter import (
     output,
     sensor_monitors,
 )
-from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, level_attitude
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import LatencyFit, PathFix, Rotation
@@ -38,6 +36,7 @@ from modelserver.estimation.filter.output import Odometry
 from modelserver.estimation.filter.sensor_monitors import StationaryDetector
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.state import Leveling, Setup, Unaligned
+from modelserver.estimation.inputs import MAX_SOURCES, ClockMonitor, StampVerdict
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     Decision,
@@ -152,10 +151,8 @@ def test_given_a_stamp_in_the_future_then_it_is_accepted_once_a_run_of_samples_a
 
 
 def test_given_a_flood_of_source_names_then_memory_is_bounded_and_known_sources_stay_monitored():
-    monitor, _ = update(
-        create_running_monitor(), *[(f"evil{n}", 0, 9.9, 1) for n in range(2 * clock_monitor.MAX_SOURCES)]
-    )
-    assert len(monitor.sources) == clock_monitor.MAX_SOURCES
+    monitor, _ = update(create_running_monitor(), *[(f"evil{n}", 0, 9.9, 1) for n in range(2 * MAX_SOURCES)])
+    assert len(monitor.sources) == MAX_SOURCES
     monitor, words = update(monitor, *[("imu", 2, 10.0 + n * 0.02, 501 + n) for n in range(300)])
     assert set(words) == {"good"}
     assert monitor.sources["sample", "imu"].newest == T0 + 15_980_000

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.fixes import FixAlternation, evaluate_fix
+from modelserver.estimation.inputs import FixAlternation, evaluate_fix
 from modelserver.messages import FixType, GpsSample, SensorHeader
 
 START = 1_700_000_000_000_000

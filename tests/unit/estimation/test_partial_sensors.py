@@ -18,7 +18,7 @@ from modelserver.estimation.filter.gnss_monitor import (
     ReceiverMonitor,
 )
 from modelserver.estimation.filter.settings import FixSettings
-from modelserver.estimation.fixes import evaluate_fix
+from modelserver.estimation.inputs import evaluate_fix
 from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal, find_unusable
 from modelserver.messages import (
     FixType,

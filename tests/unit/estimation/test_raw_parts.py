@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from support_localization import GEODESY, MOUNTS, START
 
 from modelserver.errors import UnknownFrameError
-from modelserver.estimation.filter.clock_monitor import StampVerdict
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_factors, compute_longest_axis
 from modelserver.estimation.filter.settings import FixSettings
-from modelserver.estimation.fixes import OriginCapture, evaluate_fix
+from modelserver.estimation.inputs import OriginCapture, StampVerdict, evaluate_fix
 from modelserver.estimation.raw.localizer import (
     StampMonitor,
     compute_covariance,

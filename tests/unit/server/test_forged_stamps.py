@@ -10,7 +10,7 @@ from support_drive import CHANNELS, SimulatedDrive
 from support_faults import INERTIAL
 
 from modelserver.estimation.filter import localizer
-from modelserver.estimation.filter.clock_monitor import REPLAY_BURST, REPLAY_RATE
+from modelserver.estimation.inputs import REPLAY_BURST, REPLAY_RATE
 
 pytestmark = pytest.mark.slow
 

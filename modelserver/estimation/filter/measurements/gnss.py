@@ -31,7 +31,7 @@ from modelserver.estimation.filter.measurements.measurement import (
     wrap_angle,
 )
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.fixes import AcceptedFix, evaluate_fix, range_error, reuse_last
+from modelserver.estimation.inputs import AcceptedFix, evaluate_fix, range_error, reuse_last
 from modelserver.estimation.sensor_rig import MIN_BASELINE, SensorRig
 from modelserver.messages import FixType, GpsSample
 from modelserver.transforms import so3
