@@ -141,8 +141,6 @@ class ErrorLayout:
         return np.array(found)
 
 
-# --- the filter ---------------------------------------------------------------------------------------------
-
 KalmanFilter: Final = import_kalman_filter()
 
 ZERO: Final[Vector3] = (0.0, 0.0, 0.0)

@@ -19,10 +19,10 @@ from modelserver.earth.geodesy import GeodesyError
 from modelserver.estimation.filter import eskf
 from modelserver.estimation.filter.eskf import ZERO, ErrorLayout, Innovation, NavState, ProcessNoise
 from modelserver.estimation.filter.hypothesis_bank import DeadReckoning
-from modelserver.estimation.filter.measurements import Measurement, MeasurementContext, wheels
+from modelserver.estimation.filter.measurements import Measurement, MeasurementContext
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.measurements.measurement import OwnMeasurement, wrap_angle
-from modelserver.estimation.filter.measurements.wheels import TurnRate, read_speedometer
+from modelserver.estimation.filter.measurements.wheels import NON_HOLONOMIC, TurnRate, non_holonomic, read_speedometer
 from modelserver.estimation.filter.sensor_monitors import ImuMonitor, StationaryDetector
 from modelserver.estimation.filter.state import (
     Aligned,
@@ -400,13 +400,13 @@ def fuse_non_holonomic(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Dec
     dt = (utime - state.constraints.non_holonomic_utime) * 1e-6
     state = propagate_covariance(setup, state)
     state = state._replace(constraints=state.constraints._replace(non_holonomic_utime=utime))
-    innovation = wheels.non_holonomic(
+    innovation = non_holonomic(
         create_context(setup, state),
         max(dt, 1e-3),
         are_wheels_stationary=state.stationary.is_confirmed_by_wheels(utime),
     )
     before = state.nav
-    state, decision = fuse_constraint(setup, state, wheels.NON_HOLONOMIC, innovation)
+    state, decision = fuse_constraint(setup, state, NON_HOLONOMIC, innovation)
     nav = hold_latency(before, state.nav, setup.layout)
     is_measured = state.common.measures_wheel_speed(utime)
     if isinstance(state, Aligned) and is_outage(state, utime) and not is_measured:

@@ -38,12 +38,15 @@ from modelserver.estimation.filter.fusion import (
     report_reset,
 )
 from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
-from modelserver.estimation.filter.measurements import wheels
 from modelserver.estimation.filter.measurements.wheels import (
+    ZERO_RATE,
+    ZERO_VELOCITY,
     TurnRate,
     WheelSpeed,
     are_wheels_stationary,
     estimate_turn_rate,
+    zero_rate,
+    zero_velocity,
 )
 from modelserver.estimation.filter.sensor_monitors import RECEIVED, ImuMonitor, MountMonitor, SteeringAngle
 from modelserver.estimation.filter.state import (
@@ -203,8 +206,8 @@ def _fuse_rest(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, .
     dt = (utime - state.constraints.zupt_utime) * 1e-6
     state = fusion.propagate_covariance(setup, state)
     state = state._replace(constraints=state.constraints._replace(zupt_utime=utime))
-    innovation = wheels.zero_velocity(create_context(setup, state), dt)
-    state, decision = fuse_constraint(setup, state, wheels.ZERO_VELOCITY, innovation)
+    innovation = zero_velocity(create_context(setup, state), dt)
+    state, decision = fuse_constraint(setup, state, ZERO_VELOCITY, innovation)
     decisions: tuple[Decision, ...] = (decision,)
     contradiction = state.constraints.contradiction
     contradiction += CONTRADICTION_GAIN * (min(decision.statistic / decision.limit, LARGEST_RATIO) - contradiction)
@@ -212,7 +215,7 @@ def _fuse_rest(setup: Setup, state: N, utime: int) -> tuple[N, tuple[Decision, .
     if contradiction > LARGEST_CONTRADICTION and state.stationary.is_confirmed_by_wheels(utime):
         # wheels that are stuck, and it moves so smoothly that it seems stationary
         state = bank_step.suspect_wheels(setup, state)
-        return state, (*decisions, report_event(state, wheels.ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
+        return state, (*decisions, report_event(state, ZERO_VELOCITY, Verdict.REJECTED, "it moves"))
     detector = state.stationary
     if detector.sum_time > 0.0:
         if detector.get_quiet_time(utime) >= setup.settings.recapture_time:
@@ -228,11 +231,11 @@ def _fuse_zero_rate(setup: Setup, state: N, axes: slice = slice(0, 3)) -> tuple[
     """Return the state after ZARU along the axes that the gyro measures, or with gyro biases that have changed."""
     detector = state.stationary
     mean_rate, seconds = detector.mean_stationary_rate, detector.sum_time
-    whole = wheels.zero_rate(create_context(setup, state), mean_rate, state.earth.rotation, seconds)
+    whole = zero_rate(create_context(setup, state), mean_rate, state.earth.rotation, seconds)
     state, decisions = _check_biases(setup, state, whole, seconds)
     if not decisions:
         measured = Innovation(whole.residual[axes], whole.jacobian[axes], whole.noise[axes, axes])
-        state, decision = fuse_constraint(setup, state, wheels.ZERO_RATE, measured)
+        state, decision = fuse_constraint(setup, state, ZERO_RATE, measured)
         decisions = (decision,)
     return state._replace(stationary=detector.restart_mean()), decisions
 
@@ -260,7 +263,7 @@ def _check_biases(setup: Setup, state: N, innovation: Innovation, seconds: float
         nav = nav.widen({8: max(UNNOTICED_TIME * abs(change[2]), state.turns.allowance) ** 2})
     state = state._replace(nav=nav, constraints=rest._replace(rest_turn=ZERO, rest_time=0.0))
     text = f"the bias of a gyro has changed by {math.degrees(np.abs(change).max()):.2f} deg/s"
-    return state, (report_event(state, wheels.ZERO_RATE, Verdict.RESET, text),)
+    return state, (report_event(state, ZERO_RATE, Verdict.RESET, text),)
 
 
 def _store_biases(setup: Setup, state: N) -> N:
@@ -474,8 +477,8 @@ def _fuse_wheels_at_rest(setup: Setup, state: N, utime: int, is_stationary: bool
     decisions = NOTHING
     is_due = dt >= ZUPT_PERIOD
     if is_stationary and is_due:
-        innovation = wheels.zero_velocity(create_context(setup, state), dt)
-        state, decision = fuse_constraint(setup, state, wheels.ZERO_VELOCITY, innovation)
+        innovation = zero_velocity(create_context(setup, state), dt)
+        state, decision = fuse_constraint(setup, state, ZERO_VELOCITY, innovation)
         decisions = (decision,)
     if not is_stationary or is_due:
         state = state._replace(constraints=state.constraints._replace(zupt_utime=utime))
