@@ -38,7 +38,7 @@ from benchmarks.rough_simulation import GroundMotion, RoughSimulation, SideSlip,
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.geometry import ModelBuilder
 from modelserver.messages import Estimate, FixType, OrientationReference, WheelsSample

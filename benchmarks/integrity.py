@@ -50,7 +50,7 @@ from benchmarks.integrity_drives import (
 from benchmarks.requirements import FAULT, GAPS, HEALTHY, MILD_FAULT, Required
 from modelserver.earth.geodesy import Geodesy
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.messages import GpsSample, Invalid
 
 LOOK_PERIOD: Final = 0.2

@@ -51,7 +51,7 @@ def render_drive() -> str:
     from modelserver.config.vehicle_file import load_config
     from modelserver.earth.geodesy import Geodesy, origin_at
     from modelserver.estimation.filter.localizer import FilterLocalizer
-    from modelserver.estimation.filter.setup import Setup
+    from modelserver.estimation.filter.state import Setup
     from modelserver.messages import GpsSample, ImuSample
     from modelserver.server.vehicle import load_vehicle
     from modelserver.simulation import GpsModel, ImuModel, Timing

@@ -12,7 +12,7 @@ from modelserver.estimation.filter.eskf import NavState
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.estimation.sensor_rig import Kinematics, Mounts, SensorRig
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.simulation import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from support_filter import RIG
 
-from modelserver.estimation.filter.persistence import get_setup_hash
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
+from modelserver.estimation.filter.warm_start import get_setup_hash
 from modelserver.messages import PersistedPose, PersistedState
 
 SETUP = Setup(RIG)

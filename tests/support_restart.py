@@ -10,7 +10,7 @@ from functools import cache
 from support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, WHEELS, WHEELS_MODEL, Run, drive, fork, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.messages import Mode, PersistedState, RestoredState, WheelsSample
 from modelserver.simulation import DrivePhase, Event, Simulation, Trajectory
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from modelserver.core import CoreSettings, CoreState, Instant, start
 from modelserver.earth.geodesy import Geodesy, origin_at
-from modelserver.estimation.interface import LocalizerEvent
+from modelserver.estimation.history import LocalizerEvent
 from modelserver.geometry import Model, ModelBuilder, Sigma
 from modelserver.messages import (
     STALE_SENSORS,

@@ -14,12 +14,11 @@ import numpy as np
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import origin_at
-from modelserver.estimation.filter.error_layout import ErrorState
+from modelserver.estimation.filter.eskf import ErrorState
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements import MEASUREMENT_TYPES, Innovation
-from modelserver.estimation.filter.measurements.measurement import body_velocity_jacobian
-from modelserver.estimation.filter.measurements.own import read_covariance
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.measurements.measurement import body_velocity_jacobian, read_covariance
+from modelserver.estimation.filter.state import Setup
 from modelserver.messages import ImuSample, MeasurementSample, SensorHeader
 from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, ImuModel, Simulation, Timing, Trajectory, figure_eight

@@ -18,8 +18,8 @@ from modelserver.config import reader
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.estimation.raw.settings import RawSettings
+from modelserver.estimation.sensor_rig import MagnetometerCalibration
 from modelserver.files import PROCESS_FIX, FileKind, NotRegularFileError, detect_file_kind, read_start
 from modelserver.messages import Mode
 

@@ -19,7 +19,7 @@ from modelserver.core.requests import is_answerable, reply_error
 from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, switch_mode, update_localizer
 from modelserver.core.state import CoreState, StepResult, count_rejection
 from modelserver.errors import Status
-from modelserver.estimation.interface import Localizer, LocalizerEvent
+from modelserver.estimation.history import Localizer, LocalizerEvent
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.transforms.covariance import find_problem

@@ -25,7 +25,7 @@ from modelserver.core.state import (
     handle_warning,
     mark_received,
 )
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import Localizer
 from modelserver.geometry import names
 from modelserver.named_tuples import new_tuple
 from modelserver.query.view import PlatformView

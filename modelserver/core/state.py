@@ -11,8 +11,7 @@ from modelserver import messages
 from modelserver.core.host_clock import HostClock, Instant
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import NotConnectedError
-from modelserver.estimation.history import History
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import History, Localizer
 from modelserver.geometry.model import Model
 from modelserver.joints.history import JointHistory
 from modelserver.named_tuples import new_tuple

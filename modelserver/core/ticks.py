@@ -10,7 +10,7 @@ from modelserver.core.host_clock import Instant
 from modelserver.core.requests import answer_waiting
 from modelserver.core.samples import check_host_clock, publish_pose
 from modelserver.core.state import START, START_REPORT_NS, CoreState, StepResult, handle_warning
-from modelserver.estimation.interface import PersistentLocalizer
+from modelserver.estimation.history import PersistentLocalizer
 
 MAX_TICK_LATENCIES: Final = 512
 """Tick latencies that are retained for the percentiles of a health report."""

@@ -3,6 +3,8 @@ Pure.
 
 Between two estimates position is linear and rotation at constant rate; where a new pose epoch begins between them the
 earlier one is held. Estimates may be deferred: they are computed when first read (`DeferredEstimate`).
+
+`Localizer` is what the core needs of one.
 """
 
 from __future__ import annotations
@@ -11,13 +13,27 @@ import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Generator
-from typing import Final, Protocol
+from typing import Final, Protocol, Self, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.messages import VALID, Estimate, Invalid, Quality, VehicleMotion
+from modelserver.messages import (
+    VALID,
+    Decision,
+    Estimate,
+    Invalid,
+    LocalizerSummary,
+    NavigationState,
+    PersistedState,
+    PersistOrigin,
+    Quality,
+    Rejected,
+    Sample,
+    SwitchMode,
+    VehicleMotion,
+)
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3, to_vector3
 
@@ -377,3 +393,49 @@ def restamp(estimate: Estimate, utime: int, flag: Quality, invalid: Invalid = VA
         estimate.limit_risk,
         estimate.horizontal_allowance,
     )
+
+
+# --- interface of a localizer -------------------------------------------------------------------------------
+
+LocalizerEvent: TypeAlias = Rejected | PersistOrigin | Decision
+"""What a localizer reports beside its estimate: a rejected sample, the origin that it has set, the decision on a
+measurement.
+"""
+
+
+@runtime_checkable
+class PersistentLocalizer(Protocol):
+    """A localizer with a state for the warm start of the next run."""
+
+    def get_state_to_persist(self) -> PersistedState | None:
+        """Return the state for the next run; None where it is no better than what was persisted before."""
+        ...
+
+
+class Localizer(Protocol):
+    """An immutable localizer state. No clock: time comes in samples."""
+
+    def process(self, sample: Sample | SwitchMode) -> tuple[Self, tuple[LocalizerEvent, ...]]: ...
+
+    def estimate(self, utime: int) -> Estimate:
+        """Return the base frame's pose predicted to `utime` from the samples processed."""
+        ...
+
+    def defer_estimate(self, utime: int) -> Estimate | DeferredEstimate:
+        """Return `estimate(utime)`, deferred until it is read where that saves work."""
+        ...
+
+    def navigation(self, utime: int) -> NavigationState | None:
+        """Return the navigation state as of the newest sample; None for a localizer without a filter."""
+        ...
+
+    def find_stale_sensors(self, utime: int) -> Invalid:
+        """Return the bits of STALE_SENSORS of an estimate at `utime`, at a fraction of its cost."""
+        ...
+
+    def summary(self, utime: int) -> LocalizerSummary: ...
+
+    @property
+    def utime(self) -> int:
+        """The instant of the newest sample processed, 0 before the first."""
+        ...

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.fix_alternation import FixAlternation
-from modelserver.estimation.fix_quality import evaluate_fix
-from modelserver.estimation.interface import LocalizerEvent
+from modelserver.estimation.filter.state import Setup
+from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import FixAlternation, evaluate_fix
 from modelserver.estimation.raw.localizer import Heading, RawLocalizer
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts

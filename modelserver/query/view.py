@@ -35,8 +35,7 @@ from modelserver.errors import (
     find_nearest_names,
     quote,
 )
-from modelserver.estimation.history import History, restamp
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import History, Localizer, restamp
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates
 from modelserver.geometry.kinematic_path import KinematicPath

@@ -17,7 +17,7 @@ from typing import Final
 from modelserver import core
 from modelserver.core import CoreState, Instant
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import Localizer
 from modelserver.geometry import names
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.server.ingress import MODE_TYPE, SensorChannel

@@ -18,8 +18,14 @@ from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.state import START
 from modelserver.earth.geodesy import GeodesyError, make_origin
-from modelserver.estimation.findings import find_unusable
-from modelserver.estimation.sensor_rig import SPEEDOMETER, Mounts, SensorRig, SpeedometerSignal, SteeringSignal
+from modelserver.estimation.sensor_rig import (
+    SPEEDOMETER,
+    Mounts,
+    SensorRig,
+    SpeedometerSignal,
+    SteeringSignal,
+    find_unusable,
+)
 from modelserver.formats import FileExamination, examine_file
 from modelserver.formats.common import is_far
 from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
@@ -78,7 +84,7 @@ class Vehicle:
         start_report = ""
         setup = self.make_localizer_setup()
         if setup is not None:
-            from modelserver.estimation.filter.persistence import prepare_warm_start
+            from modelserver.estimation.filter.warm_start import prepare_warm_start
             from modelserver.estimation.modes import ModeLocalizer
 
             origin = get_configured_origin(config) or origin
@@ -112,7 +118,7 @@ class Vehicle:
         """Make the configuration of the localizers; None without a localization sensor."""
         if self.rig is None:
             return None
-        from modelserver.estimation.filter.setup import Setup
+        from modelserver.estimation.filter.state import Setup
         from modelserver.estimation.modes import LocalizerConfig
 
         return LocalizerConfig(
@@ -489,7 +495,8 @@ def _find_type_problems(config: VehicleConfig, file: str) -> list[errors.Problem
     own = list_own_measurements(config)
     if not own:
         return problems
-    from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES, PLUGIN_GROUP, find_repeated_state
+    from modelserver.estimation.filter.measurements.measurement import MEASUREMENT_TYPES, PLUGIN_GROUP
+    from modelserver.estimation.filter.state import find_repeated_state
 
     for name, given in own.items():
         if given in MEASUREMENT_TYPES:

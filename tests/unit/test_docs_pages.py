@@ -17,9 +17,8 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.settings import FilterSettings, FixSettings
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.estimation.settings import FixSettings
 from modelserver.messages import Invalid
 from modelserver.wire.channels import CHANNELS
 from msdrivers.registry import KINDS

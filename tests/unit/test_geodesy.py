@@ -274,7 +274,7 @@ def test_values_are_immutable_equal_and_pickle():
 def test_only_localization_and_simulation_pay_for_pyproj():
     code = (
         "import sys, modelserver, modelserver.geometry.model, modelserver.messages, modelserver.query, "
-        "modelserver.config.vehicle_file, modelserver.estimation.sensor_rig, modelserver.estimation.interface; "
+        "modelserver.config.vehicle_file, modelserver.estimation.sensor_rig, modelserver.estimation.history; "
         "sys.exit('pyproj' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -38,13 +38,13 @@ import numpy as np
 from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import Geodesy, GeodesyError
 from modelserver.errors import RecordingError
-from modelserver.estimation import fix_quality as gate
-from modelserver.estimation.filter import eskf, gnss_monitor, propagation
+from modelserver.estimation import inputs as gate
+from modelserver.estimation.filter import eskf, fusion, gnss_monitor
 from modelserver.estimation.filter.fusion import create_context
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import GpsPosition
 from modelserver.estimation.filter.state import Aligned
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import Localizer
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import Decision, GpsSample
 from modelserver.server.offline import OfflineRun, TrackRow
@@ -391,7 +391,7 @@ def _score(sample: GpsSample, error: float, localizer: Localizer | None) -> Scor
     measurement = next((each for each in setup.measurements.get(GpsSample, ()) if isinstance(each, GpsPosition)), None)
     if not isinstance(state, Aligned) or measurement is None:
         return unknown
-    state = propagation.advance(setup, state, utime)
+    state = fusion.advance(setup, state, utime)
     gnss = state.gnss
     seconds = (utime - gnss.last_fix.utime) * 1e-6 if gnss.last_fix is not None else 0.0
     nav = gnss_monitor.inflate_correlated_error(state.nav, gnss.noise_inflation, seconds, setup.layout, setup.settings)

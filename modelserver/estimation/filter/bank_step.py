@@ -14,11 +14,9 @@ from typing import Final
 import numpy as np
 
 from modelserver.estimation.filter import heading_alignment, heading_step, hypothesis_bank, output
-from modelserver.estimation.filter.dead_reckoning import DeadReckoning
-from modelserver.estimation.filter.error_layout import STRAPDOWN
-from modelserver.estimation.filter.eskf import NavState
-from modelserver.estimation.filter.fusion import release_motion, report_event
-from modelserver.estimation.filter.gnss_monitor import AIDED_TIME, MOVING_TIME
+from modelserver.estimation.filter.eskf import STRAPDOWN, NavState
+from modelserver.estimation.filter.fusion import OUTAGE_US, release_motion, report_event
+from modelserver.estimation.filter.gnss_monitor import AIDED_TIME, MOVING_TIME, START_ERROR
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.hypothesis_bank import (
     BIAS,
@@ -27,6 +25,7 @@ from modelserver.estimation.filter.hypothesis_bank import (
     SHARE_OF_LIMIT,
     SHARED,
     WHEEL_SCALE,
+    DeadReckoning,
     Fault,
     HypothesisBank,
     PlanarFix,
@@ -34,12 +33,9 @@ from modelserver.estimation.filter.hypothesis_bank import (
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
 from modelserver.estimation.filter.measurements.wheels import SCALE
-from modelserver.estimation.filter.propagation import OUTAGE_US
 from modelserver.estimation.filter.protection_levels import LIMIT_RISK, compute_longest_variance
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, N, Navigating, Unaligned
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
-from modelserver.estimation.filter.turn_monitor import START_ERROR
+from modelserver.estimation.filter.sensor_monitors import StationaryDetector
+from modelserver.estimation.filter.state import Aligned, N, Navigating, Setup, Unaligned
 from modelserver.messages import Decision, Verdict
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array

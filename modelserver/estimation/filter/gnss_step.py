@@ -15,12 +15,11 @@ from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic, origin_at
 from modelserver.estimation.filter import (
     bank_step,
     eskf,
+    fusion,
     gnss_monitor,
     heading_alignment,
-    heading_check,
     heading_step,
     leveling,
-    propagation,
 )
 from modelserver.estimation.filter.eskf import Earth, Innovation, NavState
 from modelserver.estimation.filter.fusion import (
@@ -35,7 +34,7 @@ from modelserver.estimation.filter.fusion import (
     report_event,
     report_reset,
 )
-from modelserver.estimation.filter.gnss_monitor import MOVING_TIME
+from modelserver.estimation.filter.gnss_monitor import MOVING_TIME, TurnMonitor, TurnNode, find_turn
 from modelserver.estimation.filter.heading_alignment import PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.measurements.gnss import (
     GpsPosition,
@@ -44,7 +43,6 @@ from modelserver.estimation.filter.measurements.gnss import (
     split_variance,
 )
 from modelserver.estimation.filter.measurements.measurement import wrap_angle
-from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import (
     Aligned,
     FilterState,
@@ -52,11 +50,11 @@ from modelserver.estimation.filter.state import (
     Navigating,
     PendingDecision,
     S,
+    Setup,
     Unaligned,
     is_speed_known,
 )
-from modelserver.estimation.filter.turn_monitor import TurnMonitor, TurnNode, find_turn
-from modelserver.estimation.fix_quality import AcceptedFix
+from modelserver.estimation.inputs import AcceptedFix
 from modelserver.messages import Decision, FixType, GpsSample, Verdict
 from modelserver.transforms import so3
 
@@ -113,7 +111,7 @@ def fuse_fix(setup: Setup, state: FilterState, item: Item) -> Fused:
         if _shows_motion(setup, state, sample):
             return _set_moving(state, item.utime), NOTHING
         return state, NOTHING
-    state = propagation.advance(setup, state, item.utime)
+    state = fusion.advance(setup, state, item.utime)
     if isinstance(state, Unaligned):
         return _fuse_unaligned(setup, state, item, sample, fix, is_used)
     return _fuse_aligned(setup, state, item, sample, measurement, fix, is_used)
@@ -379,7 +377,7 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
     before = state.turns
     if state.common.measures_wheel_speed(nav.utime):
         return state._replace(turns=before.append(node)), NOTHING
-    noise = propagation.select_noise(setup, state, nav).yaw
+    noise = fusion.select_noise(setup, state, nav).yaw
     is_at_rest = state.common.wheels.is_suspect
     speed = math.hypot(*nav.velocity)
     turns = before.compare(node, noise, settings.gyro_bias_walk**2, speed, is_at_rest=is_at_rest)
@@ -412,7 +410,7 @@ def _compare_turns(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Align
 
 def _check_heading(setup: Setup, state: Aligned, newest: PathFix) -> tuple[Aligned, tuple[Decision, ...]]:
     """Return the state after a fix more for the check of a restored heading: confirmed, corrected, or still neither."""
-    check, rotation, decision = heading_check.update(setup, state, newest)
+    check, rotation, decision = heading_step.check_heading(setup, state, newest)
     state = state._replace(heading_check=check)
     if rotation is not None:
         state = heading_step.start_epoch(heading_step.initialize(setup, state, state.nav, rotation, newest))

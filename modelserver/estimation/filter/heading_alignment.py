@@ -34,8 +34,7 @@ import numpy as np
 
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.estimation.filter import eskf
-from modelserver.estimation.filter.error_layout import ErrorLayout
-from modelserver.estimation.filter.eskf import NavState
+from modelserver.estimation.filter.eskf import ErrorLayout, NavState
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.transforms import so3

@@ -4,6 +4,10 @@ Before the heading is known, N is rotated about up by an unknown angle. `align_b
 to the fixes, `fuse_velocity` uses the receiver's velocity, `fuse_baseline` a second antenna, `fuse_imu_yaw` the IMU's
 own yaw, `fuse_absolute_pose` a pose of an operator or another source; `initialize` then sets the state in the world.
 Once the filter is aligned these are ordinary measurements.
+
+A warm start's heading is checked against the first meters driven and the fixes there (`check_heading`). Stationary
+wheels show that the vehicle did not turn by itself, not that nobody lifted it. A state with a wrong heading and a small
+uncertainty would explain the fixes by their time-correlated error, and never find out.
 """
 
 from __future__ import annotations
@@ -16,12 +20,7 @@ from typing import Final
 import numpy as np
 
 from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
-from modelserver.estimation.filter import (
-    heading_alignment,
-    leveling,
-    propagation,
-    protection_levels,
-)
+from modelserver.estimation.filter import fusion, heading_alignment, leveling, protection_levels
 from modelserver.estimation.filter.eskf import Earth, NavState
 from modelserver.estimation.filter.fusion import (
     NOTHING,
@@ -31,29 +30,30 @@ from modelserver.estimation.filter.fusion import (
     create_context,
     fuse_measurement,
     reject,
+    report_event,
     report_reset,
 )
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment, PathFit, PathFix, Rotation, to_horizontal
 from modelserver.estimation.filter.measurements import MeasurementContext
-from modelserver.estimation.filter.measurements.aiding import AbsolutePose
 from modelserver.estimation.filter.measurements.gnss import (
     GpsBaseline,
     get_baseline_sigma,
     read_velocity,
 )
-from modelserver.estimation.filter.measurements.imu_orientation import ImuYaw, compute_yaw
-from modelserver.estimation.filter.measurements.measurement import wrap_angle
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.measurements.measurement import AbsolutePose, ImuYaw, compute_yaw, wrap_angle
 from modelserver.estimation.filter.state import (
     Aligned,
     FilterState,
+    HeadingCheck,
     Leveling,
     Navigating,
+    Setup,
     Unaligned,
     is_speed_known,
 )
-from modelserver.messages import AbsolutePoseSample, GpsSample, ImuSample, Mode, YawSource
+from modelserver.estimation.filter.warm_start import WARM_START
+from modelserver.messages import AbsolutePoseSample, Decision, GpsSample, ImuSample, Mode, Verdict, YawSource
 from modelserver.transforms import so3
 
 MAX_FIX_AGE: Final = 1.5
@@ -225,7 +225,7 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
     receiver = state.common.receiver
     if receiver.is_unfilled(sample):
         if not sample.speed > 0.0:
-            if not _moves(propagation.predict(setup, state, item.utime)):
+            if not _moves(fusion.predict(setup, state, item.utime)):
                 return state, NOTHING
             state = state._replace(common=state.common._replace(receiver=receiver.count_unfilled()))
             return state, (reject(item, "unfilled"),)
@@ -235,7 +235,7 @@ def fuse_velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
         return fuse_measurement(setup, state, item)
     if isinstance(accept_fix(setup, state, sample), str):
         return state, NOTHING
-    state = propagation.advance(setup, state, item.utime)
+    state = fusion.advance(setup, state, item.utime)
     newest = state.alignment.last_fix
     found = _align_by_velocity(setup, state, sample, item.utime)
     if found is None or newest is None:
@@ -329,7 +329,7 @@ def fuse_imu_yaw(setup: Setup, state: FilterState, item: Item) -> Fused:
 
 def _align_by_azimuth(setup: Setup, state: Unaligned, item: Item, angle: float, sigma: float) -> Fused:
     """Return the state in the world by a measured heading, once there is a fix."""
-    state = propagation.advance(setup, state, item.utime)
+    state = fusion.advance(setup, state, item.utime)
     newest = state.alignment.last_fix
     if newest is None or (item.utime - newest.utime) * 1e-6 > MAX_FIX_AGE:
         return state, NOTHING
@@ -352,7 +352,7 @@ def fuse_absolute_pose(setup: Setup, state: FilterState, item: Item) -> Fused:
     if sample.position is None or sample.orientation is None or geodesy is None:
         return state, NOTHING
     assert isinstance(measurement, AbsolutePose)
-    state = propagation.advance(setup, state, item.utime)
+    state = fusion.advance(setup, state, item.utime)
     site = state.site or geodesy.tangent
     context = create_context(setup, state)._replace(site=site)
     return _set_pose(setup, state, item, measurement, sample, context, site)
@@ -382,3 +382,48 @@ def _set_pose(
     nav = nav.forget(slice(0, 3), again.noise[:3, :3])._replace(position=(x + a, y + b, z + c))
     aligned = _align(state, nav, site, GnssMonitor(last_fix=state.alignment.last_fix))
     return aligned, (report_reset(item, "position and heading were set"),)
+
+
+# --- heading check of a warm start --------------------------------------------------------------------------
+
+MIN_DISTANCE: Final = 3.0
+"""Meters from end to end that give a direction, and as many again per meter of the antenna from the middle."""
+
+MAX_GAP: Final = 2.0
+"""Seconds between two fixes beyond which the segment restarts."""
+
+MOUNT_SIGMA: Final = 0.05
+"""Radians by which path and heading may differ on a sound vehicle: side slip, and the survey of the frames."""
+
+
+def check_heading(
+    setup: Setup, state: Aligned, newest: PathFix
+) -> tuple[HeadingCheck | None, Rotation | None, Decision | None]:
+    """Return the check after a fix: None once it is decided, with the rotation of N if the heading is wrong."""
+    check, nav = state.heading_check, state.nav
+    assert check is not None
+    velocity = cmath.rect(nav.body_velocity(setup.rig.base)[0], nav.yaw)
+    position = newest.position - newest.arm
+    dt = (newest.utime - check.utime) * 1e-6
+    if not check.utime or dt > MAX_GAP:
+        return HeadingCheck(newest.utime, newest.utime, position, 0j, velocity), None, None
+    travel = check.travel + 0.5 * dt * (check.velocity + velocity)
+    check = check._replace(utime=newest.utime, travel=travel, velocity=velocity)
+    arm, moved = abs(newest.arm), position - check.position
+    # wheels that spin, or fixes that jump, give no direction
+    if abs(travel) < MIN_DISTANCE * (1.0 + arm) or not 0.5 < abs(moved) / abs(travel) < 2.0:
+        return check, None, None
+    seconds = (newest.utime - check.begin) * 1e-6
+    changed = newest.correlated * math.sqrt(2.0 * (1.0 - math.exp(-seconds / setup.settings.gps_correlation_time)))
+    sigma = math.hypot(1.5 * newest.white, changed, 0.2 * arm) / abs(travel)
+    if sigma > setup.settings.align_sigma:
+        return check, None, None
+    angle = cmath.phase(moved / travel)
+    if abs(angle) <= 4.0 * math.hypot(sigma, MOUNT_SIGMA, math.sqrt(max(nav.covariance[8, 8], 0.0))):
+        text = f"the restored heading is right: {abs(travel):.1f} m driven agree with it"
+        return None, None, report_event(state, WARM_START, Verdict.USED, text)
+    degrees = abs(math.degrees(angle))
+    text = (
+        f"cold start of the pose: the restored heading was off by {degrees:.0f} deg, the vehicle was turned meanwhile"
+    )
+    return None, Rotation(angle, sigma), report_event(state, WARM_START, Verdict.RESET, text)

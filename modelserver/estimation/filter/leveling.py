@@ -17,15 +17,23 @@ from typing import Final
 import numpy as np
 
 from modelserver.earth.geodesy import geodetic_from_ecef
-from modelserver.estimation.filter.dead_reckoning import DeadReckoning
-from modelserver.estimation.filter.error_layout import ACCELEROMETER_BIAS, GYRO_BIAS, STRAPDOWN, VELOCITY
-from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, Earth, NavState, level_attitude
+from modelserver.estimation.filter.eskf import (
+    ACCELEROMETER_BIAS,
+    GYRO_BIAS,
+    STANDARD_GRAVITY,
+    STRAPDOWN,
+    VELOCITY,
+    ZERO,
+    Earth,
+    NavState,
+    compute_tilt,
+    level_attitude,
+)
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import HeadingAlignment
-from modelserver.estimation.filter.imu_monitor import ImuMonitor
-from modelserver.estimation.filter.measurements.constraints import compute_tilt
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Leveling, MotionConstraints, Unaligned
+from modelserver.estimation.filter.hypothesis_bank import DeadReckoning
+from modelserver.estimation.filter.sensor_monitors import ImuMonitor
+from modelserver.estimation.filter.state import Aligned, Leveling, MotionConstraints, Setup, Unaligned
 from modelserver.messages import Estimate
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Quaternion, Vector3

@@ -1,28 +1,68 @@
 """The filter as a localizer: samples in any order of arrival in, the pose at any instant out.
 
 Read top-down: `FilterLocalizer.process` -> `ClockMonitor.update` -> `Timeline.insert`, `fuse`, `settle` -> `step`.
+
+Timeline: delayed measurements (out-of-sequence). Each item is inserted at its instant, and what follows is fused again
+from the state before it, a bounded number of items at a time. Whatever the order of arrival, the final state is that of
+one order: instant, source, sequence number. Items older than the horizon are settled: their decisions are final, and
+the state before the rest is the base.
+
+Step: one item after another, in the order of their instants, from state to state. `step(setup, state, item)` is a pure
+function, and does not depend on the order of arrival.
+Read top-down: `step` -> the handlers in `motion_step`, `gnss_step`, `heading_step` and `fusion` -> `eskf`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.earth.geodesy import Geodesy
-from modelserver.estimation.filter import imu_monitor, leveling, output, persistence, propagation
-from modelserver.estimation.filter.clock_monitor import IMU_RANK, ClockMonitor, StampVerdict
-from modelserver.estimation.filter.fusion import IMU, Item, reject, split_sample
-from modelserver.estimation.filter.odometry import Odometry
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, FilterState, GyroBiases, Leveling, Navigating, Unaligned
-from modelserver.estimation.filter.step import start
+from modelserver.estimation.filter import (
+    eskf,
+    fusion,
+    gnss_step,
+    heading_step,
+    leveling,
+    motion_step,
+    output,
+    sensor_monitors,
+    warm_start,
+)
+from modelserver.estimation.filter.fusion import (
+    IMU,
+    MODE,
+    NOTHING,
+    STEERING,
+    Fused,
+    Handler,
+    Item,
+    fuse_measurement,
+    reject,
+    report_reset,
+    split_sample,
+)
+from modelserver.estimation.filter.output import Odometry
+from modelserver.estimation.filter.state import (
+    Aligned,
+    Common,
+    FilterState,
+    GyroBiases,
+    Leveling,
+    Navigating,
+    Setup,
+    Unaligned,
+    WarmStart,
+)
 from modelserver.estimation.filter.stream_correlation import StreamCorrelation
-from modelserver.estimation.filter.timeline import Timeline
-from modelserver.estimation.interface import LocalizerEvent
+from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import IMU_RANK, ClockMonitor, StampVerdict
 from modelserver.messages import (
     STALE_SENSORS,
+    Decision,
     Estimate,
     ImuSample,
     Invalid,
@@ -210,10 +250,10 @@ class FilterLocalizer(NamedTuple):
         """Return the head propagated by an IMU sample alone, while a delayed measurement is being worked in."""
         head = self.head
         if item.kind == IMU and isinstance(sample, ImuSample) and not isinstance(head, Leveling):
-            values = imu_monitor.read_imu(sample, self.setup.mount)
+            values = sensor_monitors.read_imu(sample, self.setup.mount)
             if not isinstance(values, str) and item.utime > head.nav.utime and self.setup.uses_imu(head.common.mode):
                 imu = head.imu._replace(used_utime=item.utime)
-                return propagation.propagate_imu(self.setup, head, item.utime, *values, head.stationary, imu)
+                return fusion.propagate_imu(self.setup, head, item.utime, *values, head.stationary, imu)
         return head
 
     def _advance_odom(self, head: Navigating) -> tuple[Odometry, tuple[Odometry, ...]]:
@@ -259,7 +299,7 @@ class FilterLocalizer(NamedTuple):
         """Return the whole state as of the newest sample; None before leveling."""
         head = self.head
         if not isinstance(head, Leveling):
-            head = propagation.propagate_covariance(self.setup, head)
+            head = fusion.propagate_covariance(self.setup, head)
         return output.get_navigation_state(self.setup, head)
 
     def get_state_to_persist(self) -> PersistedState | None:
@@ -267,7 +307,7 @@ class FilterLocalizer(NamedTuple):
         head = self.head
         if isinstance(head, Leveling):
             return None
-        return persistence.get_persisted_state(self.setup, head, self.estimate(head.nav.utime).invalid)
+        return warm_start.get_persisted_state(self.setup, head, self.estimate(head.nav.utime).invalid)
 
     def find_stale_sensors(self, utime: int) -> Invalid:
         """Return the bits of STALE_SENSORS of an estimate at `utime`, which is not before the newest sample."""
@@ -323,3 +363,245 @@ def _get_odom_at(odoms: tuple[Odometry, ...], utime: int, newest: Odometry) -> O
         if odom.utime <= utime:
             return odom
     return odoms[0] if odoms else newest
+
+
+# --- timeline -----------------------------------------------------------------------------------------------
+
+MAX_ITEMS: Final = 8192
+"""Items within a horizon: more come from a flood, and are rejected."""
+
+
+class Entry(NamedTuple):
+    """An item, the state after it (None: not fused yet), and the decisions on it."""
+
+    item: Item
+    state: FilterState | None
+    decisions: tuple[Decision, ...]
+
+
+Key: TypeAlias = tuple[int, str, int, int]
+
+
+def _get_key(entry: Entry) -> Key:
+    return entry.item.key
+
+
+def _get_order(item: Item) -> tuple[int, str]:
+    """Return what orders two items of one source and instant; samples are values, so their repr is complete."""
+    return item.seq, repr(item.sample)
+
+
+class Timeline(NamedTuple):
+    """`base` is the state before all `entries`; the first `num_fused` of them are fused."""
+
+    base: FilterState
+    entries: tuple[Entry, ...] = ()
+    num_fused: int = 0
+
+    @property
+    def newest(self) -> FilterState:
+        state = self.entries[self.num_fused - 1].state if self.num_fused else self.base
+        assert state is not None
+        return state
+
+    def is_fused(self, limit: int) -> bool:
+        """Return whether everything up to the instant `limit` is fused."""
+        return self.num_fused == len(self.entries) or self.entries[self.num_fused].item.utime > limit
+
+    def append(
+        self, setup: Setup, items: Sequence[Item], budget: int, limit: int, oldest: int
+    ) -> tuple[Timeline, FilterState, tuple[Decision, ...]] | None:
+        """Return the timeline with the items of a sample more, all fused and settled, and what follows from it.
+
+        That is its newest state, and the settled decisions. None if the items do not follow all others. The usual case
+        of `insert`, `fuse` and `settle`, at a fraction of their cost; `oldest` is the beginning of the horizon.
+        """
+        base, entries, num_fused = self.base, self.entries, self.num_fused
+        first = items[0]
+        utime = first.utime
+        if not entries or not oldest <= utime <= limit:
+            return None
+        if len(items) > 1 and any(each.utime != utime for each in items):
+            return None
+        newest = entries[-1].item
+        # one of the same source and instant may be a duplicate
+        if utime < newest.utime or (utime == newest.utime and first.source <= newest.source):
+            return None
+        waiting = len(entries) - num_fused
+        if waiting + len(items) > budget:
+            return None
+        state = self.newest
+        fused = []
+        for item in (*[entry.item for entry in entries[num_fused:]], *items) if waiting else items:
+            state, decisions = step(setup, state, item)
+            fused.append(new_tuple(Entry, (item, state, decisions)))
+        entries = (*entries[:num_fused], *fused) if waiting else (*entries, *fused)
+        # one or two at a time, and never the last one
+        cut, settled = 0, NOTHING
+        while entries[cut].item.utime < oldest:
+            settled += entries[cut].decisions
+            cut += 1
+        if cut:
+            before = entries[cut - 1].state
+            assert before is not None
+            base, entries = before, entries[cut:]
+        return new_tuple(Timeline, (base, entries, len(entries))), state, settled
+
+    def insert(self, item: Item) -> tuple[Timeline, Item | None] | str:
+        """Return the timeline with an item more, and the item that it replaces; or in one word why not.
+
+        Of two items of one source and instant the lower sequence number counts, whichever arrived first.
+        """
+        entries = self.entries
+        key = item.key
+        if not entries or key > entries[-1].item.key:
+            at = len(entries)
+        elif len(entries) >= MAX_ITEMS:
+            return "overload"
+        else:
+            at = bisect_left(entries, key, key=_get_key)
+        replaced = None
+        duplicate = self._find_duplicate(item, at)
+        if duplicate is not None:
+            replaced = entries[duplicate].item
+            if _get_order(replaced) <= _get_order(item):
+                return "duplicate"
+            entries = entries[:duplicate] + entries[duplicate + 1 :]
+        entries = entries[:at] + (Entry(item, None, ()),) + entries[at:]  # noqa: RUF005 - a third faster here
+        return Timeline(self.base, entries, min(self.num_fused, at)), replaced
+
+    def _find_duplicate(self, item: Item, at: int) -> int | None:
+        """Return the index of the same measurement of the same source and instant; `at` is the item's own index.
+
+        A source measures a thing once at an instant, whatever its numbering; all of that instant are side by side.
+        """
+        for around in (range(at - 1, -1, -1), range(at, len(self.entries))):
+            for n in around:
+                other = self.entries[n].item
+                if other.utime != item.utime or other.source != item.source:
+                    break
+                # different types of samples may have the same source name
+                if other.part == item.part and type(other.sample) is type(item.sample):
+                    return n
+        return None
+
+    def fuse(self, setup: Setup, budget: int, limit: int) -> Timeline:
+        """Return the timeline with up to `budget` items more fused, none later than the instant `limit`."""
+        entries, at = self.entries, self.num_fused
+        if self.is_fused(limit):
+            return self
+        state = self.newest
+        fused = []
+        for entry in entries[at : at + budget]:
+            if entry.item.utime > limit:
+                break
+            state, decisions = step(setup, state, entry.item)
+            fused.append(Entry(entry.item, state, decisions))
+        until = at + len(fused)
+        return Timeline(self.base, entries[:at] + tuple(fused) + entries[until:], until)
+
+    def settle(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:
+        """Return the timeline without the fused items older than `utime`, and the decisions on them."""
+        entries = self.entries
+        cut = 0
+        decisions: tuple[Decision, ...] = ()
+        # one or two at a time
+        while cut < self.num_fused and entries[cut].item.utime < utime:
+            decisions += entries[cut].decisions
+            cut += 1
+        if not cut:
+            return self, ()
+        state = entries[cut - 1].state
+        assert state is not None
+        return Timeline(state, entries[cut:], self.num_fused - cut), decisions
+
+    def get_state_at(self, utime: int) -> FilterState:
+        """Return the newest fused state not newer than an instant; the base before all."""
+        for entry in reversed(self.entries[: self.num_fused]):
+            if entry.item.utime <= utime and entry.state is not None:
+                found: FilterState = entry.state
+                return found
+        return self.base
+
+
+# --- step ---------------------------------------------------------------------------------------------------
+
+
+def start(mode: Mode, geodesy: Geodesy | None, restored: RestoredState | None = None) -> Leveling:
+    """Return the state before the first sample; `restored` is the state of an earlier run, for a warm start."""
+    waiting = None if restored is None or restored.state is None else WarmStart(restored)
+    return Leveling(Common(mode=mode, geodesy=geodesy, warm_start=waiting))
+
+
+def step(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after an item, and the decisions."""
+    decisions = NOTHING
+    pending = state.common.pending
+    if pending and pending[0].utime <= item.utime:
+        state, decisions = _apply_pending(setup, state, item.utime)
+    state, more = _HANDLERS.get(item.kind, fuse_measurement)(setup, state, item)
+    if not isinstance(state, Leveling):
+        # the whole check after an update, its cheap part after a propagation
+        if not (eskf.is_sound if more else eskf.is_plausible)(state.nav, setup.settings):
+            state = Leveling(state.common.restart())
+            more = (*more, report_reset(item, "the filter had diverged"))
+        elif state.common.warm_start is not None:
+            state, steps = warm_start.advance(setup, state, item.utime)
+            more = (*more, *steps)
+    return state, decisions + more
+
+
+def _apply_pending(setup: Setup, state: FilterState, utime: int) -> Fused:
+    """Return the state with the pending decisions applied that no delayed sample can change any more."""
+    decisions = NOTHING
+    for each in state.common.pending:
+        if each.utime > utime:
+            break
+        common = state.common._replace(pending=state.common.pending[1:])
+        if each.origin is not None:
+            common = common._replace(geodesy=Geodesy(each.origin))
+        state = state._replace(common=common)
+        if each.resets_position and isinstance(state, Aligned) and state.bank is None:
+            state = fusion.propagate_covariance(setup, state)
+            state, decision = gnss_step.reset_position(setup, state)
+            decisions += () if decision is None else (decision,)
+    return state, decisions
+
+
+def _switch_mode(setup: Setup, state: FilterState, item: Item) -> Fused:
+    sample = item.sample
+    assert isinstance(sample, SwitchMode)
+    if not isinstance(state, Leveling):
+        state = fusion.advance(setup, state, item.utime)
+    state = state._replace(common=state.common._replace(mode=sample.mode))
+    return state, (report_reset(item, f"mode {sample.mode.name.lower()}"),)
+
+
+def _fuse_gnss(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state after a measurement of the receiver.
+
+    It is not used while a driver fills a gap of the IMU: of a unit that measures both, it may have filled that of the
+    receiver too, and a straight line between two fixes is off the path by meters in a turn.
+    """
+    imu, is_imu_used = state.imu, setup.uses_imu(state.common.mode)
+    if imu.fills_gap and is_imu_used and (item.utime - imu.used_utime) * 1e-6 <= setup.settings.rate_hold:
+        return state, (reject(item, "interpolated"),)
+    return _GNSS_HANDLERS[item.kind](setup, state, item)
+
+
+_GNSS_HANDLERS: dict[str, Handler] = {
+    "gps_position": gnss_step.fuse_fix,
+    "gps_height": gnss_step.fuse_height,
+    "gps_velocity": heading_step.fuse_velocity,
+    "gps_baseline": heading_step.fuse_baseline,
+}
+
+_HANDLERS: dict[str, Handler] = {
+    IMU: motion_step.fuse_imu,
+    MODE: _switch_mode,
+    STEERING: motion_step.fuse_steering,
+    "wheel_speed": motion_step.fuse_wheels,
+    **dict.fromkeys(_GNSS_HANDLERS, _fuse_gnss),
+    "imu_yaw": heading_step.fuse_imu_yaw,
+    "absolute_pose": heading_step.fuse_absolute_pose,
+}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from statistics import NormalDist
-from typing import Final
+from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.transforms.so3 import Array
@@ -89,3 +89,52 @@ def invert_heading(level: float, settings: FilterSettings) -> float:
     """Return the variance of the heading that has a protection level, rad2: the reverse of `compute_heading`."""
     _, k = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
     return max((level / k) ** 2 - HEADING_FLOOR**2, 0.0)
+
+
+class Bounds(NamedTuple):
+    """The error of a pose by the mixture: levels, protection levels (m, rad) and risks of the limits.
+
+    `variances` are those of the pose's own covariance then: longest axis (m2) and heading (rad2).
+    """
+
+    horizontal_level: float
+    heading_level: float
+    horizontal_protection: float
+    heading_protection: float
+    horizontal_risk: float
+    heading_risk: float
+    variances: tuple[float, float]
+
+    @property
+    def risk(self) -> float:
+        """Probability that position or heading are beyond their limits."""
+        return self.horizontal_risk + self.heading_risk
+
+    @property
+    def allowance(self) -> float:
+        """The part of the horizontal level that the pose's own covariance does not have, m."""
+        k, _ = compute_factors(LEVEL_RISK)
+        return max(self.horizontal_level - k * math.sqrt(self.variances[0]), 0.0)
+
+    def grow(self, variances: tuple[float, float], limits: tuple[float, float], settings: FilterSettings) -> Bounds:
+        """Return the bounds of a pose that is predicted from then on, by the growth of its own covariance."""
+        (before, heading_before), (after, heading_after) = self.variances, variances
+        if not (after > before or heading_after > heading_before):
+            return self
+        floor = HEADING_FLOOR**2
+        sigmas = math.sqrt(before), math.sqrt(heading_before + floor)
+        grown = math.sqrt(max(after, before)), math.sqrt(max(heading_after, heading_before) + floor)
+        level, heading_level = compute_factors(LEVEL_RISK)
+        protection, heading_protection = get_factors(settings.risk_per_hour, settings.gps_correlation_time)
+        more, turned = grown[0] - sigmas[0], grown[1] - sigmas[1]
+        least = compute_limit_risks(*sigmas, limits[0] - self.allowance, limits[1])
+        risks = compute_limit_risks(*grown, limits[0] - self.allowance, limits[1])
+        return Bounds(
+            self.horizontal_level + level * more,
+            min(self.heading_level + heading_level * turned, math.pi),
+            self.horizontal_protection + protection * more,
+            min(self.heading_protection + heading_protection * turned, math.pi),
+            min(self.horizontal_risk + risks[0] - least[0], 1.0),
+            min(self.heading_risk + risks[1] - least[1], 1.0),
+            variances,
+        )

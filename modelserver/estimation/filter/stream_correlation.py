@@ -42,11 +42,11 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth.geodesy import LocalFrame
-from modelserver.estimation.filter.imu_monitor import read_turn_rate
 from modelserver.estimation.filter.measurements.gnss import locate_fix, split_variance
 from modelserver.estimation.filter.measurements.wheels import estimate_turn_rate
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.fix_quality import evaluate_fix
+from modelserver.estimation.filter.sensor_monitors import read_turn_rate
+from modelserver.estimation.filter.state import Setup
+from modelserver.estimation.inputs import evaluate_fix
 from modelserver.messages import GpsSample, ImuSample, Mode, Sample, SensorFinding, SwitchMode, WheelsSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array

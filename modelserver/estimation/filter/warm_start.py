@@ -1,44 +1,175 @@
 """Warm start: restore persisted biases at leveling, and the pose if the vehicle cannot have moved.
 
+What is persisted (`get_persisted_state`) has a hash of all that it depends on: elsewhere it is not used.
+
 Nobody observed the vehicle between the two runs. Biases change slowly whatever happens, so they are restored, after
 covariance inflation by their age (`age_biases`). The pose is not: a heading cannot be observed while stationary. It is
 used only if the vehicle was stationary when it was stored and is now, the time between is short, the wheels' counters
 continue and have not moved, gravity points the same way, and fixes agree if there are any. Until all of this is known
 there is no pose, and if any of it is missing the start is as cold as without a stored pose. A restored heading is then
-checked against the first meters driven (`heading_check`).
+checked against the first meters driven (`heading_step.check_heading`).
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
-from modelserver.earth.geodesy import GeodesyError, LocalFrame
-from modelserver.estimation.filter import eskf
-from modelserver.estimation.filter.error_layout import STRAPDOWN
-from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, Earth, NavState, level_attitude
+from modelserver.earth.geodesy import GeodesyError, LocalFrame, geodetic_from_ecef
+from modelserver.errors import quote
+from modelserver.estimation.filter import eskf, fusion, output, protection_levels
+from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, STRAPDOWN, ZERO, Earth, NavState, level_attitude
 from modelserver.estimation.filter.fusion import NOTHING, Fused, report_event
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor, OutputOffset
 from modelserver.estimation.filter.leveling import get_tilt_by_bias
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR
 from modelserver.estimation.filter.measurements.measurement import point_jacobian
-from modelserver.estimation.filter.persistence import WARM_START, format_age, get_travel
-from modelserver.estimation.filter.setup import STATIONARY_ANGLE_WALK, Setup
+from modelserver.estimation.filter.sensor_monitors import RECEIVED
 from modelserver.estimation.filter.state import (
+    STATIONARY_ANGLE_WALK,
     Aligned,
     FilterState,
     HeadingCheck,
     Leveling,
     Navigating,
+    Setup,
     Unaligned,
     WarmStart,
 )
-from modelserver.estimation.filter.wheel_monitor import RECEIVED
-from modelserver.messages import Decision, Mode, PersistedPose, PersistedState, Verdict, WheelsSample
+from modelserver.messages import Decision, Mode, PersistedPose, PersistedState, RestoredState, Verdict, WheelsSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array
+
+WARM_START: Final = "warm_start"
+"""Kind of the ledger's decisions on a warm start."""
+
+
+@lru_cache(maxsize=8)
+def get_setup_hash(setup: Setup) -> str:
+    """Return a hash of all that a stored state depends on: equal where it may be used."""
+    rig = setup.rig
+    words = repr((rig.geometry_key(), rig.kinematics, rig.steering, setup.layout.names))
+    return hashlib.sha256(words.encode()).hexdigest()[:16]
+
+
+def get_persisted_state(setup: Setup, state: FilterState, invalid: int) -> PersistedState | None:
+    """Return what to store of a state; None if what was stored before is better.
+
+    `invalid` are the reasons of the present pose: an invalid pose is not stored, its biases are.
+    """
+    if isinstance(state, Leveling) or state.common.warm_start is not None:
+        return None
+    state = fusion.propagate_covariance(setup, state)
+    nav = state.nav
+    P = nav.covariance
+    if isinstance(state, Aligned):
+        # neither bank nor monitor are stored: their level of the heading is
+        bound = output.get_heading_protection(setup, state)
+        P = P.copy()
+        P[8, 8] = max(float(P[8, 8]), protection_levels.invert_heading(bound, setup.settings))
+    numbers = tuple(P.ravel().tolist())
+    if not all(map(math.isfinite, (*numbers, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras))):
+        return None
+    pose = None
+    if isinstance(state, Aligned) and state.is_stationary and not invalid:
+        pose = _get_persisted_pose(state, nav)
+    return PersistedState(
+        "",
+        0,
+        0,
+        "",
+        get_setup_hash(setup),
+        nav.utime,
+        setup.layout.names,
+        nav.gyro_bias,
+        nav.accelerometer_bias,
+        tuple(map(float, nav.extras)),
+        numbers,
+        pose,
+    )
+
+
+def _get_persisted_pose(state: Aligned, nav: NavState) -> PersistedPose | None:
+    gnss, common = state.gnss, state.common
+    offset = gnss.offset
+    numbers = (*offset.value, *offset.variance, gnss.outlier_allowance, gnss.noise_inflation)
+    if not all(map(math.isfinite, (*nav.position, *nav.attitude, *numbers))):
+        return None
+    source, seq = "", 0
+    travel: tuple[tuple[str, float], ...] = ()
+    received = common.previous.get((common.wheels.source, RECEIVED))
+    if received is not None and isinstance(received.sample, WheelsSample):
+        source, seq = common.wheels.source, received.sample.header.seq
+        travel = get_travel(received.sample)
+    return PersistedPose(
+        *geodetic_from_ecef(state.site.ecef),
+        nav.position,
+        nav.attitude,
+        offset.value,
+        offset.variance,
+        gnss.outlier_allowance,
+        gnss.noise_inflation,
+        gnss.used_utime,
+        gnss.num_confirmed,
+        common.epoch,
+        source,
+        seq,
+        travel,
+    )
+
+
+def get_travel(sample: WheelsSample) -> tuple[tuple[str, float], ...]:
+    """Return the travel of each wheel that measures it, by name, m."""
+    return tuple((wheel.name, wheel.travel) for wheel in sample.wheels if math.isfinite(wheel.travel))
+
+
+def check_restored(restored: RestoredState, vehicle: str, setup: Setup) -> RestoredState:
+    """Return what was restored, without a state of another vehicle, of other mounts, or too old; with the reason."""
+    state = restored.state
+    if state is None:
+        return restored
+    reason = ""
+    if state.vehicle != vehicle:
+        reason = f"it is of vehicle {quote(state.vehicle)}, not of {quote(vehicle)}"
+    elif state.setup != get_setup_hash(setup):
+        reason = "mounts, wheels or measurements of the vehicle have changed since"
+    elif state.names != setup.layout.names or len(state.covariance) != setup.layout.size**2:
+        reason = "its error states are others"
+    elif restored.age > restored.max_age:
+        reason = "it is older than warm_start.max_age_s"
+    if not reason:
+        return restored
+    text = f"the state stored {format_age(restored.age)} is not used: {reason}"
+    return restored._replace(state=None, reason=text)
+
+
+def prepare_warm_start(
+    restored: RestoredState | None, vehicle: str, setup: Setup, mode: Mode
+) -> tuple[RestoredState | None, str]:
+    """Return the state to start from, None for a cold start; and the message, empty if no state was asked for."""
+    if restored is None:
+        return None, ""
+    if mode is Mode.RAW:
+        restored = restored._replace(state=None, reason="raw mode restores only the origin")
+    restored = check_restored(restored, vehicle, setup)
+    if restored.state is None:
+        return None, f"cold start: {restored.reason}"
+    return restored, f"warm start: the state stored {format_age(restored.age)} waits for the sensors"
+
+
+def format_age(seconds: float) -> str:
+    """Return an age in words, e.g. `5 min ago`."""
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.0f} {unit} ago"
+    return f"{seconds:.0f} s ago"
+
+
+# --- warm start ---------------------------------------------------------------------------------------------
 
 NUM_FIXES: Final = 3
 """Fixes in a row that must agree with the persisted pose, or disagree: one of them may be an outlier."""

@@ -4,7 +4,7 @@ Position is the newest good fix, moved to the base frame by the lever arm, and p
 Roll and pitch are the IMU's, or its gyros' corrected by the specific force. Heading is the course while moving, the
 integrated gyro in between, and held while stationary. Limits: docs/raw-mode.md.
 
-Each sample passes the clock monitor of its source first (`filter.clock_monitor`, without a horizon: raw mode has no
+Each sample passes the clock monitor of its source first (`estimation.inputs`, without a horizon: raw mode has no
 buffer to sort samples in, so a delayed one is rejected). An IMU sample propagates motion and heading; a fix updates
 position, heading and speed at its own instant, for which two seconds of motion are stored. After a step back of a
 clock all but Odom, origin and biases restarts.
@@ -48,7 +48,7 @@ speed of half its time T ago, which has changed by a T / 2 since with a = `usual
 a T / 2 gives the time for the speed. A course is that of the segment since the last one, once its sigma is within
 `course_sigma_limit`: that of new errors in the fit, of the time-correlated rest (Gauss-Markov), and of the turn.
 
-Stationary: the gyros and accelerometers are quiet (`filter.stationary_detector`) and the vehicle is slow by the fixes,
+Stationary: the gyros and accelerometers are quiet (`filter.sensor_monitors`) and the vehicle is slow by the fixes,
 which resolve `stationary_speed` three times only over long enough. Then the heading is held, and the mean rate of each
 `stationary_time` measures the bias, unless it is a turn: more than four sigmas of bias and noise.
 
@@ -70,9 +70,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, rotation_about_up
-from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO
-from modelserver.estimation.filter.imu_monitor import MAX_FORCE, MAX_RATE
 from modelserver.estimation.filter.protection_levels import (
     LIMIT_RISK,
     compute_factors,
@@ -80,10 +78,16 @@ from modelserver.estimation.filter.protection_levels import (
     compute_limit_risks,
     compute_longest_axis,
 )
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
-from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix
-from modelserver.estimation.interface import LocalizerEvent
-from modelserver.estimation.origin import OriginCapture, OriginProjection
+from modelserver.estimation.filter.sensor_monitors import MAX_FORCE, MAX_RATE, StationaryDetector
+from modelserver.estimation.history import LocalizerEvent
+from modelserver.estimation.inputs import (
+    AcceptedFix,
+    ClockMonitor,
+    OriginCapture,
+    OriginProjection,
+    StampVerdict,
+    evaluate_fix,
+)
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from modelserver.estimation.settings import FixSettings
+from modelserver.estimation.filter.settings import FixSettings
 
 
 @dataclass(frozen=True, slots=True)

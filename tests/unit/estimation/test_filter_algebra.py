@@ -13,10 +13,10 @@ from scipy import stats
 from support_cart import rig, some_nav
 
 from modelserver.estimation.filter import eskf, protection_levels
-from modelserver.estimation.filter.error_layout import STRAPDOWN, ErrorLayout, ErrorState
+from modelserver.estimation.filter.eskf import STRAPDOWN, ErrorLayout, ErrorState
 from modelserver.estimation.filter.measurements import Innovation
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.estimation.filterpy_import import import_kalman_filter
 from modelserver.messages import Verdict
 

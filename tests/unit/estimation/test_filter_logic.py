@@ -13,20 +13,17 @@ from support_cart import ANTENNA, GEODESY, WHEELS, localizer, model, rig, some_n
 from support_cart import IMU as IMU_FRAME
 
 from modelserver.estimation.filter import (
-    clock_monitor,
     fusion,
     heading_alignment,
     heading_step,
-    imu_monitor,
     leveling,
     output,
-    step,
+    sensor_monitors,
 )
-from modelserver.estimation.filter.clock_monitor import ClockMonitor, StampVerdict
 from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ZERO, level_attitude
 from modelserver.estimation.filter.gnss_monitor import GnssMonitor
 from modelserver.estimation.filter.heading_alignment import LatencyFit, PathFix, Rotation
-from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.localizer import FilterLocalizer, start
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, LATENCY
 from modelserver.estimation.filter.measurements.wheels import (
     WheelSpeed,
@@ -35,11 +32,11 @@ from modelserver.estimation.filter.measurements.wheels import (
     estimate_turn_rate,
     read_wheels,
 )
-from modelserver.estimation.filter.odometry import Odometry
+from modelserver.estimation.filter.output import Odometry
+from modelserver.estimation.filter.sensor_monitors import StationaryDetector
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Leveling, Unaligned
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.estimation.filter.state import Leveling, Setup, Unaligned
+from modelserver.estimation.inputs import MAX_SOURCES, ClockMonitor, StampVerdict
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (
     Decision,
@@ -158,10 +155,8 @@ def test_given_a_stamp_in_the_future_then_it_is_accepted_once_a_run_of_samples_a
 
 
 def test_given_a_flood_of_source_names_then_memory_is_bounded_and_known_sources_stay_monitored():
-    monitor, _ = update(
-        create_running_monitor(), *[(f"evil{n}", 0, 9.9, 1) for n in range(2 * clock_monitor.MAX_SOURCES)]
-    )
-    assert len(monitor.sources) == clock_monitor.MAX_SOURCES
+    monitor, _ = update(create_running_monitor(), *[(f"evil{n}", 0, 9.9, 1) for n in range(2 * MAX_SOURCES)])
+    assert len(monitor.sources) == MAX_SOURCES
     monitor, words = update(monitor, *[("imu", 2, 10.0 + n * 0.02, 501 + n) for n in range(300)])
     assert set(words) == {"good"}
     assert monitor.sources["sample", "imu"].newest == T0 + 15_980_000
@@ -319,15 +314,15 @@ def test_given_impossible_imu_samples_then_they_are_rejected(word):
         create_imu_sample(0.0, (wrong, 0.0, 0.0), (0.0, 0.0, 9.8)),
         create_imu_sample(0.0, ZERO, (0.0, 0.0, wrong)),
     ):
-        assert imu_monitor.read_imu(sample, SETUP.mount) == word
-    assert imu_monitor.read_imu(ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8)), SETUP.mount) == "nan"
-    found = imu_monitor.read_imu(create_imu_sample(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)), SETUP.mount)
+        assert sensor_monitors.read_imu(sample, SETUP.mount) == word
+    assert sensor_monitors.read_imu(ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8)), SETUP.mount) == "nan"
+    found = sensor_monitors.read_imu(create_imu_sample(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)), SETUP.mount)
     assert not isinstance(found, str)
     assert found[0] == pytest.approx((0.1, 0.2, 0.3))
 
 
 def test_given_the_pose_of_another_localizer_then_the_filter_starts_there_with_the_same_covariance():
-    first = step.start(Mode.FULL, GEODESY)
+    first = start(Mode.FULL, GEODESY)
     P = np.diag([0.04, 0.09, 0.16, 1e-3, 2e-3, 3e-3])
     X = Pose.from_rpy((10.0, 20.0, 1.0), 0.0, 0.1, 0.7)
     before = Estimate(T0 - 100_000, Pose((0.0, 0.0, 0.0)), X)
@@ -347,7 +342,7 @@ def test_given_no_fixes_for_long_then_they_are_stale_only_on_a_vehicle_with_an_a
     gps: bool, expected: Invalid
 ) -> None:
     setup = Setup(rig(gps=gps))
-    first = step.start(Mode.FULL, GEODESY)
+    first = start(Mode.FULL, GEODESY)
     X = Pose.identity()
     last = Estimate(T0, X, X, X, tuple(np.diag([0.01] * 6).ravel().tolist()))
     state = leveling.start_from(setup, first, last, replace(last, utime=T0 - 100_000))

@@ -23,18 +23,11 @@ from support_cart import (
 
 from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.estimation.filter.eskf import NavState
-from modelserver.estimation.filter.measurements import (
-    REGISTRY,
-    Innovation,
-    Measurement,
-    MeasurementContext,
-    constraints,
-)
+from modelserver.estimation.filter.measurements import REGISTRY, Innovation, Measurement, MeasurementContext, wheels
 from modelserver.estimation.filter.measurements.gnss import read_velocity
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.magnetometer import magnetic_field
-from modelserver.estimation.sensor_rig import SensorRig
+from modelserver.estimation.filter.state import Setup
+from modelserver.estimation.sensor_rig import SensorRig, magnetic_field
 from modelserver.messages import (
     AbsolutePoseSample,
     FixType,
@@ -294,10 +287,10 @@ def test_given_a_small_error_of_the_state_then_the_residual_of_a_constraint_foll
     rolling = Setup(rig(wheels=()), SETTINGS)
     bare = MeasurementContext(some_nav(rolling, seed), rolling.layout, SETTINGS, rolling.rig)
     for each, constrain in (
-        (context, lambda s: constraints.non_holonomic(s, 0.1)),
-        (bare, lambda s: constraints.non_holonomic(s, 0.1)),
-        (context, lambda s: constraints.zero_velocity(s, 0.1)),
-        (context, lambda s: constraints.zero_rate(s, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 1.0)),
+        (context, lambda s: wheels.non_holonomic(s, 0.1)),
+        (bare, lambda s: wheels.non_holonomic(s, 0.1)),
+        (context, lambda s: wheels.zero_velocity(s, 0.1)),
+        (context, lambda s: wheels.zero_rate(s, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 1.0)),
     ):
         numerical = differentiate(
             lambda nav, each=each, constrain=constrain: constrain(each._replace(nav=nav)).residual,
@@ -314,14 +307,12 @@ def test_given_a_vehicle_that_moves_as_constrained_then_the_residuals_are_0():
     arm = so3.rotate(nav.attitude, cross(nav.angular_rate, PAIR.base))
     rolling = nav._replace(velocity=(forward[0] - arm[0], forward[1] - arm[1], forward[2] - arm[2]))
     context = MeasurementContext(rolling, setup.layout, SETTINGS, PAIR)
-    assert constraints.non_holonomic(context, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert wheels.non_holonomic(context, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
     stationary = context._replace(nav=nav._replace(velocity=(0.0, 0.0, 0.0)))
-    assert constraints.zero_velocity(stationary, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
+    assert wheels.zero_velocity(stationary, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
     earth = (0.0, 4.7e-5, 5.6e-5)
     measured = np.add(nav.gyro_bias, so3.rotate(so3.conjugate(nav.attitude), earth))
-    assert constraints.zero_rate(context, tuple(measured), earth, 1.0).residual == pytest.approx(
-        [0.0, 0.0, 0.0], abs=1e-12
-    )
+    assert wheels.zero_rate(context, tuple(measured), earth, 1.0).residual == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
 
 
 # --- what is rejected, and what is used instead -------------------------------------------------------------

@@ -23,8 +23,7 @@ from support_restart import (
 )
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Leveling
+from modelserver.estimation.filter.state import Leveling, Setup
 from modelserver.messages import Mode, RestoredState
 from modelserver.messages import Phase as FilterPhase
 from modelserver.simulation import DrivePhase

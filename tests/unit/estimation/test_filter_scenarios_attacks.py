@@ -21,13 +21,11 @@ from support_filter import (
     simulation,
 )
 
-from modelserver.estimation.filter import fusion, heading_alignment, heading_step, propagation
-from modelserver.estimation.filter.error_layout import ATTITUDE
+from modelserver.estimation.filter import fusion, heading_alignment, heading_step
+from modelserver.estimation.filter.eskf import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
-from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Leveling
-from modelserver.estimation.filter.timeline import Timeline
+from modelserver.estimation.filter.localizer import FilterLocalizer, Timeline
+from modelserver.estimation.filter.state import Aligned, Leveling, Setup
 from modelserver.messages import GpsSample, ImuSample, Invalid, Mode, Phase, Verdict, WheelSample, WheelsSample
 from modelserver.simulation import START_UTIME, DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
@@ -137,7 +135,7 @@ def test_given_a_speed_that_nothing_measures_then_the_constraint_changes_no_gyro
     def constrain(slid: Aligned) -> tuple[float, float, np.ndarray]:
         """Return the change of the bias, the sideways speed, and the change of the variances."""
         utime = slid.nav.utime + 100_000
-        before = propagation.propagate_covariance(setup, slid).nav.covariance
+        before = fusion.propagate_covariance(setup, slid).nav.covariance
         after, (decision,) = fusion.fuse_non_holonomic(setup, slid, utime)
         assert decision.verdict is Verdict.USED
         learned = after.nav.gyro_bias[2] - slid.nav.gyro_bias[2]

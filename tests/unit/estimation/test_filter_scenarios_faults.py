@@ -14,8 +14,8 @@ from support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, sim
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.magnetometer import magnetic_field
+from modelserver.estimation.filter.state import Setup
+from modelserver.estimation.sensor_rig import magnetic_field
 from modelserver.messages import ImuSample, Invalid, Phase, Verdict, WheelsSample, YawSource
 from modelserver.simulation import (
     START_UTIME,

@@ -19,8 +19,7 @@ from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements.gnss import LATENCY
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned
+from modelserver.estimation.filter.state import Aligned, Setup
 from modelserver.messages import GpsSample, Invalid, Mode, Verdict
 from modelserver.simulation import DrivePhase, Event, GpsModel, figure_eight
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from support_filter import ORIGIN, RIG, drive, simulation
 
-from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.timeline import Timeline
+from modelserver.estimation.filter.localizer import FilterLocalizer, Timeline
+from modelserver.estimation.filter.state import Setup
 from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts

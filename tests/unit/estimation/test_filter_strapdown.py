@@ -9,14 +9,11 @@ import pytest
 from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_nav
 
 from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave
-from modelserver.estimation.filter import eskf, propagation
-from modelserver.estimation.filter.dead_reckoning import DeadReckoning
-from modelserver.estimation.filter.error_layout import STRAPDOWN
-from modelserver.estimation.filter.eskf import ZERO, Earth, NavState, ProcessNoise
-from modelserver.estimation.filter.imu_monitor import ImuMonitor
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Common, MotionConstraints
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
+from modelserver.estimation.filter import eskf, fusion
+from modelserver.estimation.filter.eskf import STRAPDOWN, ZERO, Earth, NavState, ProcessNoise
+from modelserver.estimation.filter.hypothesis_bank import DeadReckoning
+from modelserver.estimation.filter.sensor_monitors import ImuMonitor, StationaryDetector
+from modelserver.estimation.filter.state import Aligned, Common, MotionConstraints, Setup
 from modelserver.messages import ImuSample
 from modelserver.simulation import START_UTIME, ImuModel, Timing, Trajectory, figure_eight
 from modelserver.transforms import so3
@@ -204,12 +201,12 @@ def test_given_a_gap_then_the_last_sample_is_held_for_a_while_and_then_the_state
         Earth(),
         SITE,
     )
-    held = propagation.predict_nav(setup, state, nav.utime + 150_000)
+    held = fusion.predict_nav(setup, state, nav.utime + 150_000)
     assert held.yaw == pytest.approx(0.075)
-    later = propagation.predict_nav(setup, state, nav.utime + 1_000_000)
+    later = fusion.predict_nav(setup, state, nav.utime + 1_000_000)
     assert later.yaw == pytest.approx(0.5 * setup.settings.rate_hold)
     assert math.hypot(*later.velocity) == pytest.approx(2.0, abs=0.1)
-    caught = propagation.propagate_covariance(setup, state._replace(nav=later)).nav
+    caught = fusion.propagate_covariance(setup, state._replace(nav=later)).nav
     # 0.8 s without a measurement
     assert caught.covariance[8, 8] > nav.covariance[8, 8] + 0.5 * setup.settings.gap_rate_sigma**2
-    assert propagation.advance(setup, state, nav.utime) is state
+    assert fusion.advance(setup, state, nav.utime) is state

@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from support_cart import MOUNTS, ORIGIN, drive, localizer, process_all, rig, same
 
 from modelserver.estimation.filter.fusion import split_sample
-from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
+from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer, Timeline
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import FilterState, Leveling
-from modelserver.estimation.filter.timeline import Timeline
+from modelserver.estimation.filter.state import FilterState, Leveling, Setup
 from modelserver.estimation.history import History
 from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
 from modelserver.estimation.raw.localizer import RawLocalizer
@@ -153,7 +151,7 @@ def test_given_a_sample_twice_then_the_second_is_rejected_whatever_its_sequence_
 
 
 def test_given_more_items_than_a_horizon_can_hold_then_delayed_ones_are_rejected(monkeypatch):
-    monkeypatch.setattr("modelserver.estimation.filter.timeline.MAX_ITEMS", 10)
+    monkeypatch.setattr("modelserver.estimation.filter.localizer.MAX_ITEMS", 10)
     samples = select_events(WARM, WARM + CHUNK)
     done = process_all(drive_until_aligned(), [each for each in samples if isinstance(each, ImuSample)])
     _, notes = done.process(next(each for each in samples if isinstance(each, GpsSample)))

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.fix_alternation import FixAlternation
-from modelserver.estimation.fix_quality import evaluate_fix
+from modelserver.estimation.inputs import FixAlternation, evaluate_fix
 from modelserver.messages import FixType, GpsSample, SensorHeader
 
 START = 1_700_000_000_000_000

@@ -9,10 +9,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from modelserver.estimation.filter.dead_reckoning import DeadReckoning, Increment
 from modelserver.estimation.filter.hypothesis_bank import (
+    DeadReckoning,
     Fault,
     HypothesisBank,
+    Increment,
     PlanarFix,
     start_bank,
 )

@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from modelserver.estimation.filter.mount_monitor import FEWEST, MountMonitor
+from modelserver.estimation.filter.sensor_monitors import FEWEST, MountMonitor
 
 PERIOD = 0.1
 

@@ -17,12 +17,12 @@ from support_filter import QUICK_IMU, RIG, simulation
 from support_journal import OPEN, JournalRig
 
 from modelserver.errors import ConfigError, RecordingError
-from modelserver.estimation.filter.error_layout import ErrorState
+from modelserver.estimation.filter.eskf import ErrorState
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements import MEASUREMENT_TYPES, Innovation, MeasurementContext
-from modelserver.estimation.filter.measurements.own import OwnMeasurement, get_type, read_covariance
+from modelserver.estimation.filter.measurements.measurement import OwnMeasurement, get_type, read_covariance
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.messages import Decision, ImuSample, MeasurementSample, Mode, SensorHeader, SwitchMode, Verdict
 from modelserver.server.journal import encoding as journal_state
 from modelserver.server.journal.encoding import RunState

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from support_filter import RIG, Run, Transform, drive, simulation
 
-from modelserver.estimation.filter.receiver_monitor import (
+from modelserver.estimation.filter.gnss_monitor import (
     CARRIER_LIMIT,
     CLASS_FIXES,
     CORRECTED_LIMIT,
@@ -17,10 +17,9 @@ from modelserver.estimation.filter.receiver_monitor import (
     PLAIN_LIMIT,
     ReceiverMonitor,
 )
-from modelserver.estimation.findings import find_unusable
-from modelserver.estimation.fix_quality import evaluate_fix
-from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal
-from modelserver.estimation.settings import FixSettings
+from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.inputs import evaluate_fix
+from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal, find_unusable
 from modelserver.messages import (
     FixType,
     GpsSample,

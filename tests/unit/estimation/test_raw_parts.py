@@ -17,8 +17,8 @@ from support_localization import GEODESY, MOUNTS, START
 from modelserver.earth.geodesy import LocalFrame
 from modelserver.errors import UnknownFrameError
 from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
-from modelserver.estimation.fix_quality import evaluate_fix
-from modelserver.estimation.origin import OriginCapture
+from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.inputs import OriginCapture, evaluate_fix
 from modelserver.estimation.raw.localizer import (
     MAX_TRACK_FIXES,
     CourseResult,
@@ -35,7 +35,6 @@ from modelserver.estimation.raw.localizer import (
 )
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import Mounts
-from modelserver.estimation.settings import FixSettings
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader

@@ -13,21 +13,17 @@ from support_cart import BASE, IMU, SITE, WHEELS, model, some_nav
 from support_filter import ORIGIN, drive, simulation
 from support_restart import TO_A_STOP, skip_samples
 
-from modelserver.estimation.filter import step
-from modelserver.estimation.filter.dead_reckoning import DeadReckoning
+from modelserver.estimation.filter import localizer
 from modelserver.estimation.filter.eskf import Earth, NavState
 from modelserver.estimation.filter.fusion import get_steering_angle, split_sample
-from modelserver.estimation.filter.imu_monitor import ImuMonitor
+from modelserver.estimation.filter.hypothesis_bank import DeadReckoning
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.measurements import Innovation, MeasurementContext
 from modelserver.estimation.filter.measurements.wheels import WheelSpeed, are_wheels_stationary, estimate_turn_rate
+from modelserver.estimation.filter.sensor_monitors import ImuMonitor, StationaryDetector, SteeringAngle, WheelMonitor
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.filter.setup import Setup
-from modelserver.estimation.filter.state import Aligned, Common, FilterState, MotionConstraints
-from modelserver.estimation.filter.stationary_detector import StationaryDetector
-from modelserver.estimation.filter.wheel_monitor import SteeringAngle, WheelMonitor
-from modelserver.estimation.findings import find_unusable
-from modelserver.estimation.sensor_rig import Kinematics, SensorRig, SteeringSignal
+from modelserver.estimation.filter.state import Aligned, Common, FilterState, MotionConstraints, Setup
+from modelserver.estimation.sensor_rig import Kinematics, SensorRig, SteeringSignal, find_unusable
 from modelserver.messages import (
     Direction,
     Mode,
@@ -246,10 +242,10 @@ def create_status(utime: int, angle: float) -> VehicleStatusSample:
 
 def test_given_angles_that_are_stale_none_or_out_of_range_then_they_are_not_used():
     setup = Setup(cart(signal=SIGNAL), SETTINGS)
-    state: FilterState = step.start(Mode.FULL, None)
+    state: FilterState = localizer.start(Mode.FULL, None)
     for angle, reason in ((0.2, ""), (math.nan, "nan"), (0.9, "range"), (-0.71, "range")):
         (item,) = split_sample(setup, create_status(START_UTIME, angle))
-        state, decisions = step.step(setup, state, item)
+        state, decisions = localizer.step(setup, state, item)
         assert [each.reason for each in decisions] == ([reason] if reason else [])
         assert state.common.wheels.steering == SteeringAngle(START_UTIME, 0.2)
     assert split_sample(Setup(cart(), SETTINGS), create_status(START_UTIME, 0.2)) == []

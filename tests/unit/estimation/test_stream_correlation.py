@@ -11,7 +11,7 @@ import pytest
 from support_filter import GPS_TIMING, ORIGIN, RIG, rig, simulation
 
 from modelserver.estimation.filter.localizer import FilterLocalizer
-from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.filter.state import Setup
 from modelserver.estimation.filter.stream_correlation import MAX_LAG, STEP, WINDOW, StreamCorrelation
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.messages import FixType, GpsSample, ImuSample, Mode, Phase, SensorFinding, WheelsSample

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from modelserver.estimation.filter.wheel_monitor import WheelMonitor
+from modelserver.estimation.filter.sensor_monitors import WheelMonitor
 
 
 def compare(

@@ -12,7 +12,7 @@ from support_between import lookup_between
 from support_moving import BASE, DEEP, ENU, ODOM, SCAN, T0, UTM, S, estimate, joints_at, rover, truth, view
 
 from modelserver.core import CoreSettings, Instant, start, step
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import Localizer
 from modelserver.messages import (
     STALE_SENSORS,
     Estimate,

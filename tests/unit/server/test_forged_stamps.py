@@ -9,8 +9,8 @@ from support_attacks import FORGED, Attack, LoopRun
 from support_drive import CHANNELS, SimulatedDrive
 from support_faults import INERTIAL
 
-from modelserver.estimation.filter import timeline
-from modelserver.estimation.filter.clock_monitor import REPLAY_BURST, REPLAY_RATE
+from modelserver.estimation.filter import localizer
+from modelserver.estimation.inputs import REPLAY_BURST, REPLAY_RATE
 
 pytestmark = pytest.mark.slow
 
@@ -111,14 +111,14 @@ def test_given_forged_stamps_half_a_second_back_1000_times_a_second_then_little_
     """Each out-of-sequence measurement has all later ones fused again: unbounded, that exceeds the available time."""
     outcome = loop_run.outcome
     count = 0
-    fuse = timeline.step
+    fuse = localizer.step
 
     def counting(*arguments: Any) -> Any:
         nonlocal count
         count += 1
         return fuse(*arguments)
 
-    monkeypatch.setattr(timeline, "step", counting)
+    monkeypatch.setattr(localizer, "step", counting)
     loop_run.run(11.0, [Attack("RANGE", "stranger", (-0.5,), hz=1000.0, since=WARM_S)])
     assert count < 2.0 * REPLAY_RATE + REPLAY_BURST + 1000
     assert outcome.invalid(WARM_S) == []

@@ -12,7 +12,7 @@ from support_signing import KEY, envelope
 from support_wire import EXAMPLES
 
 import mslcm
-from modelserver.estimation.interface import LocalizerEvent
+from modelserver.estimation.history import LocalizerEvent
 from modelserver.messages import Rejected, Sample, SwitchMode
 from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock

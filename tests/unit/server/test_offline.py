@@ -11,7 +11,7 @@ from support_signing import envelope
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.errors import UnknownFrameError
-from modelserver.estimation.interface import LocalizerEvent
+from modelserver.estimation.history import LocalizerEvent
 from modelserver.geometry import ModelBuilder
 from modelserver.messages import (
     STALE_SENSORS,

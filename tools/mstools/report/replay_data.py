@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, ecef_from_geodetic
-from modelserver.estimation import fix_quality as gate
+from modelserver.estimation import inputs as gate
 from modelserver.estimation.filter.measurements.gnss import CORRELATED_ERROR, split_variance
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.interface import Localizer
+from modelserver.estimation.history import Localizer
 from modelserver.messages import (
     Decision,
     Event,

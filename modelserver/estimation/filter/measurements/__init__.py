@@ -4,14 +4,14 @@
 """
 
 from modelserver.estimation.filter.eskf import Innovation
-from modelserver.estimation.filter.measurements import aiding, gnss, imu_orientation, own, wheels
+from modelserver.estimation.filter.measurements import gnss, measurement, wheels
 from modelserver.estimation.filter.measurements.measurement import (
+    MEASUREMENT_TYPES,
     REGISTRY,
     Measurement,
     MeasurementContext,
     register,
 )
-from modelserver.estimation.filter.measurements.own import MEASUREMENT_TYPES
 
 __all__ = [
     "MEASUREMENT_TYPES",
@@ -19,10 +19,8 @@ __all__ = [
     "Innovation",
     "Measurement",
     "MeasurementContext",
-    "aiding",
     "gnss",
-    "imu_orientation",
-    "own",
+    "measurement",
     "register",
     "wheels",
 ]

@@ -21,8 +21,7 @@ from typing import ClassVar, Final, Self
 import numpy as np
 
 from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic
-from modelserver.estimation.filter.error_layout import ErrorState
-from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, Innovation
+from modelserver.estimation.filter.eskf import STANDARD_GRAVITY, ErrorState, Innovation
 from modelserver.estimation.filter.measurements.measurement import (
     MeasurementContext,
     compute_azimuth,
@@ -32,9 +31,8 @@ from modelserver.estimation.filter.measurements.measurement import (
     wrap_angle,
 )
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.findings import MIN_BASELINE
-from modelserver.estimation.fix_quality import AcceptedFix, evaluate_fix, range_error, reuse_last
-from modelserver.estimation.sensor_rig import SensorRig
+from modelserver.estimation.inputs import AcceptedFix, evaluate_fix, range_error, reuse_last
+from modelserver.estimation.sensor_rig import MIN_BASELINE, SensorRig
 from modelserver.messages import FixType, GpsSample
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Vector3
