@@ -44,7 +44,7 @@ from modelserver.errors import WireError, quote
 from modelserver.estimation.history import DeferredEstimate, History
 from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot
 from modelserver.geometry import names
-from modelserver.joints.history import NO_JOINTS, JointHistory
+from modelserver.joints import NO_JOINTS, JointHistory
 from modelserver.messages import (
     NAN,
     STALE_SENSORS,

@@ -22,7 +22,7 @@ from modelserver.errors import NotConnectedError
 from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.named_tuples import new_tuple
 from modelserver.query.answers import DeferredAnswer
 from modelserver.query.view import PlatformView

@@ -42,7 +42,7 @@ from modelserver.geometry.joint import Coordinates
 from modelserver.geometry.kinematic_path import KinematicPath, as_array
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import JointDrive
-from modelserver.joints.history import MAX_CLOCK_LEAD_S, NO_JOINTS, JointHistory
+from modelserver.joints import MAX_CLOCK_LEAD_S, NO_JOINTS, JointHistory
 from modelserver.joints.track import MAX_GAP_S, ROTATION_VECTOR_TYPES, JointTrack, Provenance, Reading, combine
 from modelserver.messages import (
     NAN,
