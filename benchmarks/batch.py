@@ -23,7 +23,7 @@ from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import (
     CHANNEL_OF,
     Estimate,

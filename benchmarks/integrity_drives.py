@@ -26,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from pyproj import Transformer
 
+from modelserver.earth import earth_rate, gravity
 from modelserver.earth.geodesy import Geodesy, origin_at
-from modelserver.earth.gravity import earth_rate, gravity
 from modelserver.estimation.sensor_rig import Kinematics, SensorRig
 from modelserver.geometry import ModelBuilder
 from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader, WheelSample, WheelsSample

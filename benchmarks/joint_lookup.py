@@ -22,7 +22,7 @@ from modelserver.estimation.history import History
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.query.view import PlatformView
 from modelserver.transforms.pose import Pose

@@ -12,7 +12,7 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Sigma
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, Origin, SensorHeader, VehicleMotion
 from modelserver.query.view import PlatformView
 from modelserver.transforms import so3

@@ -5,7 +5,7 @@ begin with `@`, what Python needs beyond that:
 
     struct:  @value NAME [tuple]       the value class: a frozen dataclass, or a NamedTuple
              @part                     only a part of other messages: no message of its own
-             @codec MODULE [value]     its codec is written by hand in modelserver.wire.MODULE; its value class as well
+             @codec fields [value]     its codec is written by hand in modelserver.wire.fields; its value class as well
              @answer NAME TEXT         of a reply: what is behind the header is a value of its own, None unless it is OK
              @order NAME ...           the order of the fields in the value, where it is another one
              @verify                   `wire.fields.verify_TYPE(value)` checks what concerns several fields
@@ -18,7 +18,7 @@ begin with `@`, what Python needs beyond that:
              @partial                  with @optional, of three numbers: None only where all are nan
              @none NUMBER              None in Python for this number
              @enum NAME [PREFIX]       a member of an enumeration, made of the constants above without their prefix
-             @flags NAME               a set of flags of `messages.flags`
+             @flags NAME               a set of flags of `messages.values`
              @check NAME [ARGUMENTS]   `wire.fields.check_NAME(value, field, ...)` on reading
              @check_all NAME           the same for an array as a whole
              @max NUMBER               of a count: more entries are malformed, and cannot be sent
@@ -698,8 +698,7 @@ def _values_module(body: str) -> str:
         "from __future__ import annotations\n\n"
         "from dataclasses import dataclass\nfrom enum import IntEnum\nfrom typing import NamedTuple\n\n"
         "from modelserver.errors import Status\n"
-        "from modelserver.messages.answers import PoseAnswer\n"
-        "from modelserver.messages.flags import MET, NAN, NO_FLAGS, VALID, Invalid, Quality, Unmet\n"
+        "from modelserver.messages.values import MET, NAN, NO_FLAGS, VALID, Invalid, PoseAnswer, Quality, Unmet\n"
         "from modelserver.transforms.pose import Pose\n"
         "from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3\n\n"
         f"\n{body}\n"
@@ -718,7 +717,7 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
     constants: list[str] = []
     functions: list[str] = []
     table: list[str] = []
-    of_module: dict[str, set[str]] = {}
+    by_hand: set[str] = set()
     for each in structs.values():
         if not each.value:
             continue
@@ -726,8 +725,7 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
         if each.answer is not None:
             names.add(each.answer.value)
         if each.codec:
-            by_hand = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip")} | {f"NO_{each.base.upper()}"}
-            of_module.setdefault(each.codec.partition(" ")[0], set()).update(by_hand)
+            by_hand |= {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip")} | {f"NO_{each.base.upper()}"}
         else:
             constants += codecs.write_constants(each)
             functions += [codecs.write_packer(each), codecs.write_unpacker(each)]
@@ -743,11 +741,7 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
     body = "\n\n\n".join(["\n".join(constants), *functions, "\n".join(["CODECS = (", *table, ")"])])
     used = set(_WORD.findall(body))
     here = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip") for each in structs.values()}
-    of_module["fields"] = {word for word in used if _HELPER.fullmatch(word)} - here
-    imports = "".join(
-        f"from modelserver.wire.{module} import {', '.join(sorted(wanted & used))}\n"
-        for module, wanted in sorted(of_module.items())
-    )
+    helpers = ({word for word in used if _HELPER.fullmatch(word)} - here) | (by_hand & used)
     numbers = "\n".join(f'    "{name}": bytes.fromhex("{fingerprints[name]}"),' for name in sorted(fingerprints))
     return (
         '"""Codec of the messages. Generated from lcmtypes/*.lcm by `make types`; do not edit."""\n\n'
@@ -756,6 +750,7 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
         "from modelserver.errors import Status\n"
         f"from modelserver.messages import {', '.join(sorted(names & used))}\n"
         "from modelserver.transforms.pose import Pose\n"
-        f"{imports}\nFINGERPRINTS: Final[Mapping[str, bytes]] = {{\n{numbers}\n}}\n"
+        f"from modelserver.wire.fields import {', '.join(sorted(helpers))}\n\n"
+        f"FINGERPRINTS: Final[Mapping[str, bytes]] = {{\n{numbers}\n}}\n"
         f'"""Of the wire types, as lcm-gen computes them."""\n\n{codecs.formats()}\n\n\n{body}\n'
     )

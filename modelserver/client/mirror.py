@@ -18,7 +18,8 @@ from typing import Any, Final, Self
 import lcm
 import numpy as np
 
-from modelserver.client.interface import (
+from modelserver.client.mirror_state import NEVER, Ages, MirrorReceiver, MirrorState
+from modelserver.client.remote import (
     NO_DEMAND,
     BatchQuery,
     PlatformClient,
@@ -27,7 +28,6 @@ from modelserver.client.interface import (
     concatenate,
     to_utime,
 )
-from modelserver.client.mirror_state import NEVER, Ages, MirrorReceiver, MirrorState
 from modelserver.errors import MalformedRequestError, NoPoseError, OutOfDateError, WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import CACHE_SIZE

@@ -21,7 +21,7 @@ Velocity: X_AB between two poses in Odom, `MIN_SPAN_US` to `MAX_SPAN_US` apart, 
 2018, eq. 145). Its sigma is half of the change that `ACCELERATION_SIGMA` makes in dt: the mean velocity is used for the
 end of the interval. Acceleration stays unknown.
 
-Extrapolation by dt: X <- X D with D = exp((v, w) dt), covariance by `covariance.compose` with Q = diag(s_p^2, s_a^2),
+Extrapolation by dt: X <- X D with D = exp((v, w) dt), covariance by `compose_covariance` with Q = diag(s_p^2, s_a^2),
 s_a = s_w dt + a_w dt^2 / 2, s_p = s_v dt + a_v dt^2 / 2 + |v| dt s_a / 3. The last term is the lateral drift from a
 heading error that grows as t^2. Protection levels become unknown (nan).
 
@@ -44,7 +44,7 @@ from modelserver.errors import WireError, quote
 from modelserver.estimation.history import DeferredEstimate, History
 from modelserver.formats.yaml_geometry import ModelSnapshot, decode_snapshot
 from modelserver.geometry import names
-from modelserver.joints.history import NO_JOINTS, JointHistory
+from modelserver.joints import NO_JOINTS, JointHistory
 from modelserver.messages import (
     NAN,
     STALE_SENSORS,
@@ -64,11 +64,10 @@ from modelserver.messages import (
     VehicleMotion,
 )
 from modelserver.query.view import PlatformView
-from modelserver.transforms import covariance as cov
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3, cross
-from modelserver.transforms.transformation import Transformation
+from modelserver.transforms.transformation import Transformation, compose_covariance
 from modelserver.wire.codec import SnapshotAssembler, decode
 
 MIN_SPAN_US: Final = 50_000
@@ -248,7 +247,7 @@ def _extrapolate(last: Estimate, utime: int, dt: float, is_stale: bool) -> Estim
     def inflate(X: Pose, numbers: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if numbers is None:
             return None
-        return tuple(cov.compose(X, np.array(numbers).reshape(6, 6), D, Q).ravel().tolist())
+        return tuple(compose_covariance(X, np.array(numbers).reshape(6, 6), D, Q).ravel().tolist())
 
     invalid = Invalid.STALE_GPS | Invalid.STALE_IMU if is_stale else VALID
     left = last.seconds_to_limit - dt

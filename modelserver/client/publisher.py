@@ -11,8 +11,7 @@ from typing import Final, Self, TypeVar
 
 import lcm
 
-from modelserver.client.interface import Time, to_utime
-from modelserver.client.remote import load_signer
+from modelserver.client.remote import Time, load_signer, to_utime
 from modelserver.messages import (
     NAN,
     Direction,

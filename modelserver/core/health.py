@@ -13,15 +13,16 @@ import math
 from collections.abc import Iterator, Sequence
 
 from modelserver import messages
-from modelserver.core.host_clock import Instant
-from modelserver.core.source_clocks import format_offset, is_clock_off
 from modelserver.core.state import (
     CHANGE_PERIOD_NS,
     CoreState,
     HealthConditions,
+    Instant,
     Outputs,
     SourceTraffic,
+    format_offset,
     get_silence_limit,
+    is_clock_off,
 )
 from modelserver.earth.geodesy import compute_geodetic
 from modelserver.estimation.filter.protection_levels import compute_longest_axis

@@ -16,9 +16,9 @@ from modelserver.errors import UnknownFrameError, find_nearest_names, find_sugge
 from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint, Mimic, coordinate_names
-from modelserver.transforms import covariance
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+from modelserver.transforms.transformation import make_covariance
 
 
 class ShapeKind(StrEnum):
@@ -128,7 +128,7 @@ class Sigma:
     @property
     def covariance(self) -> Array:
         """The diagonal covariance (6, 6)."""
-        return covariance.from_sigmas(self.position, self.rotation)
+        return make_covariance(self.position, self.rotation)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,10 @@ from modelserver.errors import quote
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
-from modelserver.transforms import covariance, so3
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+from modelserver.transforms.transformation import compose_covariance, invert_covariance
 
 MAX_ITERATIONS: Final = 100
 COLLINEAR: Final = 1e-3
@@ -78,7 +79,7 @@ def locate_on_body(model: Model, body: str, frame: str, avoid: str = "") -> tupl
     own = _get_covariance(start)
     if own is None or rest.covariance is None:
         return pose, None
-    return pose, covariance.compose(start.pose, own, rest.pose, rest.covariance)
+    return pose, compose_covariance(start.pose, own, rest.pose, rest.covariance)
 
 
 def _get_covariance(frame: BodyFrame) -> Array | None:
@@ -117,7 +118,7 @@ def place_constraint(model: Model, constraint: str, frame: str, target: str, pos
     X_MT = X_TM.pose.inverse()
     found: Array | None = None
     if X_FG.covariance is not None and X_TM.covariance is not None:
-        found = covariance.compose(X_FG.pose, X_FG.covariance, X_MT, covariance.invert(X_TM.pose, X_TM.covariance))
+        found = compose_covariance(X_FG.pose, X_FG.covariance, X_MT, invert_covariance(X_TM.pose, X_TM.covariance))
     if position_only:
         moved = part.pose @ X_J @ X_TM.pose
         pose = Pose(

@@ -33,9 +33,9 @@ from modelserver.geometry.joint import Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.transforms import chain, so3
 from modelserver.transforms.chain import ChainLink
-from modelserver.transforms.covariance import chi_square_survival
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
+from modelserver.transforms.transformation import chi_square_survival
 
 DEPTH_FIRST_VISITS = 1_000_000
 """Limit of a depth-first search, in frames: its cost grows exponentially with the loops of a model."""

@@ -6,9 +6,6 @@ NamedTuple, which costs a third of a dataclass; the rest are frozen dataclasses.
 of this package.
 """
 
-from modelserver.messages.answers import *
-from modelserver.messages.estimates import *
 from modelserver.messages.events import *
-from modelserver.messages.flags import *
 from modelserver.messages.generated import *
-from modelserver.messages.persistence import *
+from modelserver.messages.values import *

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.earth import Origin
-from modelserver.messages.answers import PoseAnswer, PoseBatch
-from modelserver.messages.flags import NAN
 from modelserver.messages.generated import (
     AbsolutePoseSample,
     Acknowledgement,
@@ -50,7 +48,7 @@ from modelserver.messages.generated import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.messages.persistence import PersistedState
+from modelserver.messages.values import NAN, PersistedState, PoseAnswer, PoseBatch
 
 Sample: TypeAlias = (
     GpsSample

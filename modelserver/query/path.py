@@ -21,7 +21,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.topology import Edge, EdgeKind
-from modelserver.joints.history import MAX_CLOCK_LEAD_S
+from modelserver.joints import MAX_CLOCK_LEAD_S
 from modelserver.joints.track import MAX_GAP_S, Provenance, Reading
 from modelserver.messages import (
     NAN,

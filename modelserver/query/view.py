@@ -38,11 +38,10 @@ from modelserver.errors import (
 from modelserver.estimation.history import History, Localizer, restamp
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates
-from modelserver.geometry.kinematic_path import KinematicPath
+from modelserver.geometry.kinematic_path import KinematicPath, as_array
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import JointDrive
-from modelserver.geometry.path_covariance import as_array
-from modelserver.joints.history import MAX_CLOCK_LEAD_S, NO_JOINTS, JointHistory
+from modelserver.joints import MAX_CLOCK_LEAD_S, NO_JOINTS, JointHistory
 from modelserver.joints.track import MAX_GAP_S, ROTATION_VECTOR_TYPES, JointTrack, Provenance, Reading, combine
 from modelserver.messages import (
     NAN,
@@ -56,10 +55,16 @@ from modelserver.messages import (
     Quality,
     TimeQuery,
 )
-from modelserver.transforms import covariance as cov
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
-from modelserver.transforms.transformation import Numbers, Transformation
+from modelserver.transforms.transformation import (
+    Numbers,
+    Transformation,
+    apply_lever_arm,
+    compose_covariance,
+    invert_covariance,
+    rotate_covariance,
+)
 
 T = TypeVar("T")
 
@@ -605,7 +610,7 @@ def _covariance(
     P = np.array(numbers).reshape(6, 6)
     if inverted:
         # the world's origin is at the end of a long lever arm
-        P = cov.rotate(X_WB.rotation.T, cov.apply_lever_arm(P, -X_WB.position))
+        P = rotate_covariance(X_WB.rotation.T, apply_lever_arm(P, -X_WB.position))
     if X_BF is None:
         return P
     Q = None if fixed is None else fixed.covariance
@@ -617,7 +622,7 @@ def _covariance(
             return None
         Q = as_array(of_path)
     if inverted:
-        return cov.compose(X_BF.inverse(), cov.invert(X_BF, Q), X_WB.inverse(), P)
+        return compose_covariance(X_BF.inverse(), invert_covariance(X_BF, Q), X_WB.inverse(), P)
     # the heading may be off by tens of degrees before the vehicle has moved
     R = X_WB.rotation
-    return cov.apply_lever_arm(P, R @ X_BF.position) + cov.rotate(R, Q)
+    return apply_lever_arm(P, R @ X_BF.position) + rotate_covariance(R, Q)

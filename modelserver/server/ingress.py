@@ -23,7 +23,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
-from modelserver.core import Instant, commands
+from modelserver.core import COMMANDS as SIGNED_KINDS
+from modelserver.core import Instant
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
 from modelserver.errors import WireError, quote
 from modelserver.messages import (
@@ -273,7 +274,7 @@ class PublisherConflictMonitor:
         return f"{who} publish on {subject} at once, and {done}{old}: stop one of them"
 
 
-COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in commands.COMMANDS}
+COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in SIGNED_KINDS}
 """Request types that must be signed, by channel."""
 
 MODE_TYPE: Final = "localization_mode_t"

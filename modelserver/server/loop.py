@@ -24,8 +24,7 @@ from typing import Any, Literal
 
 from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
-from modelserver.core import AllOutputs, CoreState, Instant
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import AllOutputs, CoreState, Instant, ModelLoaded
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import Model

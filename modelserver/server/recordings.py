@@ -16,7 +16,7 @@ from itertools import chain, islice
 from typing import Final, get_args
 
 from modelserver import messages
-from modelserver.core.source_clocks import SPREAD_S, format_offset
+from modelserver.core.state import SPREAD_S, format_offset
 from modelserver.server.clock import Clock
 from modelserver.server.ingress import peek_sample_id
 from modelserver.wire.codec import fingerprint_of, get_type_name, restamp

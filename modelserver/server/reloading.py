@@ -20,8 +20,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from modelserver import errors
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.core import CoreState
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import CoreState, ModelLoaded
 from modelserver.geometry import Model
 from modelserver.geometry.difference import describe_changes
 from modelserver.messages import LoadModel

@@ -30,8 +30,7 @@ from modelserver.errors import quote
 from modelserver.server.log import escape_text
 
 if TYPE_CHECKING:
-    from modelserver.core import CoreState, Instant
-    from modelserver.core.commands import ModelLoaded
+    from modelserver.core import CoreState, Instant, ModelLoaded
     from modelserver.server.clock import Clock
 
 MAX_STATUS_LENGTH: Final = 400

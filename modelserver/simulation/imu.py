@@ -22,7 +22,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from modelserver.earth import gravity as earth
+from modelserver import earth
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation.noise import (

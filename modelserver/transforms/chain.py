@@ -29,10 +29,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.transforms import so3
-from modelserver.transforms.covariance import large_angle_lever_arm, large_angle_lever_arm_batch
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.pose_array import PoseArray, to_matrices
 from modelserver.transforms.so3 import Array
+from modelserver.transforms.transformation import large_angle_lever_arm, large_angle_lever_arm_batch
 
 LARGE_ANGLE: Final = "large_angle"
 """Last element of the source of a large-angle link's additional covariance."""

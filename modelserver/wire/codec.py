@@ -13,10 +13,19 @@ from typing import Any, Final
 from modelserver.errors import Status, WireError
 from modelserver.messages import Policy, PoseAnswer, PoseDemand, Reply, RequestHeader, SnapshotPart, TransformReply
 from modelserver.wire.channels import CHANNELS, ChannelUse
-from modelserver.wire.fields import LENGTH, MAX_UTIME, Codec, check_end, pack_text, read_text
+from modelserver.wire.fields import (
+    LENGTH,
+    MAX_UTIME,
+    PLAIN,
+    UTIME,
+    Codec,
+    check_end,
+    pack_text,
+    read_text,
+    read_transform_numbers,
+)
 from modelserver.wire.generated import CODECS, FINGERPRINTS
 from modelserver.wire.journal import MAGIC
-from modelserver.wire.poses import PLAIN, UTIME, read_transform_numbers
 
 _BY_TYPE_NAME: Final[Mapping[str, Codec]] = {codec.type_name: codec for codec in CODECS}
 _BY_VALUE: Final[Mapping[type, Codec]] = {codec.value: codec for codec in reversed(CODECS)}

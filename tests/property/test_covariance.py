@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modelserver.transforms import Pose, Transformation, covariance
+from modelserver.transforms import Pose, Transformation
+from modelserver.transforms.transformation import (
+    compose_covariance,
+    find_covariance_problem,
+    invert_covariance,
+    make_covariance,
+    rotate_covariance,
+)
 
 SAMPLES = 40_000
 SMALL = 1e-4
@@ -56,7 +63,7 @@ def test_compose_agrees_with_monte_carlo(where):
     p_AB, R_AB = samples_of(X_AB, cov_AB, 3)
     p_BC, R_BC = samples_of(X_BC, cov_BC, 4)
     sampled = covariance_of(X_AB @ X_BC, p_AB + R_AB.apply(p_BC), R_AB * R_BC)
-    assert_alike(covariance.compose(X_AB, cov_AB, X_BC, cov_BC), sampled)
+    assert_alike(compose_covariance(X_AB, cov_AB, X_BC, cov_BC), sampled)
 
 
 @pytest.mark.parametrize("where", PLACES)
@@ -65,7 +72,7 @@ def test_invert_agrees_with_monte_carlo(where):
     cov_AB = some_covariance(5)
     p, R = samples_of(X_AB, cov_AB, 6)
     sampled = covariance_of(X_AB.inverse(), -R.inv().apply(p), R.inv())
-    assert_alike(covariance.invert(X_AB, cov_AB), sampled)
+    assert_alike(invert_covariance(X_AB, cov_AB), sampled)
 
 
 @pytest.mark.parametrize("where", PLACES)
@@ -73,31 +80,31 @@ def test_laws_that_hold_exactly(where):
     X_AB, X_BC = PLACES[where]
     cov_AB, cov_BC = some_covariance(7), some_covariance(8)
     tight = {"rtol": 1e-9, "atol": 1e-18}
-    twice = covariance.invert(X_AB.inverse(), covariance.invert(X_AB, cov_AB))
+    twice = invert_covariance(X_AB.inverse(), invert_covariance(X_AB, cov_AB))
     np.testing.assert_allclose(twice, cov_AB, **tight)
     # the inverse of a chain is the chain of the inverses
-    forward = covariance.invert(X_AB @ X_BC, covariance.compose(X_AB, cov_AB, X_BC, cov_BC))
-    backward = covariance.compose(
-        X_BC.inverse(), covariance.invert(X_BC, cov_BC), X_AB.inverse(), covariance.invert(X_AB, cov_AB)
+    forward = invert_covariance(X_AB @ X_BC, compose_covariance(X_AB, cov_AB, X_BC, cov_BC))
+    backward = compose_covariance(
+        X_BC.inverse(), invert_covariance(X_BC, cov_BC), X_AB.inverse(), invert_covariance(X_AB, cov_AB)
     )
     np.testing.assert_allclose(forward, backward, **tight)
     # a chain of three may be taken in either order
     X_CD, cov_CD = Pose.from_rpy((1, 2, 3), 0.1, 0.2, 0.3), some_covariance(9)
-    left = covariance.compose(X_AB @ X_BC, covariance.compose(X_AB, cov_AB, X_BC, cov_BC), X_CD, cov_CD)
-    right = covariance.compose(X_AB, cov_AB, X_BC @ X_CD, covariance.compose(X_BC, cov_BC, X_CD, cov_CD))
+    left = compose_covariance(X_AB @ X_BC, compose_covariance(X_AB, cov_AB, X_BC, cov_BC), X_CD, cov_CD)
+    right = compose_covariance(X_AB, cov_AB, X_BC @ X_CD, compose_covariance(X_BC, cov_BC, X_CD, cov_CD))
     np.testing.assert_allclose(left, right, **tight)
     # an exact right side adds nothing but the lever arm
-    np.testing.assert_allclose(covariance.compose(X_AB, cov_AB, Pose.identity(), np.zeros((6, 6))), cov_AB, **tight)
+    np.testing.assert_allclose(compose_covariance(X_AB, cov_AB, Pose.identity(), np.zeros((6, 6))), cov_AB, **tight)
     # turning the axes is what an exact rotation on the left does
     turn = Pose((0, 0, 0), X_AB.wxyz)
     np.testing.assert_allclose(
-        covariance.rotate(turn.rotation, cov_BC), covariance.compose(turn, np.zeros((6, 6)), X_BC, cov_BC), **tight
+        rotate_covariance(turn.rotation, cov_BC), compose_covariance(turn, np.zeros((6, 6)), X_BC, cov_BC), **tight
     )
 
 
 def test_a_lever_arm_turns_a_heading_error_into_a_sideways_error():
-    heading = covariance.from_sigmas((0.0, 0.0, 0.0), (0.0, 0.0, 0.01))
-    found = covariance.compose(Pose.identity(), heading, Pose((10.0, 0.0, 0.0)), np.zeros((6, 6)))
+    heading = make_covariance((0.0, 0.0, 0.0), (0.0, 0.0, 0.01))
+    found = compose_covariance(Pose.identity(), heading, Pose((10.0, 0.0, 0.0)), np.zeros((6, 6)))
     assert np.sqrt(np.diag(found)) == pytest.approx([0, 0.1, 0, 0, 0, 0.01])
     assert found[1, 5] == pytest.approx(0.1 * 0.01)
 
@@ -106,15 +113,15 @@ def test_transformations_carry_it_along():
     X_AB, X_BC = PLACES["ordinary"]
     cov_AB, cov_BC = some_covariance(1), some_covariance(2)
     ab, bc = Transformation("b:b", "a:a", X_AB, cov_AB), Transformation("c:c", "b:b", X_BC, cov_BC)
-    np.testing.assert_allclose((ab @ bc).covariance, covariance.compose(X_AB, cov_AB, X_BC, cov_BC))
-    np.testing.assert_allclose(ab.inverse().covariance, covariance.invert(X_AB, cov_AB))
+    np.testing.assert_allclose((ab @ bc).covariance, compose_covariance(X_AB, cov_AB, X_BC, cov_BC))
+    np.testing.assert_allclose(ab.inverse().covariance, invert_covariance(X_AB, cov_AB))
     assert (ab @ Transformation("c:c", "b:b", X_BC)).covariance is None
     assert Transformation("c:c", "b:b", X_BC).inverse().covariance is None
 
 
 def test_given_matrices_that_are_no_covariance_then_it_reports_why():
     good = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.0])
-    assert covariance.find_problem(good) == ""
+    assert find_covariance_problem(good) == ""
     for row, column, value, message in (
         (0, 0, np.nan, "not finite"),
         (1, 2, np.inf, "not finite"),
@@ -123,4 +130,4 @@ def test_given_matrices_that_are_no_covariance_then_it_reports_why():
     ):
         bad = good.copy()
         bad[row, column] = value
-        assert message in covariance.find_problem(bad)
+        assert message in find_covariance_problem(bad)

@@ -14,8 +14,9 @@ from support_joints import positions_of
 from support_spatial import rotations
 
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
-from modelserver.transforms import Pose, chain, covariance
+from modelserver.transforms import Pose, chain
 from modelserver.transforms.chain import ChainLink
+from modelserver.transforms.transformation import compose_covariance, invert_covariance
 
 
 def product_of(route, positions):
@@ -74,8 +75,8 @@ def test_given_a_chain_then_its_covariance_is_that_of_composing_and_inverting_st
     for link in some:
         Y, more = link.X_FT, link.factor @ link.factor.T
         if not link.forward:
-            Y, more = Y.inverse(), covariance.invert(Y, more)
-        X, cov = X @ Y, covariance.compose(X, cov, Y, more)
+            Y, more = Y.inverse(), invert_covariance(Y, more)
+        X, cov = X @ Y, compose_covariance(X, cov, Y, more)
     np.testing.assert_allclose(chain.covariance(some), cov, rtol=1e-9, atol=1e-15)
     assert chain.compose(some).is_close(X, 1e-12, 1e-12)
 

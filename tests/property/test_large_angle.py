@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from modelserver.transforms.covariance import large_angle_lever_arm, large_angle_lever_arm_batch
 from modelserver.transforms.so3 import Array
+from modelserver.transforms.transformation import large_angle_lever_arm, large_angle_lever_arm_batch
 
 
 def moments(root: Array, arm: Array) -> tuple[Array, Array]:

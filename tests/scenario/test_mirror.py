@@ -18,7 +18,7 @@ from support_lcm import MODELSERVER, TIMEOUT_S, reserved_url, wait_until
 from support_samples import GEOMETRY, VEHICLE, gps, imu
 
 import modelserver as ms
-from modelserver.client.interface import PlatformClient
+from modelserver.client.remote import PlatformClient
 from modelserver.messages import JointSample, JointsSample, Quality, SensorHeader
 from modelserver.wire.codec import encode
 

@@ -12,8 +12,7 @@ from support_moving import SCAN, joints_at, rover
 from support_moving import T0 as ROVER_T0
 from support_samples import ME, ORIGIN, START, ScriptedLocalizer, cart, imu, instant_at, make_decision, start_core
 
-from modelserver.core import CoreSettings, CoreState, Instant, start, step
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import CoreSettings, CoreState, Instant, ModelLoaded, start, step
 from modelserver.errors import Status
 from modelserver.estimation.raw.localizer import RawLocalizer
 from modelserver.estimation.sensor_rig import Mounts

@@ -25,8 +25,8 @@ from benchmarks.integrity_drives import (
     compute_truth,
     measure,
 )
+from modelserver.earth import earth_rate, gravity
 from modelserver.earth.geodesy import Geodesy
-from modelserver.earth.gravity import earth_rate, gravity
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
 from modelserver.transforms import so3
 

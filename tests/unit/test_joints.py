@@ -16,7 +16,7 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
-from modelserver.joints.history import MAX_CLOCK_LEAD_S, MAX_PLAUSIBLE, MAX_SUGGESTIONS, JointHistory
+from modelserver.joints import MAX_CLOCK_LEAD_S, MAX_PLAUSIBLE, MAX_SUGGESTIONS, JointHistory
 from modelserver.joints.track import (
     BLOCK_SIZE,
     MAX_GAP_S,
@@ -519,9 +519,7 @@ def test_given_a_thousand_unknown_joints_in_one_message_then_the_nearest_name_of
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     searched: list[str] = []
-    monkeypatch.setattr(
-        "modelserver.joints.history.find_nearest_names", lambda name, known: searched.append(name) or []
-    )
+    monkeypatch.setattr("modelserver.joints.find_nearest_names", lambda name, known: searched.append(name) or [])
     unknown = [JointSample(f"x{n}", 0.1) for n in range(1024)]
     _, rejected = JointHistory(constraints(), 60.0).update(sample(1.0, *unknown), at(1.0))
     assert len(rejected) == 1024

@@ -9,7 +9,7 @@ from support_mirror import feed_messages, joints, parts, snapshot
 from support_moving import BASE, SCAN, T0, S, joints_at, rover
 
 from modelserver.client.mirror_state import NEVER
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, SensorHeader, TimeQuery
 from modelserver.wire.codec import encode
 

@@ -41,15 +41,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from modelserver.earth import gravity as earth_model
+from modelserver import earth as earth_model
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filterpy_import import import_kalman_filter
 from modelserver.estimation.inputs import EARTH_RADIUS
 from modelserver.messages import Decision, Verdict
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
-from modelserver.transforms.covariance import chi_square_survival
 from modelserver.transforms.so3 import Array, Quaternion, Vector3, cross
+from modelserver.transforms.transformation import chi_square_survival
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCELEROMETER_BIAS = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
 """Indices of the strapdown states: errors along the axes of N, biases along the body axes."""

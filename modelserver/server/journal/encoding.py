@@ -42,8 +42,7 @@ import msgspec
 import numpy as np
 
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.core import CoreState
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import CoreState, ModelLoaded
 from modelserver.errors import RecordingError
 from modelserver.estimation.filter.measurements import REGISTRY
 from modelserver.messages import Event

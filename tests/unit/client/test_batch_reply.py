@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.client.interface import BatchReplyAssembler, concatenate
+from modelserver.client.remote import BatchReplyAssembler, concatenate
 from modelserver.errors import WireError
 from modelserver.messages import GetTransformations, PoseBatchReply, RequestHeader
 from modelserver.query.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer

@@ -13,10 +13,9 @@ from support_mirror import FedPlatform, drive, feed_messages, joints, parts, pos
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, estimate, truth
 
 import modelserver as ms
-from modelserver.client.interface import PlatformClient
 from modelserver.client.mirror import LocalPlatform, PlatformMirror
 from modelserver.client.mirror_state import MirrorReceiver
-from modelserver.client.remote import Platform
+from modelserver.client.remote import Platform, PlatformClient
 from modelserver.messages import MAX_REQUEST_INSTANTS, Policy, PoseDemand, TimeQuery, Unmet
 from modelserver.query.answers import check_demand
 

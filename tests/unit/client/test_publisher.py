@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from support_lcm import Listener
 
 import modelserver as ms
-from modelserver.client.interface import check_batch, to_utime
-from modelserver.client.remote import MAX_WAITING, PoseStream
+from modelserver.client.remote import MAX_WAITING, PoseStream, check_batch, to_utime
 from modelserver.earth.geodesy import origin_at
 from modelserver.errors import MalformedRequestError
 from modelserver.messages import Direction, FixType, PoseAnswer

@@ -11,7 +11,7 @@ from support_moving import BASE, ODOM, SCAN, T0, UTM, S, rover, truth, view
 from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader, TimeQuery
 from modelserver.query.batch import lookup_batch
 from modelserver.query.path import compute_motion

@@ -13,7 +13,7 @@ from support_moving import BASE, DEEP, ENU, ODOM, ORIGIN, SCAN, T0, UTM, S, esti
 
 from modelserver.errors import LimitError, NoPoseError, QueryError, Status, UnknownFrameError
 from modelserver.estimation.history import History
-from modelserver.joints.history import NO_JOINTS, JointHistory
+from modelserver.joints import NO_JOINTS, JointHistory
 from modelserver.messages import MAX_REQUEST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
 from modelserver.query.batch import lookup_batch
 from modelserver.query.view import PlatformView, complete

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, view
 
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import JointSample, JointsSample, Policy, SensorHeader, TimeQuery
 from modelserver.query.path import explain
 from modelserver.query.view import PlatformView

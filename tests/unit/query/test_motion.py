@@ -14,7 +14,7 @@ from modelserver.errors import NoPoseError, UnknownFrameError
 from modelserver.estimation.history import History
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
 from modelserver.query.path import compute_motion
 from modelserver.query.view import PlatformView

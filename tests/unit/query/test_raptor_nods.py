@@ -10,7 +10,7 @@ from support_moving import NOD, NOD_RATE, T0, UTM, S, estimate, vehicle
 
 from modelserver.estimation.history import History
 from modelserver.formats import load_model
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.query.view import PlatformView
 from modelserver.transforms.pose import Pose

@@ -12,7 +12,7 @@ from support_samples import GEOMETRY, START, VEHICLE, ScriptedLocalizer, instant
 
 from modelserver import core
 from modelserver.config.vehicle_file import load_config
-from modelserver.core.samples import report_start
+from modelserver.core import report_start
 from modelserver.estimation.filter.warm_start import check_restored, format_age, get_setup_hash
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import (

@@ -12,8 +12,7 @@ from support_journal import OPEN, SMALL, START, JournalRig
 from support_samples import GEOMETRY, ME, drive, imu
 
 from modelserver import core
-from modelserver.core import CoreState, Instant
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import CoreState, Instant, ModelLoaded
 from modelserver.errors import RecordingError
 from modelserver.messages import (
     Denied,

@@ -52,7 +52,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.log import LOG_PERIOD_S, MAX_CAUSES, RateLimitedLog
 from modelserver.server.loop import MAX_SAMPLES_NS, MIN_SAMPLES_NS, SAMPLES_PER_PASS, Hooks, Loop, LoopSettings
-from modelserver.server.scheduler import REJECTIONS_PER_CLIENT
+from modelserver.server.requests import REJECTIONS_PER_CLIENT
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REQUESTS

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.messages import GetBodyList, RequestHeader
-from modelserver.server.requests import client_of
-from modelserver.server.scheduler import (
+from modelserver.server.requests import (
     CLIENT_IDLE_NS,
     DEFERRED_PER_CLIENT,
     DEFERRED_TOTAL,
@@ -24,6 +23,7 @@ from modelserver.server.scheduler import (
     DeferredRequest,
     QueuedRequest,
     RequestScheduler,
+    client_of,
 )
 from modelserver.wire.fields import pack_text
 

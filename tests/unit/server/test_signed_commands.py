@@ -8,7 +8,7 @@ import pytest
 from support_samples import ME, START, ScriptedLocalizer, imu, start_core
 from support_signing import KEY, envelope
 
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import ModelLoaded
 from modelserver.errors import Status
 from modelserver.messages import (
     CHANNEL_OF,

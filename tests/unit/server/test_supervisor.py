@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from support_samples import START, ScriptedLocalizer, cart, gps, imu, start_core
 
-from modelserver.core import CoreState
-from modelserver.core.commands import ModelLoaded
+from modelserver.core import CoreState, ModelLoaded
 from modelserver.messages import Estimate, HealthWarning, Invalid, LoadModel, ReloadModel, RequestHeader
 from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock

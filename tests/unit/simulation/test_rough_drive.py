@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rough_simulation import SideSlip
-from modelserver.earth import gravity as earth
+from modelserver import earth
 from modelserver.earth.geodesy import Geodesy
 from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
 from modelserver.transforms import so3

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from modelserver.earth import gravity as earth
+from modelserver import earth
 from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.messages import (

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.messages import (
     EdgeReport,
     Explanation,

@@ -16,7 +16,7 @@ from support_recordings import write_log
 
 from modelserver.formats import save_model
 from modelserver.geometry.parts import Sigma
-from modelserver.joints.history import JointHistory
+from modelserver.joints import JointHistory
 from modelserver.transforms import Pose
 from modelserver.wire.codec import encode
 from mstools.cli import main

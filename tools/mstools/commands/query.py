@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from modelserver.client.interface import NO_DEMAND, FrameClient, R
+from modelserver.client.remote import NO_DEMAND, FrameClient, R
 from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest_names, quote
 from modelserver.geometry import names
 from modelserver.messages import (

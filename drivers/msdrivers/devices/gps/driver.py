@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
-from modelserver.messages.flags import NAN
+from modelserver.messages.values import NAN
 from modelserver.transforms.so3 import Vector3
 from msdrivers.devices.gps import (
     DAY,

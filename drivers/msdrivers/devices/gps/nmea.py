@@ -29,7 +29,7 @@ from typing import Any
 import pynmea2
 
 from modelserver.messages import FixType
-from modelserver.messages.flags import NAN
+from modelserver.messages.values import NAN
 from msdrivers.devices.gps import DAY, SECOND
 from msdrivers.devices.stream import NO_FRAME, ParsedFrame, RejectedFrame
 
