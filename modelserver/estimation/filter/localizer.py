@@ -61,7 +61,6 @@ from modelserver.estimation.filter.stream_correlation import StreamCorrelation
 from modelserver.estimation.history import LocalizerEvent
 from modelserver.estimation.inputs import IMU_RANK, ClockMonitor, StampVerdict
 from modelserver.messages import (
-    STALE_SENSORS,
     Decision,
     Estimate,
     ImuSample,
@@ -311,7 +310,7 @@ class FilterLocalizer(NamedTuple):
 
     def find_stale_sensors(self, utime: int) -> Invalid:
         """Return the bits of STALE_SENSORS of an estimate at `utime`, which is not before the newest sample."""
-        return output.find_invalid(self.setup, self.head, utime) & STALE_SENSORS
+        return output.find_stale_sensors(self.setup, self.head, utime)
 
     def summary(self, utime: int) -> LocalizerSummary:
         """Return mode and phase, whether the vehicle is stationary, when a fix was last used, and the findings."""

@@ -299,22 +299,34 @@ _to_quality = lru_cache(maxsize=256)(Quality)
 """The flags of a number, at a fraction of the cost of calling the enumeration."""
 
 
-def find_invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
-    """Return the reasons against an estimate at `utime`, except for the risk of its limits."""
-    return _to_invalid(_find_invalid_bits(setup, state, utime))
+def find_stale_sensors(setup: Setup, state: FilterState, utime: int) -> Invalid:
+    """Return the bits of STALE_SENSORS of an estimate at `utime`."""
+    return _to_invalid(_find_stale_bits(setup, state, utime))
 
 
-def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
-    """Return `find_invalid` as a number, for `estimate` to add to: combining flags costs more than all else here."""
-    settings, common = setup.settings, state.common
-    invalid = 0
+def _find_stale_bits(setup: Setup, state: FilterState, utime: int) -> int:
+    settings, mode, stale = setup.settings, state.common.mode, 0
     if isinstance(state, Aligned):
         gnss = state.gnss
         excludes = state.bank is not None and state.bank.excludes_fixes
-        is_stale = gnss.used_utime and not excludes and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
-        if is_stale and setup.uses_gnss(common.mode):
-            invalid |= 32  # STALE_GPS
-    else:
+        is_old = gnss.used_utime and not excludes and (utime - gnss.used_utime) * 1e-6 > settings.gps_timeout
+        if is_old and setup.uses_gnss(mode):
+            stale |= 32  # STALE_GPS
+    nav_utime = 0 if isinstance(state, Leveling) else state.nav.utime
+    used_utime = state.imu.used_utime if setup.uses_imu(mode) else nav_utime
+    if used_utime and (utime - used_utime) * 1e-6 > settings.imu_timeout:
+        stale |= 64  # STALE_IMU
+    return stale
+
+
+def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
+    """Return the reasons against an estimate at `utime`, except for the risk of its limits.
+
+    As a number, for `estimate` to add to: combining flags costs more than all else here.
+    """
+    settings, common = setup.settings, state.common
+    invalid = _find_stale_bits(setup, state, utime)
+    if not isinstance(state, Aligned):
         invalid |= 8  # NOT_MOVED_YET
         if isinstance(state, Leveling) or state.alignment.last_fix is None:
             invalid |= 1  # NO_FIX
@@ -322,12 +334,8 @@ def _find_invalid_bits(setup: Setup, state: FilterState, utime: int) -> int:
         imu_utime = state.imu.used_utime
         if not imu_utime:
             invalid |= 2  # NO_IMU
-        elif (utime - imu_utime) * 1e-6 > settings.imu_timeout:
-            invalid |= 64  # STALE_IMU
         elif (imu_utime - utime) * 1e-6 > settings.imu_timeout:
             invalid |= 512  # CLOCK_STEPPED
-    elif not isinstance(state, Leveling) and (utime - state.nav.utime) * 1e-6 > settings.imu_timeout:
-        invalid |= 64  # STALE_IMU
     if common.geodesy is None:
         invalid |= 4  # NO_ORIGIN
     if common.is_clock_stepped:
@@ -417,7 +425,7 @@ def get_navigation_state(setup: Setup, state: FilterState) -> NavigationState | 
         common.mode,
         state.phase,
         state.is_stationary,
-        find_invalid(setup, state, nav.utime),
+        _to_invalid(_find_invalid_bits(setup, state, nav.utime)),
         common.epoch,
         latitude,
         longitude,

@@ -348,7 +348,7 @@ def test_given_no_fixes_for_long_then_they_are_stale_only_on_a_vehicle_with_an_a
     state = leveling.start_from(setup, first, last, replace(last, utime=T0 - 100_000))
     assert state is not None
     late = T0 + round((setup.settings.gps_timeout + 1.0) * 1e6)
-    assert output.find_invalid(setup, state, late) & Invalid.STALE_GPS == expected
+    assert output.find_stale_sensors(setup, state, late) & Invalid.STALE_GPS == expected
 
 
 # --- heading alignment --------------------------------------------------------------------------------------
