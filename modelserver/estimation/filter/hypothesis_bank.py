@@ -273,7 +273,7 @@ it alone makes none invalid. And after an outage: gyro and wheels fail at a tent
 REFUTED: Final = 0.01
 """Share of its first weight at which such a hypothesis is refuted: one fix leaves VOID_SHARE, so more than one did."""
 
-TURNS: Final = 8
+TURNS, QUARTER = 8, 2
 """Directions in which dead reckoning that was lost may go on: 22.5 degrees either way, equation (3) is a line."""
 
 OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
@@ -381,7 +381,7 @@ class HypothesisBank(NamedTuple):
         """Return the bank beside the hypotheses that dead reckoning was lost, and that fixes which are off are right.
 
         The vehicle is where `fix` is, in one of TURNS directions. `begins`: whether the fix is the first one that is
-        off; after an outage any direction may be right, else one that differs by more than fixes which drift show.
+        off; after an outage any direction may be right, else one that differs by a quarter turn or more.
         """
         is_lost = begins and self.may_be_lost
         share = LOST_AFTER_OUTAGE if is_lost else LOST_SHARE
@@ -389,7 +389,9 @@ class HypothesisBank(NamedTuple):
         # those that fixes have refuted begin again: the vehicle may turn unmeasured later
         if self.weights[own].sum() > (share if begins else REFUTED * share):
             return self
-        turns = np.arange(0 if is_lost else 1, TURNS) * math.tau / TURNS
+        # fixes that were dragged away and then stay look like a lost place under nearly the same heading
+        first = 0 if is_lost else QUARTER
+        turns = np.arange(first, TURNS - max(first - 1, 0)) * math.tau / TURNS
         n = len(turns)
         means = np.repeat(self.means[self.published][None], n, axis=0)
         means[:, HEADING] += turns
