@@ -36,7 +36,7 @@ from mstools.launch.drive import make_simulation
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PRODUCT: Final = tuple(str(ROOT / name) + os.sep for name in ("modelserver", "drivers"))
-DOUBLES: Final = ("links/fake.py", "server/fake_bus.py", "server/bus.py", "server/clock.py")
+DOUBLES: Final = ("links/fake.py", "server/bus.py", "server/clock.py")
 """Ends of the paths of link, bus and clocks, whose doubles run here."""
 
 START: Final = 1_700_000_000_000_000
@@ -45,6 +45,9 @@ SECONDS: Final = 25.0
 
 TRACED_S: Final = 2.0
 """End of the drive in which fixes are traced: some of them are not beside the report of each second."""
+
+MOST_PASSES: Final = 10_000
+"""Passes of the loop within which a sample or a query has been passed on: a hundred times what they take."""
 
 CHANNELS: Final = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}
 FIX_FILES, QUERY_FILES = 40, 20
@@ -117,20 +120,26 @@ class Rig:
         while self.line.incoming:
             self.runner.run_once()
 
+    def run_until(self, is_done: Callable[[], bool]) -> None:
+        """Run the loop until something is done. Raises RuntimeError if it is not after MOST_PASSES."""
+        for _ in range(MOST_PASSES):
+            if is_done():
+                return
+            self.loop.run_once()
+        raise RuntimeError(f"not done after {MOST_PASSES} passes of the loop; its log says why")
+
     def pass_fix(self) -> None:
         """Pass a fix from the line to POSE."""
         self.read_line()
         self.bus.published.clear()
-        while not self.bus.get_published("POSE"):
-            self.loop.run_once()
+        self.run_until(lambda: bool(self.bus.get_published("POSE")))
 
     def drive(self) -> Way:
         """Drive, and return the shortest way of a fix at the end."""
         ways = []
         run = make_simulation(self.config, START, SECONDS, sensors=tuple(CHANNELS))
         for event in run.events(SECONDS):
-            while event.header.host_utime > self.clock.utime():
-                self.loop.run_once()
+            self.run_until(lambda utime=event.header.host_utime: self.clock.utime() >= utime)
             if not isinstance(event, GpsSample):
                 self.publish(event)
                 continue
@@ -158,8 +167,7 @@ class ClientBus:
         bus = self.rig.bus
         bus.published.clear()
         bus.requests.put(channel, data, ("127.0.0.1", 1))
-        while not bus.get_published(self._channel):
-            self.rig.loop.run_once()
+        self.rig.run_until(lambda: bool(bus.get_published(self._channel)))
         self._replies += bus.get_published(self._channel)
         os.write(self._wake, b"1")
 
