@@ -26,7 +26,7 @@ _DEPTH_FIX = "look for brackets that are not closed"
 MAX_NODES = 4_000_000
 """Nodes, aliases expanded; 10,000 frames have about 130,000."""
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class NodeKind(Enum):
@@ -114,7 +114,7 @@ class _NodeBuilder:
         root: YamlNode | None = None
         open_nodes: list[tuple[YamlNode, str | None, YamlNode | None]] = []
         """Open containers: node, its anchor, and for a mapping the key whose value is next."""
-        events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
+        events: Iterator[Any] = yaml.parse(text, Loader=LOADER)
         for event in events:
             kind, line = type(event), event.start_mark.line + 1
             if kind is yaml.ScalarEvent:

@@ -265,7 +265,7 @@ def _list_installed() -> frozenset[str]:
     return frozenset(each.__module__.partition(".")[0] for each in REGISTRY.values()) - {"modelserver"}
 
 
-class _Reader:
+class _StateReader:
     """Reads the value of a stream. `weight` is the number of values so far, references counted in full."""
 
     def __init__(self, data: bytes):
@@ -446,7 +446,7 @@ def encode_value(value: object, pause: Callable[[], object] = lambda: None, is_d
 
 def decode_value(data: bytes) -> Any:
     """Decode a value. Raises RecordingError for invalid data."""
-    source = _Reader(data)
+    source = _StateReader(data)
     try:
         value = source.read()
         source.close()

@@ -16,13 +16,11 @@ from typing import Any, NamedTuple
 import yaml
 
 from modelserver.errors import ModelServerError, SyntaxProblemError, quote
-from modelserver.yaml_tree import parse_yaml
+from modelserver.yaml_tree import LOADER, parse_yaml
 
 KeyPath = Sequence[str]
 MAX_SPACES = 1000
 """Spaces before a colon that are looked through."""
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class EditError(ModelServerError):
@@ -62,7 +60,7 @@ class YamlText:
             parse_yaml(content)
         except SyntaxProblemError as error:
             raise EditError(f"line {error.line}: {error}; {error.fix}") from None
-        self._root = yaml.compose(text, Loader=_LOADER)
+        self._root = yaml.compose(text, Loader=LOADER)
         self._newline = "\r\n" if "\r\n" in text else "\n"
         uses = Counter(id(node) for node in _walk(self._root))
         self._shared = {node for node, count in uses.items() if count > 1}
