@@ -41,7 +41,7 @@ from modelserver.earth.geodesy import (
     geodetic_from_ecef,
     origin_at,
 )
-from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.filter.settings import SharedSettings
 from modelserver.messages import FixType, GpsSample, Origin
 from modelserver.named_tuples import new_tuple
 from modelserver.transforms import so3
@@ -108,7 +108,7 @@ def reuse_last(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @reuse_last
-def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool = False, /) -> AcceptedFix | str:
+def evaluate_fix(sample: GpsSample, settings: SharedSettings, may_lack_type: bool = False, /) -> AcceptedFix | str:
     """Return the fix, or the reason why it is not good enough.
 
     `may_lack_type`: a fix of type NONE with a covariance is one of a publisher that fills in neither type nor number of
@@ -148,7 +148,7 @@ def evaluate_fix(sample: GpsSample, settings: FixSettings, may_lack_type: bool =
     return fix if fix.sigma <= settings.maximum_sigma else "sigma"
 
 
-def range_error(fix_type: FixType, settings: FixSettings) -> float:
+def range_error(fix_type: FixType, settings: SharedSettings) -> float:
     """Return the range error (UERE) of a fix type, meters."""
     if fix_type == FixType.RTK_FIXED:
         return settings.uere_rtk_fixed
@@ -165,7 +165,7 @@ def _has_covariance(sample: GpsSample) -> bool:
     return stated is not None and 0.0 < stated[0] < math.inf and 0.0 < stated[4] < math.inf
 
 
-def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float, float, float]:
+def _covariance(sample: GpsSample, settings: SharedSettings) -> tuple[float, float, float, float]:
     """Return variances east and north, covariance, variance up: the receiver's, else range error times dilution."""
     stated = sample.position_covariance
     if stated is not None and _has_covariance(sample):
@@ -194,7 +194,7 @@ class OriginCapture:
     fixes: tuple[tuple[int, Vector3, float], ...] = ()
 
     def add_fix(
-        self, utime: int, ecef: Vector3, sigma: float, settings: FixSettings
+        self, utime: int, ecef: Vector3, sigma: float, settings: SharedSettings
     ) -> tuple[OriginCapture, Origin | None]:
         """Return the capture with a further fix, and the origin once it is found.
 
@@ -438,7 +438,7 @@ class ClockMonitor(NamedTuple):
     sources: Mapping[SourceKey, SourceClock] = MappingProxyType({})
 
     def update(
-        self, name: SourceKey, rank: int, utime: int, seq: int, settings: FixSettings, horizon: float
+        self, name: SourceKey, rank: int, utime: int, seq: int, settings: SharedSettings, horizon: float
     ) -> tuple[ClockMonitor, StampVerdict]:
         """Return the monitor after a stamp, and what it means; `horizon` (s) is how late a sample may come."""
         newest, leading, lead_utime, sources = self

@@ -17,7 +17,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.estimation.filter.settings import FilterSettings, FixSettings
+from modelserver.estimation.filter.settings import FilterSettings, SharedSettings
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.messages import Invalid
 from modelserver.wire.channels import CHANNELS
@@ -72,7 +72,7 @@ def keys_of(kind: type) -> tuple[set[str], set[str]]:
             continue
         (sections if inner else keys).add(field)
         for each in inner:
-            if not issubclass(each, FixSettings):
+            if not issubclass(each, SharedSettings):
                 more, parts = keys_of(each)
                 keys, sections = keys | more, sections | parts
     return keys, sections
@@ -84,7 +84,7 @@ def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [FixSettings, FilterSettings, RawSettings])
+@pytest.mark.parametrize("kind", [SharedSettings, FilterSettings, RawSettings])
 def test_given_settings_of_localization_then_their_page_has_each_with_default_and_meaning(
     pages: ModuleType, kind: type
 ) -> None:

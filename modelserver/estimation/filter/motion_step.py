@@ -48,7 +48,13 @@ from modelserver.estimation.filter.measurements.wheels import (
     zero_rate,
     zero_velocity,
 )
-from modelserver.estimation.filter.sensor_monitors import RECEIVED, ImuMonitor, MountMonitor, SteeringAngle
+from modelserver.estimation.filter.sensor_monitors import (
+    LARGEST_RATIO,
+    RECEIVED,
+    ImuMonitor,
+    MountMonitor,
+    SteeringAngle,
+)
 from modelserver.estimation.filter.state import (
     Aligned,
     FilterState,
@@ -71,9 +77,6 @@ stop."""
 LARGEST_CONTRADICTION: Final = 0.4
 CONTRADICTION_GAIN: Final = 0.1
 """Mean NIS of ZUPT, relative to its gate, of a vehicle that is not stationary, and the weight of one; usual is 0.1."""
-
-LARGEST_RATIO: Final = 10.0
-"""Largest share of one, relative to its gate."""
 
 CHANGED_SIGMAS: Final = 5.0
 """Standard deviations by which the mean rate of a stationary vehicle shows that a gyro's bias has changed."""

@@ -43,8 +43,7 @@ from typing import Final, NamedTuple
 
 from modelserver.estimation.filter.eskf import ZERO
 from modelserver.estimation.filter.measurements.wheels import TurnRate
-from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.estimation.raw.settings import RawSettings
+from modelserver.estimation.filter.settings import SharedSettings
 from modelserver.estimation.sensor_rig import YawGyro
 from modelserver.messages import ImuSample
 from modelserver.named_tuples import new_tuple
@@ -254,7 +253,7 @@ class StationaryDetector(NamedTuple):
         force: Vector3,
         bias: Vector3,
         bias_sigma: float,
-        settings: FilterSettings | RawSettings,
+        settings: SharedSettings,
     ) -> StationaryDetector:
         """Return the detector after an IMU sample; `bias` is that of the gyros, with `bias_sigma` on each axis."""
         dt = (utime - self.utime) * 1e-6
@@ -356,7 +355,7 @@ GAIN: Final = 0.1
 """Weight of a sample in that mean."""
 
 LARGEST_RATIO: Final = 10.0
-"""Largest share of one sample, relative to its gate."""
+"""Largest share of one sample, or one ZUPT, in a mean of NIS relative to the gate."""
 
 RECEIVED: Final = "seen"
 """Kind under which the last wheel sample received is stored as a previous sample, beside the last one compared."""

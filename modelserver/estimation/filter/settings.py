@@ -9,8 +9,8 @@ from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True)
-class FixSettings:
-    """Quality limits of fixes, origin capture, clock jumps. SI units; a sigma is one standard deviation.
+class SharedSettings:
+    """Settings that raw mode and the filter share. SI units and radians; a sigma is one standard deviation.
 
     Defaults are from data sheets or physics, as stated at each; none is tuned to a recording. Raises ValueError for a
     number that is not finite or out of range.
@@ -61,6 +61,30 @@ class FixSettings:
     clock_jump_samples: int = 3
     """Number of successive samples that confirm a step of a source's clock."""
 
+    # --- the inertial unit, the receiver's velocity, tilt ---
+
+    gyro_noise: float = 1e-3
+    """Angle random walk, rad/sqrt(s): MicroStrain 3DM-GX1 data sheet, 3.5 deg/sqrt(hour)."""
+    gyro_bias_sigma: float = 0.012
+    """Bias before it was captured, rad/s: 3DM-GX1 data sheet, 0.7 deg/s over temperature."""
+    gyro_bias_walk: float = 3.5e-5
+    """Random walk of the bias, rad/s/sqrt(s): the data sheet's 0.02 deg/s short-term, reached in 100 s."""
+    rate_hold: float = 0.2
+    """Longest gap between inertial samples that is bridged with the last one, seconds."""
+    gap_rate_sigma: float = 0.3
+    """Sigma of the turn rate that nobody measured during a gap, rad/s: a vehicle in a gentle turn."""
+    stationary_rate: float = 0.02
+    """Spread of the gyros, rad/s, below which they are quiet: the unit's own noise in a bandwidth of 50 Hz is 0.007
+    (3DM-GX1 data sheet), and an engine idles."""
+    stationary_force: float = 0.15
+    """Spread of the specific force, m/s2, below which the accelerometers are quiet: an idling engine."""
+    velocity_sigma: float = 0.1
+    """Sigma of the receiver's velocity if it reports none, m/s: three times the 0.03 m/s rms of the OEM4 sheet."""
+    imu_timeout: float = 0.5
+    """Age of the last inertial sample past which a pose is stale, seconds."""
+    maximum_tilt: float = 1.05
+    """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
+
     def __post_init__(self) -> None:
         problems = []
         for field in dataclasses.fields(self):
@@ -76,7 +100,7 @@ class FixSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class FilterSettings(FixSettings):
+class FilterSettings(SharedSettings):
     """Settings of the filter. SI units and radians; a sigma is one standard deviation.
 
     Defaults are a data sheet's or physics' numbers, named at each; none is tuned to a recording.
@@ -87,12 +111,6 @@ class FilterSettings(FixSettings):
 
     # --- the inertial unit ---
 
-    gyro_noise: float = 1e-3
-    """Angle random walk, rad/sqrt(s): MicroStrain 3DM-GX1 data sheet, 3.5 deg/sqrt(hour)."""
-    gyro_bias_sigma: float = 0.012
-    """Bias before it was captured, rad/s: 3DM-GX1 data sheet, 0.7 deg/s over temperature."""
-    gyro_bias_walk: float = 3.5e-5
-    """Random walk of the bias, rad/s/sqrt(s): the data sheet's 0.02 deg/s short-term, reached in 100 s."""
     gyro_bias_step: float = 0.02
     """Change of a gyro's bias that a fault brings, two standard deviations, rad/s: 1 deg/s, as after a shock or with a
     failing supply. The heading's protection level covers it until fixes show it."""
@@ -107,10 +125,6 @@ class FilterSettings(FixSettings):
     """Bias before it was found, m/s2: 3DM-GX1 data sheet, 10 mg; an error of the mount's tilt looks the same."""
     accelerometer_bias_walk: float = 1e-3
     """Random walk of the bias, m/s2/sqrt(s): 3 mg in 15 minutes of warming up."""
-    rate_hold: float = 0.2
-    """Longest gap between inertial samples that is bridged with the last one, seconds."""
-    gap_rate_sigma: float = 0.3
-    """Sigma of the turn rate that nobody measured during a gap, rad/s: a vehicle in a gentle turn."""
     gap_acceleration: float = 1.0
     """Sigma of the acceleration that nobody measured during a gap, m/s2: ordinary driving and braking."""
     wheel_rate_sigma: float = 0.05
@@ -170,11 +184,6 @@ class FilterSettings(FixSettings):
 
     # --- standing ---
 
-    stationary_rate: float = 0.02
-    """Spread of the gyros, rad/s, below which they are quiet: the unit's own noise in a bandwidth of 50 Hz is 0.007
-    (3DM-GX1 data sheet), and an engine idles."""
-    stationary_force: float = 0.15
-    """Spread of the specific force, m/s2, below which the accelerometers are quiet: an idling engine."""
     stationary_speed: float = 0.05
     """Speed below which wheels and filter may be standing, m/s."""
     stationary_time: float = 1.0
@@ -203,8 +212,6 @@ class FilterSettings(FixSettings):
     position_slew_rate: float = 2.0
     """How fast the pose follows the time-correlated error of the fixes, m/s, at most: the pose in the world is where
     the receiver would report it, because way points are surveyed with it, but it does not jump there."""
-    velocity_sigma: float = 0.1
-    """Sigma of the receiver's velocity if it reports none, m/s: three times the 0.03 m/s rms of the OEM4 sheet."""
     course_speed: float = 1.0
     """Least speed at which course and speed are taken for a velocity, m/s (report 5.1)."""
     course_sigma: float = 0.05
@@ -268,8 +275,6 @@ class FilterSettings(FixSettings):
 
     gps_timeout: float = 300.0
     """Age of the last used fix past which a pose is stale, seconds: the bounds speak long before."""
-    imu_timeout: float = 0.5
-    """Age of the last inertial sample past which a pose is stale, seconds."""
     risk_per_hour: float = 1e-5
     """Probability in an hour that the true position, or heading, is outside its bound."""
     horizontal_limit: float | None = None
@@ -278,15 +283,13 @@ class FilterSettings(FixSettings):
     heading_limit: float | None = None
     """The same of the heading error, radians. If not given 0.6; while no wheels measure the speed 0.35, since nothing
     shows then that the vehicle moves along its own axis, as the heading by fixes assumes."""
-    maximum_tilt: float = 1.05
-    """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands."""
     maximum_speed: float = 60.0
     """Fastest the vehicle moves, m/s: a state beyond is taken for a diverged filter."""
 
     def __post_init__(self) -> None:
         problems = []
         try:
-            FixSettings.__post_init__(self)
+            SharedSettings.__post_init__(self)
         except ValueError as error:
             problems += str(error).splitlines()
         for name, most in (("gps_white_share", 1.0), ("gate_risk", 0.1), ("risk_per_hour", 0.1), ("horizon", 10.0)):

@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.filter.settings import SharedSettings
 
 
 @dataclass(frozen=True, slots=True)
-class RawSettings(FixSettings):
+class RawSettings(SharedSettings):
     """Settings of raw mode. SI units and radians; a sigma is one standard deviation.
 
     Defaults are from data sheets or physics, as stated at each; none is tuned to a recording. Raises ValueError for a
@@ -38,33 +38,18 @@ class RawSettings(FixSettings):
 
     # --- IMU ---
 
-    gyro_noise: float = 1e-3
-    """Angle random walk, rad/sqrt(s): MicroStrain 3DM-GX1 data sheet, 3.5 deg/sqrt(hour)."""
-    gyro_bias_sigma: float = 0.012
-    """Sigma of the gyro bias before it is measured, rad/s: 3DM-GX1 data sheet, 0.7 deg/s over temperature."""
-    gyro_bias_walk: float = 3.5e-5
-    """Random walk of the bias, rad/s/sqrt(s): 0.02 deg/s short-term of the data sheet, reached in 100 s."""
     tilt_sigma: float = 0.035
     """Sigma of roll and pitch, rad: 3DM-GX1 data sheet, 2 deg under dynamic conditions."""
     tilt_time: float = 5.0
     """Time constant with which specific force corrects roll and pitch, seconds: long against a curve, short against
     the effect of gyro bias (0.012 rad/s would tilt by 0.06 rad)."""
-    maximum_tilt: float = 1.05
-    """Tilt from which the pose is invalid, rad: 60 deg, steeper than any ground vehicle drives. It shows an IMU that
-    is mounted other than the geometry states."""
     tilt_gate: float = 1.0
     """Largest | |f| - g |, m/s2, at which specific force is used as gravity: a tenth of g."""
-    rate_hold: float = 0.2
-    """Longest gap between IMU samples that is bridged with the last rate, seconds; then the turn stops."""
-    gap_rate_sigma: float = 0.3
-    """Sigma of the yaw rate during a gap without gyro, rad/s: a vehicle in a gentle turn."""
 
     # --- heading ---
 
     course_speed: float = 0.5
     """Least speed at which the course of the receiver is used for the heading, m/s."""
-    velocity_sigma: float = 0.1
-    """Sigma of the receiver velocity where it states none, m/s: three times the 0.03 m/s rms of the OEM4 data sheet."""
     course_sigma_limit: float = 0.15
     """Sigma below which a course is used, rad; a course from positions waits until it is."""
     course_window: float = 30.0
@@ -86,8 +71,6 @@ class RawSettings(FixSettings):
     """Speed below which the vehicle may be stationary, m/s."""
     stationary_rate: float = 0.01
     """Spread of the gyros, and distance of the rate from the bias, below which they are quiet, rad/s: 0.6 deg/s."""
-    stationary_force: float = 0.15
-    """Spread of the specific force, m/s2, below which the accelerometers are quiet: an idling engine."""
     stationary_time: float = 2.0
     """Time for which both must last before the vehicle is stationary and the bias is measured, seconds."""
 
@@ -95,8 +78,6 @@ class RawSettings(FixSettings):
 
     gps_timeout: float = 2.0
     """Age of the last good fix above which a pose is stale, seconds: four missed fixes of a 2 Hz receiver."""
-    imu_timeout: float = 0.5
-    """Age of the last IMU sample above which a pose is stale, seconds."""
     fix_rejections: int = 2
     """Number of rejected fixes in a row that make a pose invalid: one is an outlier."""
     risk: float = 1e-3
@@ -107,7 +88,7 @@ class RawSettings(FixSettings):
     """The same of the heading error, radians."""
 
     def __post_init__(self) -> None:
-        FixSettings.__post_init__(self)
+        SharedSettings.__post_init__(self)
         for name, most in (("fix_noise_share", 1.0), ("maximum_tilt", math.pi / 2), ("risk", 0.5)):
             if getattr(self, name) > most:
                 raise ValueError(f"{name} is at most {most:.4g}, got {getattr(self, name)}")

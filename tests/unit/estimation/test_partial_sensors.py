@@ -17,7 +17,7 @@ from modelserver.estimation.filter.gnss_monitor import (
     PLAIN_LIMIT,
     ReceiverMonitor,
 )
-from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.filter.settings import SharedSettings
 from modelserver.estimation.inputs import evaluate_fix
 from modelserver.estimation.sensor_rig import SPEEDOMETER, SensorRig, SpeedometerSignal, find_unusable
 from modelserver.messages import (
@@ -227,14 +227,14 @@ def create_fix(fix_type: FixType = FixType.NONE, **fields: object) -> GpsSample:
 
 
 def test_given_fixes_without_a_type_then_they_are_used_by_their_covariance_until_one_has_a_type():
-    settings, stated = FixSettings(), create_fix(position_covariance=COVARIANCE)
+    settings, stated = SharedSettings(), create_fix(position_covariance=COVARIANCE)
     assert evaluate_fix(stated, settings) == "no_fix"
     fix = evaluate_fix(stated, settings, True)
     assert not isinstance(fix, str)
     assert fix.east_variance == 0.25
     assert evaluate_fix(create_fix(), settings, True) == "no_fix"
     assert evaluate_fix(create_fix(position_covariance=(0.0,) * 9), settings, True) == "no_fix"
-    assert evaluate_fix(stated, FixSettings(minimum_fix_type=2), True) == "no_fix"
+    assert evaluate_fix(stated, SharedSettings(minimum_fix_type=2), True) == "no_fix"
     monitor = ReceiverMonitor()
     assert monitor.update(stated) is monitor
     assert monitor.may_use(stated)

@@ -17,7 +17,7 @@ from support_localization import GEODESY, MOUNTS, START
 from modelserver.earth.geodesy import LocalFrame
 from modelserver.errors import UnknownFrameError
 from modelserver.estimation.filter.protection_levels import compute_factors, compute_longest_axis
-from modelserver.estimation.filter.settings import FixSettings
+from modelserver.estimation.filter.settings import SharedSettings
 from modelserver.estimation.inputs import OriginCapture, evaluate_fix
 from modelserver.estimation.raw.localizer import (
     MAX_TRACK_FIXES,
@@ -67,7 +67,7 @@ def test_the_error_of_an_invalid_setting_has_its_name(wrong):
 
 def test_every_setting_is_a_number_with_a_docstring():
     source = dataclasses.fields(RawSettings)
-    text = inspect.getsource(FixSettings) + inspect.getsource(RawSettings)
+    text = inspect.getsource(SharedSettings) + inspect.getsource(RawSettings)
     for field in source:
         assert field.type in ("int", "float")
         after = text.split(f"    {field.name}: ", 1)[1].split("\n", 2)[1]
