@@ -1,10 +1,12 @@
-"""Standard terms lead to the code: one plain grep for each hits the module that does it.
+"""Standard terms lead to the code: the module that does it is among the first that a grep lists.
 
 The terms come from the indexes of Groves (2013), PX4's EKF2, tf2 and robot_localization.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ FILTER = "modelserver/estimation/filter"
 
 TERMS = {
     # Groves
-    "lever arm": "modelserver/transforms/chain.py",
+    "lever arm": "modelserver/transforms/transformation.py",
     "specific force": "modelserver/estimation/raw/localizer.py",
     "strapdown": f"{FILTER}/eskf.py",
     "error state": f"{FILTER}/eskf.py",
@@ -48,11 +50,11 @@ TERMS = {
     "NIS": f"{FILTER}/eskf.py",
     "chi-square gate": f"{FILTER}/eskf.py",
     "measurement noise": f"{FILTER}/measurements/measurement.py",
-    "process noise": f"{FILTER}/settings.py",
+    "process noise": f"{FILTER}/eskf.py",
     "dilution of precision": "modelserver/estimation/inputs.py",
     "protection level": f"{FILTER}/protection_levels.py",
     "integrity": f"{FILTER}/protection_levels.py",
-    "dead reckoning": f"{FILTER}/output.py",
+    "dead reckoning": f"{FILTER}/bank_step.py",
     "quaternion": "modelserver/transforms/so3.py",
     "rotation vector": "modelserver/transforms/so3.py",
     "left Jacobian": "modelserver/transforms/so3.py",
@@ -84,7 +86,7 @@ TERMS = {
     "loop closure": "modelserver/geometry/topology.py",
     "inertia tensor": "modelserver/geometry/inertia.py",
     "parallel axis": "modelserver/geometry/inertia.py",
-    "twist": "modelserver/query/path.py",
+    "twist": "modelserver/geometry/kinematic_path.py",
     # robot_localization
     "map frame": "modelserver/query/view.py",
     "REP-105": f"{FILTER}/output.py",
@@ -107,21 +109,26 @@ TERMS = {
 }
 
 
-def hits(term: str) -> list[str]:
-    """Return the product files that `grep -rliF TERM` lists, without the generated ones."""
-    found = [
-        path.relative_to(ROOT).as_posix()
+ROWS, FILES = 10, 5
+"""How many rows of `grep -rniF TERM`, and files of `grep -rciF TERM` with the most rows first, one looks at."""
+
+
+@cache
+def read_product() -> dict[str, list[str]]:
+    """Return the lines of the product's files, without the generated ones, in small letters; in the order of a grep."""
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8").lower().splitlines()
         for folder in FOLDERS
         for path in sorted((ROOT / folder).rglob("*.py"))
-        if term.lower() in path.read_text(encoding="utf-8").lower() and path.name != "generated.py"
-    ]
-    assert found, f"no product file has {term!r}"
-    return found
+        if path.name != "generated.py"
+    }
 
 
 @pytest.mark.parametrize(("term", "place"), TERMS.items())
-def test_given_a_standard_term_then_a_grep_hits_its_place(term: str, place: str) -> None:
-    assert place in hits(term)
+def test_given_a_standard_term_then_its_place_is_among_the_first_that_a_grep_lists(term: str, place: str) -> None:
+    rows = [path for path, lines in read_product().items() for line in lines if term.lower() in line]
+    files = [path for path, _ in Counter(rows).most_common(FILES)]
+    assert place in rows[:ROWS] or place in files, (len(rows), files)
 
 
 def test_given_the_terms_then_there_are_enough() -> None:
