@@ -317,7 +317,8 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_transforms[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms).transformation
+            ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
+            return self._query_pose(*ends, to_utime(at), policy, wait_ms).transformation
 
     def _query_pose(
         self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND

@@ -37,6 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, make_status_error
+from modelserver.geometry import names
 from modelserver.key_files import KEY_FILE_VARIABLE, read_keys
 from modelserver.messages import (
     CHANNEL_OF,
@@ -128,7 +129,7 @@ def check_batch(
     pairs: Sequence[tuple[str, str]], at: Sequence[Time] | npt.NDArray[Any]
 ) -> tuple[tuple[tuple[str, str], ...], npt.NDArray[np.int64]]:
     """Return the pairs and times of a batch query. Raises MalformedRequestError where the wire cannot hold them."""
-    wanted = tuple((interest, reference) for interest, reference in pairs)
+    wanted = tuple((names.complete(interest), names.complete(reference)) for interest, reference in pairs)
     try:
         given = np.asarray(at)
         if given.dtype.kind == "M" or (given.dtype.kind == "O" and given.ndim == 1):
@@ -249,7 +250,8 @@ class FrameClient(ABC):
         """
         demand = make_demand(max_horizontal, max_heading, max_age, min_integrity)
         utime = at if type(at) is int else to_utime(at)
-        return self._query_pose(frame_of_interest, frame_of_reference, utime, policy, wait_ms, demand)
+        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
+        return self._query_pose(*ends, utime, policy, wait_ms, demand)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -276,7 +278,8 @@ class FrameClient(ABC):
         unknown (nan). Raises as `get_transformation`.
         """
         time = TimeQuery(to_utime(at), policy, wait_ms)
-        request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
+        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
+        request = GetMotion(self._header(), *ends, names.complete(expressed_in), time)
         return require_answer(self._query(request, MotionReply).answer)
 
     def explain(
@@ -293,7 +296,8 @@ class FrameClient(ABC):
         Raises as `get_transformation`.
         """
         time = TimeQuery(to_utime(at), policy, wait_ms)
-        request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
+        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
+        request = GetExplanation(self._header(), *ends, time)
         return require_answer(self._query(request, ExplanationReply).answer)
 
     def get_dynamics(
@@ -311,7 +315,8 @@ class FrameClient(ABC):
         in World:ENU. Needs the section `dynamics` of the vehicle file; `PlatformMirror` has none. Raises as
         `get_transformation`; ForbiddenError where it is not configured.
         """
-        request = GetDynamics(self._header(), frame, equations, floating, TimeQuery(to_utime(at), policy))
+        time = TimeQuery(to_utime(at), policy)
+        request = GetDynamics(self._header(), names.complete(frame), equations, floating, time)
         return require_answer(self._query(request, DynamicsReply).answer)
 
     def _header(self) -> RequestHeader:
@@ -361,7 +366,7 @@ class PlatformClient(FrameClient):
         Parameters
         ----------
         frame_of_interest, frame_of_reference
-            Body:Frame.
+            Body:Frame; a body alone is its frame Origin, and map, odom and utm are the world frames, as in ROS.
         at
             Time: microseconds since the Unix epoch, a datetime or a numpy.datetime64; 0 for the latest common one.
         policy
@@ -376,9 +381,8 @@ class PlatformClient(FrameClient):
         QueryError
             The reason in the reply.
         """
-        return self._query_pose(
-            frame_of_interest, frame_of_reference, at if type(at) is int else to_utime(at), policy, wait_ms
-        ).transformation
+        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
+        return self._query_pose(*ends, at if type(at) is int else to_utime(at), policy, wait_ms).transformation
 
     def get_state_vector(
         self, *, at: Time = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
@@ -438,6 +442,7 @@ class PlatformClient(FrameClient):
             As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
             `fixed_frame` and a `reference_at` of 0 for more times than one request to the server holds.
         """
+        fixed_frame = names.complete(fixed_frame)
         return self._query_batch(BatchQuery(*check_batch(pairs, at), fixed_frame, to_utime(reference_at), covariance))
 
     @abstractmethod

@@ -10,9 +10,9 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from pydantic import ConfigDict
+from pydantic import AfterValidator, ConfigDict
 
 from modelserver.config import reader
 from modelserver.dynamics.stability import DynamicsSettings
@@ -21,6 +21,7 @@ from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import MagnetometerCalibration
 from modelserver.files import PROCESS_FIX, FileKind, NotRegularFileError, detect_file_kind, read_start
+from modelserver.geometry import names
 from modelserver.messages import Mode
 
 MAX_CHANNEL = 39
@@ -31,6 +32,9 @@ MAX_NAME = 64
 
 MAX_LATENCY = 5.0
 """Seconds: the localization retains the past for no longer."""
+
+FrameName: TypeAlias = Annotated[str, AfterValidator(names.complete)]
+"""A frame, `Body:Frame`; a body's name alone is its frame `Origin`."""
 
 
 def _check(section: object, *problems: str, channel: str = "", **ranges: tuple[float, float]) -> None:
@@ -105,7 +109,7 @@ class SensorConfig:
 
     channel: str
     """Channel of its samples."""
-    frame: str
+    frame: FrameName
     """Frame at which it is mounted, `Body:Frame`."""
     latency: float = 0.0
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
@@ -120,7 +124,7 @@ class SensorConfig:
 class GpsConfig(SensorConfig):
     """The GNSS receiver."""
 
-    second_frame: str = ""
+    second_frame: FrameName = ""
     """Frame of the other antenna of a dual-antenna receiver."""
 
 
@@ -182,7 +186,7 @@ class WheelsConfig:
 
     channel: str = "WHEELS"
     """Channel of its samples."""
-    frames: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, FrameName] = field(default_factory=dict)
     """For each wheel's name the frame of its contact point."""
     publisher: str = ""
     """The `header.source` of its samples, which others on the channel do not displace; empty: a driver of this file."""
@@ -419,9 +423,9 @@ class VehicleConfig:
     """Name of the vehicle."""
     geometry: str
     """Path of the geometry file, relative to this file."""
-    base_frame: str
+    base_frame: FrameName
     """The frame that POSE describes."""
-    rolling_frame: str = ""
+    rolling_frame: FrameName = ""
     """The frame that moves along its own x axis when the vehicle turns: the middle of the rear axle with steered front
     wheels, the middle of the wheels with skid steering. Empty: `base_frame`."""
     variables: dict[str, str] = field(default_factory=dict)

@@ -77,7 +77,7 @@ from modelserver.messages import (
     SendReply,
 )
 from modelserver.named_tuples import new_tuple
-from modelserver.query.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
+from modelserver.query.answers import DeferredAnswer, complete_names, compute_replies, is_deferred, make_error_reply
 from modelserver.query.view import PlatformView
 from modelserver.transforms.transformation import find_covariance_problem
 
@@ -111,6 +111,7 @@ def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[Co
     """Answer a request, defer a long answer, or let the request wait until the data it asks for arrive."""
     if not is_answerable(request.header, state.settings.reply_prefix):
         return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+    request = complete_names(request)
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
         if len(state.waiting) < state.settings.waiting_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
@@ -494,12 +495,13 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
 
 def _set_pose(state: CoreState, request: messages.SetStateVector | messages.SetHTransform, now: Instant) -> StepResult:
     given, view = request.pose.transformation, state.view
+    ends = names.complete(given.frame_of_interest), names.complete(given.frame_of_reference)
     state = state._replace(requests_answered=state.requests_answered + 1)
     origin = None if view.localizer is None else view.localizer.estimate(now.utime).origin
     why = ""
     if view.localizer is None:
         why = "no localization sensor is configured (section 'sensors' of the vehicle file)"
-    elif (given.frame_of_interest, given.frame_of_reference) != (view.base_frame, names.WORLD_UTM):
+    elif ends != (view.base_frame, names.WORLD_UTM):
         why = (
             f"the pose is of {given.frame_of_interest} in {given.frame_of_reference}; expected the pose of "
             f"{view.base_frame} in {names.WORLD_UTM}"
@@ -518,8 +520,7 @@ def _set_pose(state: CoreState, request: messages.SetStateVector | messages.SetH
     covariance = SET_COVARIANCE if given.covariance is None else tuple(given.covariance.ravel().tolist())
     sample = messages.AbsolutePoseSample(
         messages.SensorHeader(given.utime or now.utime, OPERATOR, state.requests_answered),
-        given.frame_of_interest,
-        given.frame_of_reference,
+        *ends,
         given.pose.xyz,
         given.pose.wxyz,
         covariance,

@@ -200,13 +200,14 @@ class Model:
     def get_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference` by the shortest path (eq. 11-13).
 
-        Movable joints are at their default positions; `modelserver.query` knows the actual ones. Both are full names,
-        `Body:Frame`. Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        Movable joints are at their default positions; `modelserver.query` knows the actual ones. Frames are named
+        `Body:Frame`, or by a body alone its frame `Origin`. Raises UnknownBodyError, UnknownFrameError or
+        NotConnectedError.
         """
         try:
             return self._transformations[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._compute(frame_of_interest, frame_of_reference)
+            return self._compute(names.complete(frame_of_interest), names.complete(frame_of_reference))
 
     def get_kinematic_path(self, frame_of_interest: str, frame_of_reference: str) -> KinematicPath:
         """Return the shortest kinematic path from the frame of reference to the frame of interest, cached.
@@ -215,6 +216,8 @@ class Model:
         """
         found = self._paths.get((frame_of_interest, frame_of_reference))
         if found is None:
+            frame_of_interest = names.complete(frame_of_interest)
+            frame_of_reference = names.complete(frame_of_reference)
             interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
             if interest.assembly in self._assemblies_with_loops:
                 path = self.find_path(frame_of_interest, frame_of_reference)
@@ -291,20 +294,21 @@ class Model:
         return tuple([drive.multiplier * value for value in leader.sigma or (math.nan,) * leader.count])
 
     def _split(self, name: str) -> tuple[Body, BodyFrame]:
+        everything = (names.join(body.name, frame.name) for body in self.bodies for frame in body)
         try:
-            body_name, frame_name = names.split(name)
-        except ValueError:
-            everything = (names.join(body.name, frame.name) for body in self.bodies for frame in body)
-            raise UnknownFrameError(
-                f"{quote(name)} is not a frame: frames are named Body:Frame", find_nearest_names(name, everything)
-            ) from None
+            body_name, frame_name = names.split(names.complete(name))
+        except ValueError as error:
+            raise UnknownFrameError(str(error), find_nearest_names(name, everything)) from None
         found = self._bodies.get(body_name)
         if found is None:
-            near = find_nearest_names(body_name, self._bodies)
-            raise UnknownBodyError(
-                f"the model has no body {quote(body_name)}",
-                (names.join(body, frame_name) if self._bodies[body].has_frame(frame_name) else body for body in near),
-            )
+            near = [
+                names.join(body, frame_name) if self._bodies[body].has_frame(frame_name) else body
+                for body in find_nearest_names(body_name, self._bodies)
+            ]
+            if frame_name == names.ORIGIN:  # perhaps what is given is a frame without its body
+                of_bodies = [names.join(body.name, body_name) for body in self.bodies if body.has_frame(body_name)]
+                near += of_bodies[: names.MAX_LISTED] or find_nearest_names(body_name, everything)
+            raise UnknownBodyError(f"the model has no body {quote(body_name)}", dict.fromkeys(near))
         return found, found.frame(frame_name)
 
     def _get_end_nodes(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:

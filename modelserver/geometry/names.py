@@ -21,6 +21,27 @@ def join(body: str, frame: str) -> str:
     return f"{body}:{frame}"
 
 
+ORIGIN = "Origin"
+"""Name of the frame at a body's origin."""
+
+ROS_WORLDS = {"map": WORLD_ENU, "odom": ODOM, "utm": WORLD_UTM}
+"""The world frames by their names in ROS (REP-105)."""
+
+
+def complete(name: str) -> str:
+    """Return the full name of a frame. As in ROS, a name without a colon is a world frame, or a body's own frame."""
+    return name if ":" in name or not name else ROS_WORLDS.get(name) or join(name, ORIGIN)
+
+
+def shorten(name: str) -> str:
+    """Return the short name of a frame that `complete` completes, or the name itself where there is none."""
+    for short, world in ROS_WORLDS.items():
+        if name == world:
+            return short
+    body, _, frame = name.partition(":")
+    return body if frame == ORIGIN and body not in ROS_WORLDS else name
+
+
 def split(name: str) -> tuple[str, str]:
     """Return body and frame of a full name. Raises ValueError where it is not of the form `Body:Frame`."""
     body, colon, frame = name.partition(":")

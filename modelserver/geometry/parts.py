@@ -203,12 +203,13 @@ class Body:
         return "" if found is None else found.find_error()
 
     def frame(self, name: str) -> BodyFrame:
-        """Return the frame of that name. Raises UnknownFrameError with the nearest names."""
+        """Return the frame of that name. Raises UnknownFrameError with the nearest names, or with all."""
         found = self._by_name.get(name)
         if found is None:
+            near = find_nearest_names(name, self._by_name)
+            others = "" if near else f"; its frames are {names.format_names([each.full_name for each in self])}"
             raise UnknownFrameError(
-                f"body {self.name} has no frame {quote(name)}",
-                (names.join(self.name, near) for near in find_nearest_names(name, self._by_name)),
+                f"body {self.name} has no frame {quote(name)}{others}", (names.join(self.name, each) for each in near)
             )
         return found
 

@@ -97,6 +97,28 @@ class DeferredAnswer(NamedTuple):
             ]
 
 
+_FRAME_FIELDS: Final[Mapping[type, tuple[str, ...]]] = {
+    GetTransformation: ("frame_of_interest", "frame_of_reference"),
+    GetMotion: ("frame_of_interest", "frame_of_reference", "expressed_in"),
+    GetExplanation: ("frame_of_interest", "frame_of_reference"),
+    GetTransformations: ("fixed_frame",),
+    GetDynamics: ("frame",),
+}
+
+
+def complete_names(request: Request) -> Request:
+    """Return a request with the full names of its frames, as `names.complete` does."""
+    full: Any = request
+    for field in _FRAME_FIELDS.get(type(request), ()):
+        given = getattr(request, field)
+        if ":" not in given:
+            full = full._replace(**{field: names.complete(given)})
+    if isinstance(request, GetTransformations):
+        pairs = tuple([(names.complete(interest), names.complete(reference)) for interest, reference in request.pairs])
+        full = full._replace(pairs=pairs)
+    return full  # type: ignore[no-any-return]
+
+
 def effort_of(request: Request) -> float:
     """Return the computing effort of a request in units of a typical one (about 0.1 ms), from the request alone."""
     if isinstance(request, GetTransformations):

@@ -96,8 +96,8 @@ def test_given_a_running_service_then_a_client_of_the_protocol_receives_frames_p
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 0
-    assert found["/pose"].frame_id == "World:UTM"
-    assert found["/tf"].transforms[0].parent_frame_id in ("World:UTM", "Raptor:CG")
+    assert found["/pose"].frame_id == "utm"
+    assert found["/tf"].transforms[0].parent_frame_id in ("utm", "Raptor:CG")
     assert found["/diagnostics"]["status"][0]["name"] == "pose"
     assert found["/fix/gps"].latitude == pytest.approx(50.27, abs=0.01)
 

@@ -35,8 +35,10 @@ from modelserver.messages import (
     Event,
     GetBodyFrameList,
     GetBodyList,
+    GetExplanation,
     GetHistory,
     GetHTransform,
+    GetMotion,
     GetStateVector,
     GetTransformation,
     Health,
@@ -212,13 +214,35 @@ def test_given_the_inverse_h_transform_then_it_is_the_world_in_the_vehicle() -> 
 
 
 @pytest.mark.parametrize(
+    ("request_", "ends"),
+    [
+        (GetTransformation(ME, "Camera", "map"), ("Camera:Origin", "World:ENU")),
+        (GetTransformation(ME, "utm", "odom"), ("World:UTM", "Odom:Origin")),
+        (GetExplanation(ME, "Camera", "Cart:Base"), ("Camera:Origin", "Cart:Base")),
+        (GetMotion(ME, "Camera", "Cart:Base", "Camera"), ("Camera:Origin", "Cart:Base")),
+    ],
+)
+def test_given_frame_names_as_ros_has_them_then_the_answer_has_the_full_ones(
+    request_: Any, ends: tuple[str, str]
+) -> None:
+    run = Run()
+    run.samples(0, 1)
+    reply = run.ask(request_)
+    assert reply.header.status is Status.OK, reply.header.message
+    answer = reply.answer
+    answer = getattr(answer, "pose", None) or getattr(answer, "answer", answer)
+    assert (answer.transformation.frame_of_interest, answer.transformation.frame_of_reference) == ends
+
+
+@pytest.mark.parametrize(
     ("request_", "status", "near"),
     [
         (GetTransformation(ME, "Camrea:Origin", "Cart:Base"), Status.UNKNOWN_BODY, "Camera:Origin"),
         (GetTransformation(ME, "Camera:Orign", "Cart:Base"), Status.UNKNOWN_FRAME, "Camera:Origin"),
         (GetTransformation(ME, "World:UTN", "Cart:Base"), Status.UNKNOWN_FRAME, "World:UTM"),
         (GetTransformation(ME, "Lamp:Origin", "Cart:Base"), Status.NOT_CONNECTED, ""),
-        (GetTransformation(ME, "x" * 60_000, "Cart:Base"), Status.UNKNOWN_FRAME, ""),
+        (GetTransformation(ME, "x" * 60_000, "Cart:Base"), Status.UNKNOWN_BODY, ""),
+        (GetTransformation(ME, "Camera:a:b", "Cart:Base"), Status.UNKNOWN_FRAME, ""),
         (GetBodyFrameList(ME, "Crat"), Status.UNKNOWN_BODY, "Cart"),
         (GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START - 1)), Status.TOO_OLD, ""),
         (GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START + 2 * S)), Status.TOO_NEW, ""),

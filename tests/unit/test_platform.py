@@ -275,7 +275,7 @@ def test_given_no_origin_yet_then_odom_answers_and_the_world_does_not() -> None:
         ("Odom:", UnknownFrameError, "Odom:Origin"),
         ("Camera:Orgin", UnknownFrameError, "Camera:Origin"),
         ("Camrea:Origin", UnknownBodyError, "Camera:Origin"),
-        ("Camera", UnknownFrameError, ""),
+        ("Camrea", UnknownBodyError, "Camera:Origin"),
         ("", UnknownFrameError, ""),
     ],
 )

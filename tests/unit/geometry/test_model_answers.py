@@ -10,7 +10,7 @@ import pytest
 from support_geometry import all_frames, chain, random_builder, star
 
 from modelserver.errors import LimitError, NotConnectedError, UnknownBodyError, UnknownFrameError
-from modelserver.geometry import Body, BodyFrame, Constraint, Model, ModelBuilder, Search, Sigma, topology
+from modelserver.geometry import Body, BodyFrame, Constraint, Model, ModelBuilder, Search, Sigma, names, topology
 from modelserver.geometry import model as model_module
 from modelserver.transforms import Pose
 
@@ -104,8 +104,10 @@ def test_unknown_names_are_distinguished_with_the_nearest():
         model.get_transformation("C:a", "A:a")
     with pytest.raises(UnknownFrameError, match="body A has no frame 'b'"):
         model.get_transformation("A:b", "A:a")
-    with pytest.raises(UnknownFrameError, match=r"'A' is not a frame: frames are named Body:Frame"):
+    with pytest.raises(UnknownFrameError, match=r"body A has no frame 'Origin'; its frames are A:a"):
         model.get_transformation("A:a", "A")
+    with pytest.raises(UnknownFrameError, match=r"'A:a:b' is not of the form Body:Frame"):
+        model.get_transformation("A:a", "A:a:b")
     with pytest.raises(UnknownBodyError):
         model.get_body_frame_list("C")
     big = star(20).build()
@@ -115,7 +117,7 @@ def test_unknown_names_are_distinguished_with_the_nearest():
     with pytest.raises(UnknownBodyError) as caught:
         big.get_transformation("Divice00007:Origin", "Hub:Mount00001")
     assert caught.value.nearest[0] == "Device00007:Origin"
-    with pytest.raises(UnknownFrameError) as caught:
+    with pytest.raises(UnknownBodyError) as caught:
         big.find_path("Hub Mount00003", "Hub:Mount00001")
     assert caught.value.nearest[0] == "Hub:Mount00003"
 
@@ -281,3 +283,9 @@ def test_the_depth_first_search_gives_up_on_dense_loops(monkeypatch):
     with pytest.raises(LimitError, match="use the breadth-first search"):
         model.find_path("Alone:x", "B0:free", Search.DEPTH_FIRST)
     assert len(model.find_path("B8:free", "B0:free")) == 1
+
+
+@pytest.mark.parametrize("full", ["World:UTM", "World:ENU", "Odom:Origin", "base:Origin", "map:Origin", "Cart:Base"])
+def test_short_names_of_frames_are_those_of_ros_and_lead_back_to_the_full_ones(full):
+    assert names.complete(names.shorten(full)) == full
+    assert (names.shorten("World:ENU"), names.shorten("base_link:Origin")) == ("map", "base_link")

@@ -72,7 +72,7 @@ def test_given_a_log_then_the_frames_are_where_a_query_of_the_log_places_them(lo
     frames: dict[str, Pose] = {}
     for now, message in read(mcap, "/tf"):
         for transform in message.transforms:
-            if transform.parent_frame_id == "World:UTM":
+            if transform.parent_frame_id == "utm":
                 assert transform.child_frame_id == "Raptor:CG"
                 world[utime_of(transform.timestamp)] = pose_of(transform)
                 continue

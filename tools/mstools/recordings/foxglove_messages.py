@@ -12,7 +12,8 @@ which writes an MCAP file or serves a websocket. Topics:
     /events        Log               validity, rejections, resets, mode, geometry
     /lcm/CHANNEL   bytes             each LCM message as it is, with its .lcm definition as the schema
 
-Foxglove's frames are those of the geometry, by their full names.
+Foxglove's frames are those of the geometry, by their names in ROS where they have one: utm, base_link for
+base_link:Origin.
 """
 
 from __future__ import annotations
@@ -204,7 +205,9 @@ class FoxgloveWriter:
         stamp, pose = found.utime, found.pose
         transform = _make_transform(found.frame_of_reference, found.frame_of_interest, pose, stamp)
         self._tf.log(FrameTransforms(transforms=[transform]), log_time=now * 1000)
-        message = PoseInFrame(timestamp=_stamp(stamp), frame_id=found.frame_of_reference, pose=_convert_pose(pose))
+        message = PoseInFrame(
+            timestamp=_stamp(stamp), frame_id=names.shorten(found.frame_of_reference), pose=_convert_pose(pose)
+        )
         self._pose.log(message, log_time=now * 1000)
         if answer.origin is None or stamp < self._next_fix <= stamp + FIX_PERIOD_US:
             return
@@ -285,8 +288,8 @@ def _make_transform(parent: str, child: str, pose: Pose, utime: int) -> FrameTra
     translation, rotation = _convert(pose)
     return FrameTransform(
         timestamp=_stamp(utime),
-        parent_frame_id=parent,
-        child_frame_id=child,
+        parent_frame_id=names.shorten(parent),
+        child_frame_id=names.shorten(child),
         translation=translation,
         rotation=rotation,
     )
@@ -298,7 +301,7 @@ def _make_fix(utime: int, frame: str, place: tuple[float, float, float], covaria
     kind = LocationFixPositionCovarianceType
     return LocationFix(
         timestamp=_stamp(utime),
-        frame_id=frame,
+        frame_id=names.shorten(frame),
         latitude=latitude,
         longitude=longitude,
         altitude=height if math.isfinite(height) else 0.0,
@@ -331,7 +334,7 @@ def _make_entity(frame: str, X_body_frame: Pose, shapes: tuple[Shape, ...], now:
             models.append(ModelPrimitive(pose=pose, scale=scale, color=color, url=shape.file))
     return SceneEntity(
         timestamp=_stamp(now),
-        frame_id=frame,
+        frame_id=names.shorten(frame),
         id=names.split(frame)[0],
         frame_locked=True,
         cubes=cubes,

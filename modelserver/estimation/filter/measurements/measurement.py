@@ -212,7 +212,7 @@ def transform_to_site(context: MeasurementContext, reference: str, point: Vector
     """Return a point of a world frame in N, and the rotation from its axes there to N; or in one word why not."""
     if context.site is None or context.geodesy is None:
         return ""
-    geodesy, site = context.geodesy, context.site
+    geodesy, site, reference = context.geodesy, context.site, names.complete(reference)
     try:
         if reference == names.WORLD_ENU:
             return site.from_ecef(geodesy.tangent.to_ecef(point)), site.rotation_of(geodesy.tangent)
