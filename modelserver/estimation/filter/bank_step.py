@@ -124,7 +124,7 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
     )
     fix = None if newest is None else _read_fix(setup, state, newest)
     after = bank.advance(utime, step, fix, setup.settings, _get_slip(setup))._replace(reckoning=now)
-    after = after.judge_fixes(output.get_limits(setup, state)[0], is_outage=_ends_outage(state))
+    after = after.judge_fixes(output.get_limits(setup, state)[0])
     state = state._replace(bank=after)
     if after.may_be_transported and abs(after.rest_turn) > TURNED:
         state = suspect_wheels(setup, state)
@@ -140,7 +140,8 @@ def advance(setup: Setup, state: Aligned, newest: PathFix | None = None) -> tupl
         text = "fixes are trusted again: they agree with dead reckoning"
         return state, (report_event(state, KIND, Verdict.USED, text),)
     assert fix is not None
-    after = after.suspect_path(utime, fix, setup.settings, begins=not bank.excludes_fixes)
+    if not bank.excludes_fixes and _ends_outage(state):
+        after = after.suspect_path(utime, fix, setup.settings)
     return _correct(setup, state._replace(bank=after), bank)
 
 
@@ -203,7 +204,7 @@ def _correct(setup: Setup, state: Aligned, before: HypothesisBank) -> tuple[Alig
     bank, (limit, _) = state.bank, output.get_limits(setup, state)
     assert bank is not None
     # fixes that are off by the hypothesis that the state is set to would move it away again
-    bank = bank.judge_fixes(limit, least=0.0, is_outage=_ends_outage(state))
+    bank = bank.judge_fixes(limit, least=0.0)
     state = _judge(setup, _follow(setup, state._replace(bank=bank)))
     return state, (report_event(state, KIND, Verdict.RESET, reason),)
 

@@ -265,15 +265,11 @@ SHARE_OF_LIMIT: Final = 0.2
 PLACE_SIGMA: Final = 0.1
 """Sigma of the place of the rolling frame beside the states, m."""
 
-LOST_SHARE, LOST_AFTER_OUTAGE = 1e-3, 0.1
-"""Probability that dead reckoning was lost where fixes are off: a tenth of the risk with which a pose is valid, so that
-it alone makes none invalid. And after an outage: gyro and wheels fail at a tenth of the rate at which fixes jump
-(`FAULTS`)."""
+LOST_SHARE: Final = 0.1
+"""Probability that dead reckoning was lost where fixes are off after an outage: gyro and wheels fail at a tenth of the
+rate at which fixes jump (`FAULTS`)."""
 
-REFUTED: Final = 0.01
-"""Share of its first weight at which such a hypothesis is refuted: one fix leaves VOID_SHARE, so more than one did."""
-
-TURNS, QUARTER = 8, 2
+TURNS: Final = 8
 """Directions in which dead reckoning that was lost may go on: 22.5 degrees either way, equation (3) is a line."""
 
 OWN_WAY, DRIFT_SIGMAS = 20.0, 5.0
@@ -315,7 +311,6 @@ class HypothesisBank(NamedTuple):
     settled: the fault that has become certain in the last step: from then on it is a corrected state, and no fault.
     excludes_fixes: whether fixes are not used, since they are off by the published hypothesis.
     may_be_transported: whether that began while the vehicle was at rest: a ferry or a trailer may move it.
-    may_be_lost: whether that began with the first fixes after an outage: dead reckoning may be wrong.
     reckoning: dead reckoning at `utime`.
     """
 
@@ -337,7 +332,6 @@ class HypothesisBank(NamedTuple):
     settled: Fault = Fault.NONE
     excludes_fixes: bool = False
     may_be_transported: bool = False
-    may_be_lost: bool = False
     reckoning: DeadReckoning = DeadReckoning()
 
     @property
@@ -356,11 +350,11 @@ class HypothesisBank(NamedTuple):
         n = self.published
         return bool(self.faults[n] or self.jumped[n] or not self.weights[n] > CERTAIN)
 
-    def judge_fixes(self, limit: float, *, least: float = SETTLED, is_outage: bool = False) -> HypothesisBank:
+    def judge_fixes(self, limit: float, *, least: float = SETTLED) -> HypothesisBank:
         """Return the bank with the decision whether fixes are used; `limit` is that of the position, m.
 
         They are not once they are certain to be off (with a weight of `least`), by a share of the limit that matters;
-        that lasts as long as the published hypothesis has them off. `is_outage`: whether no fix was used for a while.
+        that lasts as long as the published hypothesis has them off.
         """
         off = (self.jumped > 0) | (self.faults == Fault.DRIFT) | (self.faults == Fault.SPOOFING)
         excludes = bool(off[self.published])
@@ -374,27 +368,16 @@ class HypothesisBank(NamedTuple):
             x, P = self.means[self.published], self.covariances[self.published]
             variance = max(P[DRIFT, DRIFT], P[DRIFT + 1, DRIFT + 1])
             may_be_transported &= math.hypot(x[DRIFT], x[DRIFT + 1]) < DRIFT_SIGMAS * math.sqrt(variance)
-        may_be_lost = excludes and (self.may_be_lost if self.excludes_fixes else is_outage)
-        return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported, may_be_lost=may_be_lost)
+        return self._replace(excludes_fixes=excludes, may_be_transported=may_be_transported)
 
-    def suspect_path(self, utime: int, fix: PlanarFix, settings: FilterSettings, *, begins: bool) -> HypothesisBank:
-        """Return the bank beside the hypotheses that dead reckoning was lost, and that fixes which are off are right.
+    def suspect_path(self, utime: int, fix: PlanarFix, settings: FilterSettings) -> HypothesisBank:
+        """Return the bank beside the hypothesis that dead reckoning was lost, and that fixes which are off are right.
 
-        The vehicle is where `fix` is, in one of TURNS directions. `begins`: whether the fix is the first one that is
-        off; after an outage any direction may be right, else one that differs by a quarter turn or more.
+        The vehicle is where `fix` is, in one of TURNS directions. It is for the first fixes after an outage: those that
+        were dragged away and then stay look like a lost place too.
         """
-        is_lost = begins and self.may_be_lost
-        share = LOST_AFTER_OUTAGE if is_lost else LOST_SHARE
-        own = (self.faults == Fault.GYRO) & (self.jumped == 0)
-        # those that fixes have refuted begin again: the vehicle may turn unmeasured later
-        if self.weights[own].sum() > (share if begins else REFUTED * share):
-            return self
-        # fixes that were dragged away and then stay look like a lost place under nearly the same heading
-        first = 0 if is_lost else QUARTER
-        turns = np.arange(first, TURNS - max(first - 1, 0)) * math.tau / TURNS
-        n = len(turns)
-        means = np.repeat(self.means[self.published][None], n, axis=0)
-        means[:, HEADING] += turns
+        means = np.repeat(self.means[self.published][None], TURNS, axis=0)
+        means[:, HEADING] += np.arange(TURNS) * math.tau / TURNS
         place = fix.position - np.exp(1j * means[:, HEADING]) * fix.lever
         means[:, EAST], means[:, NORTH], means[:, ERROR:] = place.real, place.imag, 0.0
         variances = np.diagonal(self.covariances[self.published]).copy()
@@ -402,11 +385,10 @@ class HypothesisBank(NamedTuple):
         variances[HEADING] = (math.pi / TURNS) ** 2
         variances[BIAS] += (0.5 * settings.gyro_bias_step) ** 2
         variances[ERROR_RATE:] = 0.0
-        bank = self._replace(weights=self.weights * (1.0 - share))
-        labels, onsets = np.array(((Fault.GYRO, 0, 0),) * n), np.full(n, utime)
-        return bank._append(
-            means, np.repeat(np.diag(variances)[None], n, axis=0), np.full(n, share / n), labels, onsets
-        )
+        bank = self._replace(weights=self.weights * (1.0 - LOST_SHARE))
+        labels, onsets = np.array(((Fault.GYRO, 0, 0),) * TURNS), np.full(TURNS, utime)
+        covariances = np.repeat(np.diag(variances)[None], TURNS, axis=0)
+        return bank._append(means, covariances, np.full(TURNS, LOST_SHARE / TURNS), labels, onsets)
 
     @property
     def offset(self) -> complex:
