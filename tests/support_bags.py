@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ TYPES = {
     "odom": "nav_msgs/msg/Odometry",
     "joints": "sensor_msgs/msg/JointState",
     "text": "std_msgs/msg/String",
+    "tf": "tf2_msgs/msg/TFMessage",
 }
 
 START_NS = 1_700_000_000_000_000_000
@@ -23,18 +24,20 @@ class Ros:
     """Makes messages of one version of ROS, and writes them into a bag."""
 
     def __init__(self, version: int = 1):
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.version = version
         self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+        if version == 1:
+            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TYPES["tf"]))
 
     def make(self, type_name: str, /, **fields: Any) -> Any:
         return self.store.types[type_name](**fields)
 
-    def header(self, stamp_ns: int) -> Any:
+    def header(self, stamp_ns: int, frame: str = "x") -> Any:
         time = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         more = {"seq": 0} if self.version == 1 else {}
-        return self.make("std_msgs/msg/Header", stamp=time, frame_id="x", **more)
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **more)
 
     def vector(self, values: Sequence[float], name: str = "Vector3") -> Any:
         return self.make(f"geometry_msgs/msg/{name}", **dict(zip("xyz", map(float, values), strict=True)))
@@ -126,6 +129,21 @@ class Ros:
             velocity=np.array(velocity, float),
             effort=np.array([], float),
         )
+
+    def transforms(
+        self, stamp_ns: int, parent: str, children: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    ) -> Any:
+        """Return a TFMessage: position and quaternion, scalar first, of each child in the parent."""
+        found = []
+        for child, (xyz, wxyz) in children.items():
+            pose = self.make(
+                "geometry_msgs/msg/Transform", translation=self.vector(xyz), rotation=self.quaternion(wxyz)
+            )
+            header = self.header(stamp_ns, parent)
+            found.append(
+                self.make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=pose)
+            )
+        return self.make(TYPES["tf"], transforms=found)
 
     def text(self, words: str) -> Any:
         return self.make(TYPES["text"], data=words)

@@ -186,6 +186,6 @@ def test_given_a_file_without_lcm_messages_or_a_damaged_one_then_import_bag_ends
     cut.write_bytes(mcap.read_bytes()[:20_000])
     assert run_import(cut, out) != 0
     assert "cut.mcap: the MCAP file" in capsys.readouterr().err
-    assert run_import(mcap, out, "--topic", "/lcm/GPS=gps") != 0
+    assert run_import(mcap, out, "--topic", "gps=/lcm/GPS") != 0
     assert "--topic goes with a ROS bag" in capsys.readouterr().err
     assert not out.exists()

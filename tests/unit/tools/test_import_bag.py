@@ -13,12 +13,15 @@ import pytest
 from support_bags import START_NS, Ros
 
 from modelserver.errors import RecordingError
+from modelserver.formats import load_model
 from modelserver.messages import Direction, FixType, ImuSample, OrientationReference, WheelsSample, YawSource
+from modelserver.transforms import Pose
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.commands.import_bag import import_bag
 from mstools.recordings.bags import DEFAULT_OPTIONS, Altitude, BagOptions, ImuOrientation, TopicKind
+from mstools.recordings.log_platform import LogPlatform
 
 TYPE_NAMES = {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t", "JOINTS": "joints_t"}
 
@@ -175,7 +178,7 @@ def test_given_two_inertial_units_when_imported_then_the_busier_is_taken_and_the
     )
     by_topic = {each.topic: each for each in import_bag(bag, tmp_path / "a.lcm").topics}
     assert by_topic["/two"].written == 2
-    assert "--topic /one=imu" in by_topic["/one"].skipped
+    assert "--topic imu=/one" in by_topic["/one"].skipped
     assert by_topic["/chatter"].skipped == "unsupported type"
     chosen = import_bag(bag, tmp_path / "b.lcm", kinds={"/one": TopicKind.IMU})
     assert {each.topic: each.written for each in chosen.topics} == {"/one": 1, "/two": 0, "/chatter": 0}
@@ -449,6 +452,78 @@ def test_given_no_rosbags_when_imported_then_the_pip_command_is_reported(
     assert err.count("\n") == 1
 
 
+# --- choice of topics ---------------------------------------------------------------------------------------
+
+
+def test_given_busier_outputs_of_estimators_then_the_sensors_are_taken_and_the_reason_is_shown(
+    tmp_path: Path, ros: Ros, capsys: pytest.CaptureFixture[str]
+) -> None:
+    busy = [(name, START_NS + n, make()) for n in range(3) for name, make in (("/gps/filtered", ros.fix),)]
+    busy += [(name, START_NS + n, ros.odom()) for n in range(3) for name in ("/odometry/filtered", "/odometry/gps")]
+    bag = ros.write(tmp_path / "a.bag", [*busy, ("/fix", START_NS, ros.fix()), ("/wheel/odom", START_NS, ros.odom())])
+    code, out, err = run(capsys, "import-bag", bag)
+    assert (code, err) == (0, "")
+    lines = dict(line.split(" -> ") for line in out.splitlines())
+    assert lines["  /fix (sensor_msgs/msg/NavSatFix)"] == "gps, the busiest that no estimator makes"
+    assert lines["  /wheel/odom (nav_msgs/msg/Odometry)"] == "wheels, the busiest that no estimator makes"
+    assert (
+        "estimator's output (filtered); --topic gps=/gps/filtered"
+        in lines["  /gps/filtered (sensor_msgs/msg/NavSatFix)"]
+    )
+    assert "estimator's output (gps)" in lines["  /odometry/gps (nav_msgs/msg/Odometry)"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.bag"]
+
+
+def test_given_only_the_output_of_an_estimator_then_it_is_taken_with_a_note(tmp_path: Path, ros: Ros) -> None:
+    bag = ros.write(tmp_path / "a.bag", [("/odometry/filtered", START_NS, ros.odom())])
+    (report,) = import_bag(bag, tmp_path / "a.lcm").topics
+    assert (report.written, report.chosen) == (1, "the only one")
+    assert "looks like an estimator's output (filtered)" in report.notes[0]
+
+
+# --- frames -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_given_tf_then_still_frames_are_constraints_and_moving_ones_joints(tmp_path: Path, version: int) -> None:
+    """What the geometry and the log answer is what the bag's transforms are, at each time."""
+    ros = Ros(version)
+    half = math.sqrt(0.5)
+    still = {"gps_link": ((0.1, 0.0, 0.9), (1.0, 0.0, 0.0, 0.0)), "mast": ((0.3, 0.0, 1.0), (half, 0.0, 0.0, half))}
+    messages = [("/tf_static", START_NS, ros.transforms(START_NS, "base_link", still))]
+    turns = [0.1 * n for n in range(5)]
+    for n, turn in enumerate(turns):
+        stamp, wxyz = START_NS + n * 10**8, (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0)
+        messages.append(("/tf", stamp, ros.transforms(stamp, "mast", {"camera": ((0.0, 0.0, 0.2), wxyz)})))
+        messages.append(
+            ("/tf", stamp, ros.transforms(stamp, "odom", {"base_link": ((float(n), 0.0, 0.0), (1, 0, 0, 0))}))
+        )
+        messages.append(("/imu", stamp, ros.imu(stamp)))
+    bag = ros.write(tmp_path / ("a.bag" if version == 1 else "a"), messages)
+    import_bag(bag, tmp_path / "a.lcm", geometry=tmp_path / "robot.yaml")
+    model = load_model(tmp_path / "robot.yaml")
+    assert model.root.name == "base_link"
+    assert sorted(model.get_body_list()) == ["base_link", "camera", "gps_link", "mast"]
+    assert model.get_transformation("gps_link", "base_link").pose.xyz == (0.1, 0.0, 0.9)
+    assert list(model.joints) == ["mast_to_camera"]
+    log = LogPlatform(tmp_path / "a.lcm", "", model)
+    for n, turn in enumerate(turns):
+        answer = log.get_pose("camera", "mast", at=START_NS // 1000 + n * 100_000)
+        expected = Pose((0.0, 0.0, 0.2), (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0))
+        assert answer.transformation.pose.is_close(expected, 1e-9, 1e-9)
+
+
+def test_given_no_transforms_of_the_vehicle_then_geometry_is_an_error_and_nothing_is_written(
+    tmp_path: Path, ros: Ros
+) -> None:
+    messages = [("/fix", START_NS, ros.fix())]
+    messages.append(("/tf", START_NS, ros.transforms(START_NS, "map", {"odom": ((0, 0, 0), (1, 0, 0, 0))})))
+    bag = ros.write(tmp_path / "a.bag", messages)
+    with pytest.raises(RecordingError, match="no transforms between frames of the vehicle"):
+        import_bag(bag, tmp_path / "a.lcm", geometry=tmp_path / "robot.yaml")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.bag"]
+
+
 # --- the command --------------------------------------------------------------------------------------------
 
 
@@ -456,7 +531,7 @@ def test_given_json_when_imported_then_the_report_is_for_scripts(
     tmp_path: Path, ros: Ros, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = ros.write(tmp_path / "a.bag", [("/fix", START_NS, ros.fix()), ("/fix", START_NS + 10**9, ros.fix())])
-    code, out, err = run(capsys, "import-bag", bag, tmp_path / "a.lcm", "--json", "--topic", "/fix=gps")
+    code, out, err = run(capsys, "import-bag", bag, tmp_path / "a.lcm", "--json", "--topic", "gps=/fix")
     assert (code, err) == (0, "")
     report = json.loads(out)
     assert report["seconds"] == 1.0
@@ -467,7 +542,7 @@ def test_given_json_when_imported_then_the_report_is_for_scripts(
     "options",
     [
         ["--topic", "fix"],
-        ["--topic", "/fix=radar"],
+        ["--topic", "radar=/fix"],
         ["--track-width", "0"],
         ["--track-width", "nan"],
         ["--undulation", "-28"],

@@ -11,14 +11,15 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import lcm
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.files import check_links
-from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
+from modelserver.formats import save_model
+from modelserver.messages import MAX_CHANNEL_LENGTH, JointsSample, SensorHeader
 from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
 from mstools.recordings.bags import (
@@ -34,20 +35,28 @@ from mstools.recordings.bags import (
     is_lcm_mcap,
     open_bag,
     open_mcap,
+    read_stamp,
 )
+from mstools.recordings.tf_tree import TF_TYPES, TfTree
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape, show_progress
+from mstools.terminal.output import check_writable, escape, show_progress, write_file
 
 
 def command(
     bag: Annotated[Path, argument("BAG", "ROS 1 file, folder of a ROS 2 recording, or MCAP file of export.")],
-    log: Annotated[Path, argument("LOG", "LCM event log to write.")],
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="LCM event log to write. Without: show what would be taken.")
+    ] = None,
     topic: Annotated[
         list[str] | None,
         option(
-            "--topic TOPIC=KIND",
-            "Type of a topic: gps, imu, wheels or joints. Default: the busiest topic of each type.",
+            "--topic KIND=TOPIC",
+            "Topic of the gps, imu, wheels or joints. Default: of each type the busiest one that no estimator makes.",
         ),
+    ] = None,
+    geometry: Annotated[
+        Path | None,
+        option("--geometry FILE", "Write the frames of tf as a geometry file; those that move become joints."),
     ] = None,
     altitude: Annotated[
         Altitude, option("--altitude", "Reference of the fixes' altitudes. ROS prescribes the ellipsoid.")
@@ -74,7 +83,8 @@ def command(
 
     \b
     Example:
-      modelserver import-bag drive.bag drive.lcm
+      modelserver import-bag drive.bag
+      modelserver import-bag drive.bag drive.lcm --topic gps=/ublox/fix
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv
     """
     if not 0.0 < track_width < 100.0:
@@ -83,24 +93,34 @@ def command(
         raise typer.BadParameter("--undulation goes with --altitude msl")
     if any(not (c.isascii() and (c.isalnum() or c == "_")) for c in prefix) or len(prefix) > MAX_CHANNEL_LENGTH - 16:
         raise typer.BadParameter(f"a prefix consists of letters, digits and underscores, got {quote(prefix)}")
-    check_writable(str(log))
-    options = BagOptions(altitude, undulation, imu_orientation, track_width)
     kinds: dict[str, TopicKind] = {}
     for pair in topic or ():
-        name, _, kind = pair.rpartition("=")
+        kind, _, name = pair.partition("=")
         if not name or kind not in list(TopicKind):
-            raise typer.BadParameter(f"--topic takes TOPIC=gps, imu, wheels or joints, got {quote(pair)}")
+            kinds_of = ", ".join(TopicKind)
+            raise typer.BadParameter(f"--topic takes KIND=TOPIC with one of {kinds_of}, got {quote(pair)}")
         kinds[name] = TopicKind(kind)
-    report = import_bag(bag, log, options, kinds, prefix, force)
+    if log is None:
+        with open_bag(bag) as opened:
+            _, topics = choose_topics(opened.topics, kinds, str(bag), has_tf=geometry is not None)
+        report = ImportReport("", list(topics.values()))
+    else:
+        check_writable(str(log))
+        if geometry is not None:
+            check_writable(str(geometry), replace=force)
+        options = BagOptions(altitude, undulation, imu_orientation, track_width)
+        report = import_bag(bag, log, options, kinds, prefix, force, geometry)
     typer.echo(json.dumps(dataclasses.asdict(report), indent=2) if as_json else report.to_text())
 
 
 @dataclass(slots=True)
 class TopicReport:
-    """Result of one topic: the number of written messages, or why it was skipped."""
+    """Result of one topic: the number of written messages and why it was chosen, or why it was skipped."""
 
     topic: str
     type_name: str
+    kind: str = ""
+    chosen: str = ""
     channel: str = ""
     written: int = 0
     skipped: str = ""
@@ -109,19 +129,24 @@ class TopicReport:
 
 @dataclass(slots=True)
 class ImportReport:
-    """Result of an import."""
+    """Result of an import, or without a log of the choice of topics; `geometry` is the geometry file written."""
 
     log: str
     topics: list[TopicReport]
     seconds: float = 0.0
+    geometry: str = ""
 
     def to_text(self) -> str:
         total = sum(each.written for each in self.topics)
-        lines = [f"{self.log}: {total} messages, {self.seconds:.1f} s"]
+        lines = [f"{self.log}: {total} messages, {self.seconds:.1f} s"] if self.log else []
         for each in self.topics:
-            what = f"{each.channel}: {each.written} messages" if each.channel else f"skipped: {each.skipped}"
+            what = f"{each.channel or each.kind}, {each.chosen}" if each.chosen else f"skipped: {each.skipped}"
+            if each.channel:
+                what += f": {each.written} messages"
             lines.append(escape(f"  {each.topic} ({each.type_name}) -> {what}"))
             lines.extend(escape(f"    note: {note}") for note in each.notes)
+        if self.geometry:
+            lines.append(escape(f"written: {self.geometry}"))
         return "\n".join(lines)
 
 
@@ -132,8 +157,9 @@ def import_bag(
     kinds: Mapping[str, TopicKind] | None = None,
     prefix: str = "",
     force: bool = False,
+    geometry: Path | None = None,
 ) -> ImportReport:
-    """Write the log of a bag atomically; see `command`. `kinds`: the type of topics by name.
+    """Write the log of a bag atomically, and the `geometry` of its tf; see `command`. `kinds`: of topics by name.
 
     Raises RecordingError for a bag that cannot be read or has nothing to convert, or a log that exists; OSError.
     """
@@ -150,18 +176,38 @@ def import_bag(
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
         else:
             with open_bag(bag_path) as bag:
-                chosen, of_topic = choose_topics(bag.topics, dict(kinds or {}), str(bag_path))
-                seconds = _write(bag, part, chosen, of_topic, options, prefix)
+                has_tf = geometry is not None
+                chosen, of_topic = choose_topics(bag.topics, dict(kinds or {}), str(bag_path), has_tf=has_tf)
+                tree = _read_tf(bag, of_topic) if has_tf else TfTree()
+                text = save_model(tree.build_model(bag_path.stem), "yaml").text if has_tf else ""
+                seconds = _write(bag, part, chosen, of_topic, options, prefix, tree)
                 reports = list(of_topic.values())
+            if geometry is not None:
+                write_file(str(geometry), text, replace=force)
         os.replace(part, log_path)
-    return ImportReport(str(log_path), reports, seconds)
+    return ImportReport(str(log_path), reports, seconds, "" if geometry is None else str(geometry))
+
+
+def _read_tf(bag: Bag, reports: Mapping[str, TopicReport]) -> TfTree:
+    """Return the frames of a bag, and note those with two parents at their topic."""
+    tree = TfTree()
+    of_tf = {name for name, each in reports.items() if each.kind == TF}
+    for name, _, message in bag.messages(of_tf):
+        tree.add(message)
+        reports[name].written += 1
+    for name in of_tf:
+        if tree.conflicts:
+            reports[name].notes.append(
+                f"frames with two parents, of which the last counts: {', '.join(tree.conflicts)}"
+            )
+    return tree
 
 
 def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) -> tuple[list[TopicReport], float]:
     """Write the LCM messages of an MCAP file; return the reports and the seconds between the first and the last."""
     with open_mcap(mcap_path) as mcap:
         reports = {
-            name: TopicReport(f"/lcm/{name}", type_name, f"{prefix}{name}")
+            name: TopicReport(f"/lcm/{name}", type_name, chosen="as it is", channel=f"{prefix}{name}")
             for name, (type_name, _) in mcap.channels.items()
         }
         if not reports:
@@ -189,16 +235,22 @@ def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) ->
     return list(reports.values()), (last - first) * 1e-6
 
 
+TF: Final = "tf"
+"""Kind of the topics of transforms, which become geometry and joints."""
+
+
 def choose_topics(
-    topics: Iterable[Topic], kinds: dict[str, TopicKind], bag: str
+    topics: Iterable[Topic], kinds: dict[str, TopicKind], bag: str, *, has_tf: bool = False
 ) -> tuple[dict[str, TopicKind], dict[str, TopicReport]]:
     """Return the type of each chosen topic, and the initial report of every topic.
 
-    Topics in `kinds` come first; for the other types the busiest matching topic is chosen.
-    Raises RecordingError if a named topic is missing or of another type, or there is nothing to convert.
+    Topics in `kinds` come first; for the other types the busiest matching topic is chosen, before it those that do not
+    look like the output of an estimator. `has_tf`: whether transforms are read too. Raises RecordingError if a named
+    topic is missing or of another type, or there is nothing to convert.
     """
     known = {each.name: each for each in topics}
     chosen: dict[str, TopicKind] = {}
+    reports = {name: TopicReport(name, each.type_name) for name, each in known.items()}
     for name, kind in kinds.items():
         if name not in known:
             near = find_nearest_names(name, known)
@@ -209,21 +261,30 @@ def choose_topics(
         if kind in chosen.values():
             raise RecordingError(f"{bag}: two topics for {kind}; a log has one source of each type")
         chosen[name] = kind
-    reports = {name: TopicReport(name, each.type_name) for name, each in known.items()}
+        reports[name].kind, reports[name].chosen = kind, "as --topic gives it"
     taken = {kind: name for name, kind in chosen.items()}
-    for each in sorted(known.values(), key=lambda each: (-each.count, each.name)):
-        found = ROS_TYPES.get(each.type_name)
+    for each in sorted(known.values(), key=lambda each: (bool(each.estimator), -each.count, each.name)):
+        found, report = ROS_TYPES.get(each.type_name), reports[each.name]
         if each.name in chosen:
             continue
-        if found is None:
-            reports[each.name].skipped = "unsupported type"
+        if each.type_name in TF_TYPES:
+            report.kind = TF
+            report.chosen, report.skipped = ("geometry", "") if has_tf else ("", "--geometry FILE takes its frames")
+        elif found is None:
+            report.skipped = "unsupported type"
         elif each.count == 0:
-            reports[each.name].skipped = "no messages"
+            report.skipped = "no messages"
         elif taken.setdefault(found, each.name) != each.name:
-            other = f"{taken[found]} is the {found} source"
-            reports[each.name].skipped = f"{other}; --topic {each.name}={found} selects this one"
+            why = f"; this looks like an estimator's output ({each.estimator})" if each.estimator else ""
+            report.skipped = f"{taken[found]} is the {found} source{why}; --topic {found}={each.name} selects this one"
         else:
             chosen[each.name] = found
+            several = sum(ROS_TYPES.get(other.type_name) is found and other.count > 0 for other in known.values()) > 1
+            report.kind, report.chosen = found, "the busiest that no estimator makes" if several else "the only one"
+            if each.estimator:
+                report.chosen = "the busiest" if several else "the only one"
+                looks = f"this looks like an estimator's output ({each.estimator}), whose errors last"
+                report.notes.append(f"{looks}: record the sensor itself")
     if not chosen:
         types = ", ".join(name.replace("/msg/", "/") for name in ROS_TYPES)
         raise RecordingError(f"{bag}: no messages of {types}")
@@ -237,23 +298,30 @@ def _write(
     reports: Mapping[str, TopicReport],
     options: BagOptions,
     prefix: str,
+    tree: TfTree,
 ) -> float:
-    """Write the messages of the chosen topics; return the seconds between the first and the last."""
+    """Write the messages of the chosen topics and the joints of `tree`; return the seconds from first to last."""
     converters = {name: CONVERTERS[kind](options) for name, kind in chosen.items()}
     unstamped = dict.fromkeys(chosen, 0)
     offsets: dict[str, list[float]] = {name: [] for name in chosen}
-    total = sum(each.count for each in bag.topics if each.name in chosen)
+    moving = {name for name, each in reports.items() if each.kind == TF} if tree.has_joints else set()
+    total = sum(each.count for each in bag.topics if each.name in chosen or each.name in moving)
     for name, kind in chosen.items():
         reports[name].channel = f"{prefix}{kind.upper()}"
-    first = last = done = 0
+    first = last = done = num_joints = 0
     out = lcm.EventLog(str(path), "w", overwrite=True)
     try:
         with show_progress(f"importing {path.name}", total) as show:
-            for name, received_ns, message in bag.messages(set(chosen)):
+            for name, received_ns, message in bag.messages(chosen.keys() | moving):
                 report = reports[name]
                 arrived = received_ns // 1000
-                stamp = message.header.stamp
-                utime = int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
+                if name in moving:
+                    for stamp, joints in tree.read_joints(message):
+                        header = SensorHeader(stamp or arrived, TF, num_joints, arrived)
+                        out.write_event(arrived, f"{prefix}JOINTS", codec.encode(JointsSample(header, joints)))
+                        num_joints += 1
+                    continue
+                utime = read_stamp(message)
                 if utime <= 0:
                     utime = arrived
                     unstamped[name] += 1

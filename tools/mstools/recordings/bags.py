@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import itertools
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -53,16 +54,39 @@ STATIONARY_SPEED = 1e-3
 """Speed in m/s below which a wheel is stationary: averaging controllers leave residues of 1e-15."""
 
 
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+
+ESTIMATOR_WORDS: Final = (
+    *("filtered", "fused", "fusion", "ekf", "ukf", "localization", "estimate", "estimated", "estimator", "navsat"),
+    *("amcl", "slam", "rtabmap", "map", "global", "icp", "rf2o", "laser", "lidar", "visual", "vio", "vo", "rgbd"),
+)
+
+
 # --- bags ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of a bag: its name, its type in ROS 2 notation (sensor_msgs/msg/Imu), number of messages."""
+    """One topic of a bag: its name, its type in ROS 2 notation (sensor_msgs/msg/Imu), number of messages.
+
+    publisher: the name of the node that published it, where the bag has it (ROS 1).
+    """
 
     name: str
     type_name: str
     count: int
+    publisher: str = ""
+
+    @property
+    def estimator(self) -> str:
+        """The word by which it looks like the output of an estimator instead of a sensor; "" if nothing does.
+
+        The words are those of the nodes that do it: robot_localization (ekf, ukf, navsat_transform; its topics are
+        odometry/filtered, gps/filtered and odometry/gps), amcl, slam_toolbox, rtabmap, rf2o, visual odometry.
+        """
+        words = re.findall(r"[a-z0-9]+", f"{self.name} {self.publisher}".lower())
+        known = (*ESTIMATOR_WORDS, "gps") if self.type_name == ODOMETRY else ESTIMATOR_WORDS
+        return next((word for word in words if word in known), "")
 
 
 class Bag:
@@ -72,9 +96,11 @@ class Bag:
         self._path = path
         self._reader = reader
         counts: Counter[tuple[str, str]] = Counter()
+        publishers: dict[tuple[str, str], str] = {}
         for each in reader.connections:
             counts[each.topic, each.msgtype] += each.msgcount
-        self.topics = tuple(Topic(*names, count) for names, count in sorted(counts.items()))
+            publishers[each.topic, each.msgtype] = getattr(each.ext, "callerid", None) or ""
+        self.topics = tuple(Topic(*names, count, publishers[names]) for names, count in sorted(counts.items()))
 
     def messages(self, topics: set[str]) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, receive time (ns) and message of some topics in the order received. Raises RecordingError."""
@@ -239,7 +265,7 @@ class TopicKind(StrEnum):
 ROS_TYPES = {
     "sensor_msgs/msg/NavSatFix": TopicKind.GPS,
     "sensor_msgs/msg/Imu": TopicKind.IMU,
-    "nav_msgs/msg/Odometry": TopicKind.WHEELS,
+    ODOMETRY: TopicKind.WHEELS,
     "sensor_msgs/msg/JointState": TopicKind.JOINTS,
 }
 
@@ -482,6 +508,12 @@ CONVERTERS: dict[TopicKind, type[Converter]] = {
 
 
 # --- parts --------------------------------------------------------------------------------------------------
+
+
+def read_stamp(message: Any) -> int:
+    """Return the time of measurement of a message with a header, microseconds since 1970; 0 for none."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
 
 
 def _covariance(values: Sequence[float]) -> Matrix3 | None:
