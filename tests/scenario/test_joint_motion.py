@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import FAST_HEALTH, Daemon
-from support_lcm import Listener, invoke, wait_until
+from support_lcm import MODELSERVER, Listener, invoke, wait_until
 from support_samples import GEOMETRY, write_vehicle
 
 import modelserver as ms
@@ -241,7 +243,22 @@ def test_given_joints_then_the_nodding_frame_moves_and_an_unknown_name_is_counte
     assert json.loads(out)["angular_velocity"] == pytest.approx([0.0, 1.0, 0.0])
     code, out, _ = run_tool(daemon, "tree", "--live")
     assert code == 0
-    assert "└─ Camera  (Mounted: revolute, -30 to 20 deg)" in out
+    assert re.search(r"└─ Camera  \(Mounted: revolute, -30 to 20 deg, \d+\.\d\d s ago by axis\)", out)
+    assert daemon.end() == 0
+
+
+def test_given_query_watch_then_it_answers_until_it_is_interrupted(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon(FAST_HEALTH)
+    arguments = ("query", "Camera", "Cart:Base", "--watch", "100", "--json", "--url", daemon.url)
+    with subprocess.Popen([*MODELSERVER, *arguments], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        answers = [json.loads(process.stdout.readline()) for _ in range(5)]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30.0) == 0
+    assert {(each["frame_of_interest"], each["valid"]) for each in answers} == {("Camera:Origin", True)}
+    code, _, err = run_tool(daemon, "query", "Camera", "map", "--watch", "1", "--at", "1")
+    assert code == 2
+    assert "--watch" in err
     assert daemon.end() == 0
 
 

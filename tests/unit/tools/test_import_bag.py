@@ -485,12 +485,12 @@ def test_given_only_the_output_of_an_estimator_then_it_is_taken_with_a_note(tmp_
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_given_tf_then_still_frames_are_constraints_and_moving_ones_joints(tmp_path: Path, version: int) -> None:
+def test_given_tf_then_rigid_frames_are_constraints_and_moving_ones_joints(tmp_path: Path, version: int) -> None:
     """What the geometry and the log answer is what the bag's transforms are, at each time."""
     ros = Ros(version)
     half = math.sqrt(0.5)
-    still = {"gps_link": ((0.1, 0.0, 0.9), (1.0, 0.0, 0.0, 0.0)), "mast": ((0.3, 0.0, 1.0), (half, 0.0, 0.0, half))}
-    messages = [("/tf_static", START_NS, ros.transforms(START_NS, "base_link", still))]
+    fixed = {"gps_link": ((0.1, 0.0, 0.9), (1.0, 0.0, 0.0, 0.0)), "mast": ((0.3, 0.0, 1.0), (half, 0.0, 0.0, half))}
+    messages = [("/tf_static", START_NS, ros.transforms(START_NS, "base_link", fixed))]
     turns = [0.1 * n for n in range(5)]
     for n, turn in enumerate(turns):
         stamp, wxyz = START_NS + n * 10**8, (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0)

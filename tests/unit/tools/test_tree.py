@@ -13,14 +13,17 @@ import pytest
 from support_lcm import reserved_url
 from support_samples import START, VEHICLE, write_vehicle
 
+from modelserver.client.mirror_state import MirrorState
 from modelserver.formats import load_model
 from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
+from modelserver.joints import JointHistory
+from modelserver.messages import JointSample, JointsSample, SensorHeader
 from modelserver.transforms import Pose
 from modelserver.wire.codec import encode, split_snapshot
 from mstools.cli import main
-from mstools.commands.tree import build_nodes, draw_lines, draw_svg
+from mstools.commands.tree import build_nodes, describe_rates, draw_lines, draw_svg
 from mstools.terminal.output import replace_unencodable
 
 Run = Callable[..., tuple[int, str, str]]
@@ -197,11 +200,34 @@ class PublishingDaemon:
         self.thread.join()
 
 
-def test_given_a_daemon_then_the_geometry_that_it_broadcasts_is_drawn(run: Run, arm: Path) -> None:
+def test_given_a_daemon_then_the_geometry_that_it_broadcasts_is_drawn(
+    run: Run, arm: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.commands.tree.LISTENING_S", 0.02)
     with reserved_url() as url, PublishingDaemon(url, load_model(arm)):
         code, out, _ = run("--live", "--url", url, "--prefix", "V1_")
+    title, _, lines = out.partition("\n")
     assert code == 0
-    assert out.partition("\n")[2] == TREE
+    assert title.endswith("; no POSE")
+    assert lines.replace(", at its default: no reading", "") == TREE
+    assert "(Rise: prismatic, 0 to 0.5 m, at its default: no reading)" in lines
+
+
+def test_given_readings_then_each_joint_has_its_rate_age_and_source(arm: Path) -> None:
+    model = load_model(arm)
+    joints = JointHistory(model.constraints, 10.0)
+    for n in range(11):
+        readings = (JointSample("Turn", 0.01 * n), *((JointSample("Rise", 0.1),) if n == 5 else ()))
+        joints, rejected = joints.update(
+            JointsSample(SensorHeader(START + n * 50_000, "head", n), readings), START + 500_000
+        )
+        assert rejected == ()
+    snapshot = ModelSnapshot("arm", model, "Base:Mount", "Base:Mount", 60.0, "JOINTS")
+    state = MirrorState(snapshot=snapshot, joints=joints, clock_offset=1_000_000)
+    notes = describe_rates(state, START - 250_000)
+    assert notes["Turn"] == ", 20.0 Hz, 0.25 s ago by head"
+    assert notes["Rise"] == ", 0.50 s ago by head"
+    assert "Close" not in notes  # it follows Turn
 
 
 def test_given_nobody_then_it_reports_where_it_listened_and_what_to_do(run: Run) -> None:

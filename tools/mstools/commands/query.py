@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +14,14 @@ import numpy as np
 import typer
 
 from modelserver.client.remote import NO_DEMAND, FrameClient, R
-from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest_names, quote
+from modelserver.errors import (
+    ModelServerError,
+    NoServerError,
+    QueryError,
+    UnknownFrameError,
+    find_nearest_names,
+    quote,
+)
 from modelserver.geometry import names
 from modelserver.messages import (
     NO_FLAGS,
@@ -44,7 +52,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import escape, format_table, load_given_model, replace_unencodable, to_json
+from mstools.terminal.output import catch_signals, escape, format_table, load_given_model, replace_unencodable, to_json
 
 if TYPE_CHECKING:
     from mstools.recordings.log_platform import LogPlatform
@@ -180,6 +188,9 @@ def _format_vector(values: Iterable[float], scale: float, unit: str) -> str:
     return "  ".join(f"{scale * value + 0.0:.4f}" for value in known) + f"  {unit}".rstrip()
 
 
+MAX_WATCH_HZ = 100.0
+"""A terminal shows no more, and a client is served at this rate (docs/reliability.md)."""
+
 EXIT_UNMET = 3
 """Exit code of an answer that does not meet the demand."""
 
@@ -206,6 +217,9 @@ def command(
         str, option("--policy", f"What is accepted at that time: {', '.join(POLICIES)}.")
     ] = "interpolated",
     wait_ms: Annotated[int, option("--wait-ms", "Let the daemon wait for data that cover it.", min=0, max=60_000)] = 0,
+    watch: Annotated[
+        float, option("--watch HZ", "Ask again at this rate until Ctrl-C.", min=0.0, max=MAX_WATCH_HZ)
+    ] = 0.0,
     explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
     motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
     expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
@@ -222,20 +236,24 @@ def command(
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 1.0,
 ) -> None:
-    """Print the pose of one frame in another. Frames are named Body:Frame.
+    """Print the pose of one frame in another. Frames are named Body:Frame, or by a body alone its frame Origin.
 
     Queries the running daemon, with --model a geometry file, or with --log the geometry, poses and joints of a log.
-    World:UTM, World:ENU and Odom:Origin exist beside the frames of the geometry. Exit code 1 if there is no answer, 3
-    if a demand (--max-..., --min-integrity) is unmet, which is printed with the reason; a pose that is not valid is
-    printed with the reason, and exits 0.
+    World:UTM, World:ENU and Odom:Origin, in short utm, map and odom, exist beside the frames of the geometry. Exit code
+    1 if there is no answer, 3 if a demand (--max-..., --min-integrity) is unmet, which is printed with the reason; a
+    pose that is not valid is printed with the reason, and exits 0. With --watch, what has no answer is printed and
+    asked again, and JSON is one line an answer.
 
     --explain prints each frame, constraint and joint on the path with its provenance, age, source, and share of the
     variance. --motion prints velocity and acceleration, linear and angular.
 
     \b
     Example:
-      modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
+      modelserver query Digiclops:ImagePlane FrontNoddingSICK --model config/raptor/geometry.xml
+      modelserver query base_link map --watch 2
     """
+    if watch and (at or log is not None):
+        raise typer.BadParameter("shows the latest pose: it goes without --at and --log", param_hint="--watch")
     when = POLICIES[choose_name(policy, POLICIES, "policy", "--policy")]
     if expressed_in and not motion:
         raise typer.BadParameter("needs --motion, whose axes it sets", param_hint="--expressed-in")
@@ -263,28 +281,56 @@ def command(
                 f"{utime} looks like seconds since 1970; times are microseconds: {utime}000000", param_hint="--at"
             )
     ends = (frame_of_interest, frame_of_reference)
-    text, data = "", dict[str, Any]()
-    if explain:
-        found = source.explain(*ends, at=utime, policy=when, wait_ms=wait_ms)
-        answer, text, data = found.answer, f"{describe_edges(found)}\n\n", {"edges": edges_as_data(found)}
-    elif motion:
-        moving = source.get_motion(*ends, expressed_in=expressed_in, at=utime, policy=when, wait_ms=wait_ms)
-        answer, text, data = moving.pose, f"{describe_motion(moving)}\n\n", motion_as_data(moving)
-    else:
-        answer = source.get_pose(
-            *ends,
-            at=utime,
-            policy=when,
-            wait_ms=wait_ms,
-            max_horizontal=max_horizontal,
-            max_heading=math.radians(max_heading),
-            max_age=max_age,
-            min_integrity=min_integrity,
-        )
-    met = "\n  demand          met" if is_demanding and not answer.unmet else ""
-    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer) + met)
+
+    def ask() -> tuple[PoseAnswer, str]:
+        text, data = "", dict[str, Any]()
+        if explain:
+            found = source.explain(*ends, at=utime, policy=when, wait_ms=wait_ms)
+            answer, text, data = found.answer, f"{describe_edges(found)}\n\n", {"edges": edges_as_data(found)}
+        elif motion:
+            moving = source.get_motion(*ends, expressed_in=expressed_in, at=utime, policy=when, wait_ms=wait_ms)
+            answer, text, data = moving.pose, f"{describe_motion(moving)}\n\n", motion_as_data(moving)
+        else:
+            answer = source.get_pose(
+                *ends,
+                at=utime,
+                policy=when,
+                wait_ms=wait_ms,
+                max_horizontal=max_horizontal,
+                max_heading=math.radians(max_heading),
+                max_age=max_age,
+                min_integrity=min_integrity,
+            )
+        if as_json:
+            return answer, json.dumps(as_dict(answer) | data, indent=None if watch else 2)
+        met = "\n  demand          met" if is_demanding and not answer.unmet else ""
+        return answer, text + describe(answer) + met
+
+    if watch:
+        watch_answers(lambda: ask()[1], 1.0 / watch)
+        return
+    answer, shown = ask()
+    typer.echo(shown)
     if answer.unmet:
         raise typer.Exit(EXIT_UNMET)
+
+
+def watch_answers(ask: Callable[[], str], period: float) -> None:
+    """Print an answer each `period` seconds until a signal; why there is none goes to stderr, a reason once."""
+    reason = ""
+    with catch_signals() as stop:
+        due = time.monotonic()
+        while not stop.is_set():
+            try:
+                typer.echo(ask())
+                reason = ""
+            except (QueryError, NoServerError) as error:
+                if str(error) != reason:
+                    reason = str(error)
+                    typer.echo(f"modelserver: {escape(reason)}", err=True)
+            # after a long answer the next one is due at once, and not all those missed
+            due = max(due + period, time.monotonic())
+            stop.wait(due - time.monotonic())
 
 
 def _parse_time(text: str) -> int:

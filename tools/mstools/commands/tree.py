@@ -6,9 +6,10 @@ import html
 import json
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -30,8 +31,16 @@ from mstools.terminal.output import (
     write_file,
 )
 
+if TYPE_CHECKING:
+    from modelserver.client.mirror_state import MirrorState
+
+NO_NOTES: Final[Mapping[str, str]] = MappingProxyType({})
+
 TIMEOUT_S = 11.0
 """Timeout for MODEL_SNAPSHOT, seconds; it is published every 5 s by default."""
+
+LISTENING_S = 2.0
+"""Seconds for which POSE and JOINTS are counted: enough for the rate of a joint that is published once a second."""
 
 
 def command(
@@ -49,7 +58,8 @@ def command(
     """Draw the kinematic tree: constraints with their joints and limits, loop closures, orphans.
 
     The parent of each body is on its shortest path from the root; `from here` marks a constraint that points to the
-    parent. --live draws the geometry of the daemon, which publishes it every few seconds.
+    parent. --live draws the geometry of the daemon, which publishes it every few seconds, with the rates and ages of
+    the pose and of each joint, and the source that publishes it.
 
     \b
     Examples:
@@ -61,14 +71,18 @@ def command(
     if as_json and svg:
         raise typer.BadParameter("excludes --svg", param_hint="--json")
     check_writable(svg, force)
-    model = receive_geometry(url, prefix, wait) if live else load_geometry(file, parse_variables(variables))
+    model, notes = (
+        receive_geometry(url, prefix, wait, 0.0 if as_json or svg else LISTENING_S)
+        if live
+        else (load_geometry(file, parse_variables(variables)), {})
+    )
     if as_json:
         typer.echo(json.dumps({body.name: [frame.full_name for frame in body.frames] for body in model.bodies}))
         return
-    title = f"{model.name or 'unnamed'}: {describe_size(model)}, revision {model.revision}"
+    title = f"{model.name or 'unnamed'}: {describe_size(model)}, revision {model.revision}{notes.get('', '')}"
     assemblies = build_nodes(model)
     if not svg:
-        typer.echo(replace_unencodable("\n".join((escape(title), *draw_lines(assemblies, frames)))))
+        typer.echo(replace_unencodable("\n".join((escape(title), *draw_lines(assemblies, frames, notes)))))
         return
     write_file(svg, draw_svg(title, assemblies, frames), force)
 
@@ -88,20 +102,49 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
     return load_given_model(file, variables)
 
 
-def receive_geometry(url: str, prefix: str, seconds: float) -> Model:
-    """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
+def receive_geometry(url: str, prefix: str, seconds: float, listening: float) -> tuple[Model, dict[str, str]]:
+    """Return the geometry that a daemon publishes, and a note for each constraint with a joint; "": for the pose.
+
+    The notes are rate, age and source in the `listening` seconds. Raises NoServerError after a timeout.
+    """
     from modelserver.client.mirror import PlatformMirror
 
     with PlatformMirror(url, channel_prefix=prefix) as mirror:
         if mirror.wait_for(lambda: mirror.read_state()[0].snapshot is not None, seconds):
-            snapshot = mirror.read_state()[0].snapshot
-            assert snapshot is not None
-            return snapshot.model
+            if listening:
+                mirror.wait_for(lambda: False, listening)
+            state, now = mirror.read_state()
+            assert state.snapshot is not None
+            return state.snapshot.model, describe_rates(state, now) if listening else {}
         raise NoServerError(
             f"no geometry received on {prefix}MODEL_SNAPSHOT at {mirror.url} within {seconds:g} s. Is the daemon "
             "running (modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its "
             "period is publish.snapshot_s in the vehicle file: use a longer --wait"
         )
+
+
+def describe_rates(state: MirrorState, now: int) -> dict[str, str]:
+    """Return rate, age and source of each joint, by its constraint, and of the pose, by an empty name."""
+    assert state.snapshot is not None
+    service_now, history = state.get_service_time(now), state.history
+    notes = {"": "; no POSE"}
+    if len(history):
+        notes[""] = f"; POSE {_describe_rate(len(history), history.first, history.last, service_now)}"
+    for name, constraint in state.snapshot.model.joints.items():
+        tracks = state.joints.tracks
+        found = [tracks[each] for each in coordinate_names(name, constraint.joint) if each in tracks]
+        if constraint.joint.mimic is None:
+            notes[name] = ", at its default: no reading"
+        if found:
+            track = max(found, key=lambda each: each.last)
+            rate = _describe_rate(len(track), track.first, track.last, service_now)
+            notes[name] = f", {rate} by {track.source or 'unknown'}"
+    return notes
+
+
+def _describe_rate(count: int, first: int, last: int, now: int) -> str:
+    rate = f"{(count - 1) * 1e6 / (last - first):.1f} Hz, " if last > first else ""
+    return f"{rate}{max(now - last, 0) * 1e-6:.2f} s ago"
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +240,11 @@ def _format_number(value: float, joint: Joint, number: int, signed: bool = False
     return text + ((" deg" if angle else " m") if unit else "")
 
 
-def describe_crossing(crossing: Crossing) -> str:
-    """Describe the constraint between a body and its parent."""
+def describe_crossing(crossing: Crossing, notes: Mapping[str, str] = NO_NOTES) -> str:
+    """Describe the constraint between a body and its parent, with its note by its name."""
     direction = "" if crossing.forward else ", from here"
-    return f"{crossing.constraint.name}: {describe_joint(crossing.constraint)}{direction}"
+    constraint = crossing.constraint
+    return f"{constraint.name}: {describe_joint(constraint)}{notes.get(constraint.name, '')}{direction}"
 
 
 ROW, STEP, MARGIN, GAP = 24, 26, 16, 14
@@ -269,20 +313,22 @@ def _draw_body(x: int, y: int, node: BodyNode, words: str) -> str:
     )
 
 
-def draw_lines(assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> Iterator[str]:
-    """Yield the lines of the drawing; unconnected assemblies come last."""
+def draw_lines(
+    assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False, notes: Mapping[str, str] = NO_NOTES
+) -> Iterator[str]:
+    """Yield the lines of the drawing, with notes of constraints by name; unconnected assemblies come last."""
     for number, assembly in enumerate(assemblies):
         if number == 1:
             yield ""
             yield f"{format_count(len(assemblies) - 1, 'orphan')}, not connected to the root:"
         for node in assembly:
-            yield from _draw_node(node, with_frames)
+            yield from _draw_node(node, with_frames, notes)
 
 
-def _draw_node(node: BodyNode, with_frames: bool) -> Iterator[str]:
+def _draw_node(node: BodyNode, with_frames: bool, notes: Mapping[str, str]) -> Iterator[str]:
     trunk = "".join("   " if last else "│  " for last in node.is_last[:-1])
     elbow = ("└─ " if node.is_last[-1] else "├─ ") if node.is_last else ""
-    label = f"  ({describe_crossing(node.crossing)})" if node.crossing is not None else ""
+    label = f"  ({describe_crossing(node.crossing, notes)})" if node.crossing is not None else ""
     yield f"{trunk}{elbow}{escape(node.body)}{escape(label)}"
     inside = trunk + (("   " if node.is_last[-1] else "│  ") if node.is_last else "")
     inside += "│  " if node.has_children else "   "

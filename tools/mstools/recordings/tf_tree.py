@@ -23,7 +23,7 @@ TF_TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 WORLD_FRAMES: Final = ("map", "odom", "utm", "earth", "world")
 """Frames of REP-105, of navsat_transform and of simulators that are fixed in the world."""
 
-STILL: Final = 1e-6
+ROUNDING: Final = 1e-6
 """Change of a transform, m and rad, that is rounding: a driver computes it again from single precision."""
 
 
@@ -51,7 +51,7 @@ class TfTree:
             elif known.parent != parent:
                 self.conflicts.add(child)
                 self.edges[child] = TfEdge(parent, pose)
-            elif not known.is_moving and not pose.is_close(known.pose, STILL, STILL):
+            elif not known.is_moving and not pose.is_close(known.pose, ROUNDING, ROUNDING):
                 self.edges[child] = known._replace(is_moving=True)
 
     def find_root(self) -> str:
