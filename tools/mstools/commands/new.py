@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shlex
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,13 +23,14 @@ import typer
 
 from modelserver.errors import ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.formats import check_file, save_model
-from modelserver.geometry import Body, JointType, Model, ModelBuilder, ShapeKind
+from modelserver.geometry import Body, JointType, Model, ModelBuilder, ShapeKind, names
 from modelserver.messages import GpsSample, ImuSample
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 from msdrivers.registry import KINDS, CanSettings, DeviceKind, ModbusSettings, SerialSettings, TcpSettings
 from mstools.commands.check import check_vehicle
+from mstools.robot_localization import EkfSettings, read_ekf_settings
 from mstools.terminal.options import choose_name, option
 from mstools.terminal.output import escape, print_problems, write_file
 
@@ -53,6 +55,13 @@ class VehicleTemplate:
     max_speed: float
     settings: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
+
+    def with_two_wheels(self) -> VehicleTemplate:
+        """Return the kind with the wheels `left` and `right` of `import-bag`, in the middle of its own."""
+        x, y = (sorted(place[axis] for place in self.wheels.values()) for axis in (0, 1))
+        middle = 0.5 * (x[0] + x[-1])
+        sides = {"left": (middle, y[-1], 0.0), "right": (middle, y[0], 0.0)}
+        return dataclasses.replace(self, wheels=sides)
 
 
 def _make_four(length: float, width: float) -> dict[str, Place]:
@@ -378,14 +387,23 @@ GEOMETRY_FILE, VEHICLE_FILE, DBC_FILE = "geometry.yaml", "vehicle.yaml", "wheels
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device of the new vehicle and its line: the path of a port, a CAN channel, or HOST:PORT."""
+    """A device of the new vehicle and its line: the path of a port, a CAN channel, or HOST:PORT.
 
-    kind: DeviceKind
-    line: str
+    kind: None where a program of the user or a log has its samples, and there is no driver.
+    """
+
+    kind: DeviceKind | None
+    line: str = ""
+
+    @property
+    def has_z_down(self) -> bool:
+        """Whether it is a unit whose own z axis is down when it stands upright."""
+        return self.kind is not None and self.kind.has_z_down
 
     @property
     def line_key(self) -> str:
         """The key of the line in a driver's section: by its form, where the kind has several."""
+        assert self.kind is not None
         keys = {SerialSettings: "port", TcpSettings: "address", CanSettings: "can", ModbusSettings: "address"}
         if SerialSettings in self.kind.lines and TcpSettings in self.kind.lines:
             return "address" if "/" not in self.line and ":" in self.line else "port"
@@ -396,7 +414,8 @@ class Device:
 class NewVehicle:
     """What is on a new vehicle.
 
-    `head` is the pan-tilt head below the camera; `given` are the frames in a geometry that exists.
+    `head` is the pan-tilt head below the camera; `given` are the frames in a geometry that exists, `ekf` the settings
+    of robot_localization.
     """
 
     name: str
@@ -407,6 +426,7 @@ class NewVehicle:
     has_camera: bool = False
     head: Device | None = None
     given: FrameChoices | None = None
+    ekf: EkfSettings | None = None
 
     @property
     def mounts(self) -> FrameChoices:
@@ -455,7 +475,7 @@ def make_geometry(vehicle: NewVehicle) -> str:
     if vehicle.imu is not None:
         comment = f"{MARK}: the unit and its own axes; here x forward, y left, z up"
         more = ", rpy_deg: [0, 0, 0]"
-        if vehicle.imu.kind.has_z_down:
+        if vehicle.imu.has_z_down:
             more, comment = ", rpy_deg: [180, 0, 0]", f"{MARK}: the unit and its own axes; here x forward, z down"
         lines.append(frame("ImuUnit", template.imu, comment, more))
     if vehicle.has_camera:
@@ -517,6 +537,8 @@ def make_vehicle(vehicle: NewVehicle) -> str:
         "state_directory: state   # the origin, and the state for the next start",
         "journal: {directory: journal, megabytes: 256}   # all inputs and outputs, to replay; the oldest are deleted",
     ]
+    if vehicle.ekf is not None:
+        lines += _list_settings(vehicle.ekf)
     if sensors := list(_list_sensors(vehicle, mounts)):
         lines += ["", "sensors:", *sensors]
     if template.settings:
@@ -534,6 +556,15 @@ def make_vehicle(vehicle: NewVehicle) -> str:
         ]
         lines += drivers
     return "\n".join(lines) + "\n"
+
+
+def _list_settings(ekf: EkfSettings) -> Iterator[str]:
+    if ekf.rate_hz:
+        yield f"publish: {{rate_hz: {ekf.rate_hz:g}}}"
+    if ekf.origin is not None:
+        utm = ", ".join(f"{each:.4f}" for each in ekf.origin.initial_utm)
+        hemisphere = "north" if ekf.origin.north else "south"
+        yield f"origin: {{initial_utm: [{utm}], zone: {ekf.origin.zone}, hemisphere: {hemisphere}}}"
 
 
 def _list_sensors(vehicle: NewVehicle, mounts: FrameChoices) -> Iterator[str]:
@@ -554,12 +585,12 @@ def _mark(mount: Mount) -> str:
 
 def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
     for name, device in (("gps", vehicle.gps), ("imu", vehicle.imu)):
-        if device is not None:
+        if device is not None and device.kind is not None:
             yield f"  {name}:   # {device.kind.description}"
             yield f"    device: {device.kind.name}"
             yield f"    {device.line_key}: {_quote(device.line)}   # {MARK}: its line on this machine"
             yield from (f"    {line}" for line in device.kind.example)
-    if vehicle.wheels is not None:
+    if vehicle.wheels is not None and vehicle.wheels.kind is not None:
         yield f"  wheels:   # {vehicle.wheels.kind.description}"
         yield f"    device: {vehicle.wheels.kind.name}"
         channel = vehicle.wheels.line
@@ -571,8 +602,7 @@ def _list_drivers(vehicle: NewVehicle) -> Iterator[str]:
             yield f"      {name}:"
             yield f"        count:   # {MARK}: the distance of one count is circumference / counts per turn"
             yield f"          {{signal: WheelCounts.{_name_part(name, 'Count')}, meters_per_count: 0.001}}"
-
-    if vehicle.head is not None:
+    if vehicle.head is not None and vehicle.head.kind is not None:
         yield f"  head:   # {vehicle.head.kind.description}"
         yield f"    device: {vehicle.head.kind.name}"
         yield f"    {vehicle.head.line_key}: {_quote(vehicle.head.line)}   # {MARK}: its line on this machine"
@@ -611,7 +641,8 @@ def list_kinds(kinds: Mapping[str, DeviceKind], sample: type[GpsSample] | type[I
 
 
 NONE: Final = "none"
-"""Answer for a device that is not there."""
+OWN: Final = "own"
+"""Answers for a device that is not there, and for one whose samples a program of the user publishes or a log has."""
 
 DEFAULT_PORT, DEFAULT_ADDRESS = "/dev/ttyUSB{}", "127.0.0.1:2947"
 """Lines of devices where this machine has none: gpsd has this address."""
@@ -626,16 +657,19 @@ def command(
     name: Annotated[str, option("--name NAME", "Name of the vehicle. Default: that of the folder.")] = "",
     vehicle: Annotated[str, option("--vehicle KIND", f"One of {', '.join(TEMPLATES)}.")] = "",
     gps: Annotated[
-        str, option("--gps DEVICE[@LINE]", "GNSS receiver, e.g. ublox@/dev/ttyACM0 or novatel@10.0.0.7:3001; none.")
+        str, option("--gps DEVICE[@LINE]", "GNSS receiver, e.g. ublox@/dev/ttyACM0, novatel@10.0.0.7:3001; own; none.")
     ] = "",
-    imu: Annotated[str, option("--imu DEVICE[@LINE]", "Inertial unit, e.g. gx1@/dev/ttyUSB1; none.")] = "",
-    wheels: Annotated[str, option("--wheels CHANNEL", "CAN channel of the wheel encoders, e.g. can0; none.")] = "",
+    imu: Annotated[str, option("--imu DEVICE[@LINE]", "Inertial unit, e.g. gx1@/dev/ttyUSB1; own; none.")] = "",
+    wheels: Annotated[str, option("--wheels CHANNEL", "CAN channel of the wheel encoders, e.g. can0; own; none.")] = "",
     camera: Annotated[bool | None, option("--camera/--no-camera", "Whether there is a camera.")] = None,
     pan_tilt: Annotated[
         str, option("--pan-tilt LINE", "Port of a pan-tilt head below the camera, e.g. /dev/ttyUSB2; none.")
     ] = "",
     urdf: Annotated[
         Path | None, option("--from-urdf FILE", "Take the geometry from this URDF or geometry file.")
+    ] = None,
+    from_ekf: Annotated[
+        Path | None, option("--from-ekf FILE", "Take what robot_localization's parameters (ekf.yaml) state.")
     ] = None,
     base_frame: Annotated[str, option("--base-frame FRAME", "With --from-urdf: the frame of the pose.")] = "",
     gps_frame: Annotated[str, option("--gps-frame FRAME", "With --from-urdf: the phase center of the antenna.")] = "",
@@ -645,14 +679,16 @@ def command(
 ) -> None:
     """Write the files of a new vehicle: geometry, vehicle file, and a DBC file if it has wheels on a CAN bus.
 
-    Asks what is on the vehicle, and proposes the ports that are there. An option answers its question. The lengths in
-    the files are typical ones; what must be measured is marked and listed.
+    Asks what is on the vehicle, and proposes the ports that are there. An option answers its question; `own` is a
+    sensor without a driver, whose samples a program of yours publishes or a log has. The lengths in the files are
+    typical ones; what must be measured is marked and listed.
 
     \b
     Examples:
       modelserver new rover
       modelserver new rover --yes --vehicle skid --gps ublox@/dev/ttyACM0 --imu gx1@/dev/ttyUSB0 --wheels can0 --camera
-      modelserver new arm --from-urdf arm.urdf --base-frame base_link:Origin
+      modelserver new arm --from-urdf arm.urdf --base-frame base_link
+      modelserver new rover --yes --from-urdf robot.urdf --from-ekf ekf.yaml
     """
     for option_name, given in (("--base-frame", base_frame), ("--gps-frame", gps_frame), ("--imu-frame", imu_frame)):
         if given and urdf is None:
@@ -663,36 +699,54 @@ def command(
     camera = True if has_head else camera
     ask = Questions(is_asking=not yes and sys.stdin.isatty())
     model = None if urdf is None else _load_geometry(urdf)
+    ekf = None if from_ekf is None else read_ekf_settings(from_ekf)
+    if model is not None and ekf is not None and not base_frame and ekf.base_frame in model.get_body_list():
+        base_frame = ekf.base_frame
     known = {name: f"{each.summary}" for name, each in TEMPLATES.items()}
     name = _check_name(ask.text("Name of the vehicle", name, folder.resolve().name or "vehicle"))
-    base = None if model is None else Mount(base_frame) if base_frame else guess_base(model)
-    turning = (
-        ()
-        if model is None or base is None
-        else tuple(iterate_wheels(model, _check_frame(model, base.frame, "--base-frame")))
+    base = (
+        None
+        if model is None
+        else Mount(_check_frame(model, base_frame, "--base-frame"))
+        if base_frame
+        else guess_base(model)
     )
+    turning = () if model is None or base is None else tuple(iterate_wheels(model, base.frame))
     kind = ask.choice(
         "Which kind of vehicle is it?", vehicle, known, guess_kind(turning) if turning else "skid", "--vehicle"
     )
+    gps_default, imu_default = DEFAULT_GPS, DEFAULT_IMU
+    wheels_default = propose_can() if model is None or turning else NONE
+    if ekf is not None:
+        gps_default, imu_default, wheels_default = (
+            OWN if each else NONE for each in (ekf.has_gps, ekf.has_imu, ekf.has_wheels)
+        )
     wanted = NewVehicle(
         name,
         TEMPLATES[kind],
-        ask.device("GNSS receiver", gps, list_kinds(KINDS, GpsSample), DEFAULT_GPS, "--gps"),
-        ask.device("Inertial unit", imu, list_kinds(KINDS, ImuSample), DEFAULT_IMU, "--imu"),
-        ask.wheels(wheels, propose_can() if model is None or turning else NONE),
+        ask.device("GNSS receiver", gps, list_kinds(KINDS, GpsSample), gps_default, "--gps"),
+        ask.device("Inertial unit", imu, list_kinds(KINDS, ImuSample), imu_default, "--imu"),
+        ask.wheels(wheels, wheels_default),
         model is None and ask.flag("Is there a camera?", camera),
+        ekf=ekf,
     )
+    if wanted.wheels is not None and wanted.wheels.kind is None:
+        wanted = dataclasses.replace(wanted, template=wanted.template.with_two_wheels())
     if wanted.has_camera:
         wanted = dataclasses.replace(wanted, head=ask.head(pan_tilt))
     if model is not None and base is not None:
         model, mounts = find_mounts(model, base, wanted, turning, gps_frame, imu_frame)
         wanted = dataclasses.replace(wanted, given=mounts)
     files = {GEOMETRY_FILE: make_geometry(wanted) if model is None else save_model(model, "yaml").text}
-    if wanted.wheels is not None:
+    if wanted.wheels is not None and wanted.wheels.kind is not None:
         files[DBC_FILE] = make_dbc(wanted)
     files[VEHICLE_FILE] = make_vehicle(wanted)
     write_files(folder, files, force)
-    show_result(folder, files)
+    if ekf is not None and from_ekf is not None:
+        for line in ekf.to_lines(from_ekf):
+            typer.echo(escape(line))
+        typer.echo()
+    show_result(folder, files, find_next(wanted, model))
 
 
 class Questions:
@@ -731,10 +785,11 @@ class Questions:
     ) -> Device | None:
         """Return a device and its line; None for none."""
         name, _, line = given.partition("@")
-        known = {**{each: kind.description for each, kind in kinds.items()}, NONE: "there is none"}
+        known = {each: kind.description for each, kind in kinds.items()}
+        known |= {OWN: "a program of yours publishes its samples, or a log has them", NONE: "there is none"}
         name = self.choice(f"{what}: which device?", name, known, default, option_name)
-        if name == NONE:
-            return None
+        if name in (NONE, OWN):
+            return Device(None) if name == OWN else None
         kind = kinds[name]
         line = self.text(f"{what}: its port", line, propose_line(kind, self._used))
         self._used.add(line)
@@ -748,8 +803,10 @@ class Questions:
 
     def wheels(self, given: str, default: str) -> Device | None:
         """Return the wheels on a CAN bus; None for none."""
-        channel = self.text("CAN channel of the wheel encoders (none: there are none)", given, default)
-        return None if channel == NONE else Device(KINDS["wheels"], channel)
+        channel = self.text("CAN channel of the wheel encoders (own: others publish them, none)", given, default)
+        if channel in (NONE, OWN):
+            return Device(None) if channel == OWN else None
+        return Device(KINDS["wheels"], channel)
 
 
 def propose_line(kind: DeviceKind, used: Collection[str]) -> str:
@@ -800,8 +857,7 @@ def find_mounts(
             return Mount(_check_frame(model, given, option_name))
         if guess := guess_sensor(model, words, base.frame):
             return guess
-        names = list_frames(model)
-        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        shown = names.format_names(list_frames(model))
         raise typer.BadParameter(f"give the frame; the geometry has: {shown}", param_hint=option_name)
 
     mounts = FrameChoices(
@@ -809,7 +865,7 @@ def find_mounts(
         choose(gps, GPS_WORDS, "--gps-frame") if wanted.gps is not None else None,
         choose(imu, IMU_WORDS, "--imu-frame") if wanted.imu is not None else None,
     )
-    if wanted.imu is not None and mounts.imu is not None and wanted.imu.kind.has_z_down:
+    if wanted.imu is not None and mounts.imu is not None and wanted.imu.kind is not None and wanted.imu.has_z_down:
         mounts = mounts._replace(imu=note_axes(model, mounts.imu, wanted.imu.kind.name, base.frame))
     if wanted.wheels is None:
         return model, mounts
@@ -822,7 +878,7 @@ def list_frames(model: Model) -> list[str]:
 
 
 def _check_frame(model: Model, name: str, option_name: str) -> str:
-    return choose_name(name, list_frames(model), "frame", option_name)
+    return choose_name(names.complete(name), list_frames(model), "frame", option_name)
 
 
 def write_files(folder: Path, files: Mapping[str, str], force: bool) -> None:
@@ -835,7 +891,7 @@ def write_files(folder: Path, files: Mapping[str, str], force: bool) -> None:
         write_file(str(folder / name), text, replace=True)
 
 
-def show_result(folder: Path, files: Mapping[str, str]) -> None:
+def show_result(folder: Path, files: Mapping[str, str], following: str) -> None:
     """Print what was written, what `check` finds, what must be measured, and what to do next."""
     for name in files:
         typer.echo(escape(f"written: {folder / name}"))
@@ -845,6 +901,24 @@ def show_result(folder: Path, files: Mapping[str, str]) -> None:
         typer.echo(f"\nTo be measured or adapted, marked {MARK} in the files:")
         for mark in marks:
             typer.echo(escape(f"  {mark}"))
+    where = "" if folder == Path() else f"cd {shlex.quote(str(folder))} && "
     typer.echo()
-    where = "" if folder == Path() else f"cd {folder} && "
-    typer.echo(escape(f"Next: {where}modelserver up --emulate     (no hardware needed; then modelserver status)"))
+    typer.echo(escape(f"Next: {where}{following}"))
+
+
+def find_next(wanted: NewVehicle, model: Model | None) -> str:
+    """Return the command that comes next: without drivers, the one that makes a log of a recording."""
+    devices = (wanted.gps, wanted.imu, wanted.wheels)
+    if not any(each is not None and each.kind is None for each in devices):
+        return "modelserver up --emulate     (no hardware needed; then modelserver status)"
+    track = ""
+    if wanted.wheels is not None and wanted.wheels.kind is None:
+        left, right = (wanted.template.wheels[name] for name in ("left", "right"))
+        if model is not None:
+            frames = (wanted.mounts.wheels[name].frame for name in ("left", "right"))
+            left, right = model.get_transformation(*frames).pose.xyz, (0.0, 0.0, 0.0)
+        track = f" --track-width {math.dist(left, right):.3g}"
+    return (
+        f"modelserver import-bag YOUR.bag drive.lcm{track}, then modelserver replay drive.lcm -c {VEHICLE_FILE} "
+        "--report report.html"
+    )
