@@ -44,6 +44,7 @@ GROUPS = {
         "key": "Create a key to sign commands with.",
     },
     "Recordings": {
+        "record": "Record the bus as an LCM log, with the types of its messages checked.",
         "replay": "Replay a log on the bus, or offline through the localization.",
         "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
         "export": "Convert an LCM log to an MCAP file for Foxglove, or serve the running service to it.",
@@ -82,6 +83,7 @@ _ALIASES = {
     "run": "serve server start daemon",
     "check": "validate lint",
     "replay": "play verify journal",
+    "record": "log logger rec",
     "import-bag": "import",
     "export": "mcap foxglove bridge",
     "mode": "switch",

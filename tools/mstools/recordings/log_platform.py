@@ -84,7 +84,7 @@ class LogPlatform(LocalPlatform):
         return (
             f"{self._path}: no complete geometry on {channel} ({found}), which queries need. The service publishes it "
             "since version 0.1.0, at its start and every few seconds: record all its channels for some seconds "
-            "(lcm-logger FILE); for a channel prefix use --prefix. Or give the geometry with --model FILE"
+            "(modelserver record FILE); for a channel prefix use --prefix. Or give the geometry with --model FILE"
         )
 
     @property
