@@ -91,8 +91,8 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> Non
             if not writer.has_geometry:
                 raise RecordingError(
                     f"{log}: no complete geometry on {prefix}MODEL_SNAPSHOT, so there are no frames. The service "
-                    "publishes it at its start and every few seconds: record its channels too (modelserver record); for a "
-                    "channel prefix use --prefix"
+                    "publishes it at its start and every few seconds: record its channels too (modelserver record); "
+                    "for a channel prefix use --prefix"
                 )
         part.replace(out)
     finally:
