@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import cmath
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from modelserver.earth.geodesy import origin_at
+from modelserver.formats import load_model
+from modelserver.geometry import ModelBuilder
+from modelserver.messages import GpsSample, ImuSample, WheelsSample
+from modelserver.simulation import Simulation, Trajectory, figure_eight
+from modelserver.transforms import Pose
 
 TYPES = {
     "fix": "sensor_msgs/msg/NavSatFix",
@@ -169,3 +177,47 @@ class Ros:
                     topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
                 writer.write(topics[topic], received_ns, serialize(message, kind))
         return path
+
+
+ROBOT = """<robot name="rover">
+  <link name="base_link"/><link name="gps_link"/><link name="imu_link"/>
+  <joint name="gps" type="fixed"><parent link="base_link"/><child link="gps_link"/><origin xyz="0.1 0 0.9"/></joint>
+  <joint name="imu" type="fixed"><parent link="base_link"/><child link="imu_link"/><origin xyz="0.2 0 0.1"/></joint>
+</robot>
+"""
+TRACK = 0.6
+
+
+def write_drive(path: Path, urdf: Path, seconds: float = 90.0) -> Path:
+    """Write a ROS 1 bag of a simulated drive of the robot in a URDF: its sensors, and an estimator's busier output."""
+    ros = Ros()
+    builder = ModelBuilder.from_model(load_model(urdf))
+    for name, side in (("Left", 0.5), ("Right", -0.5)):
+        builder.bodies[0].add_frame(name, Pose((0.0, side * TRACK, 0.0)))
+    drive = Simulation(
+        builder.build(),
+        "base_link:Origin",
+        Trajectory(figure_eight(radius=8.0, speed=2.0, laps=2), yaw=0.7),
+        origin_at(42.38, -71.14, 0.0),
+        gps_frame="gps_link:Origin",
+        imu_frame="imu_link:Origin",
+        wheel_frames={"left": "base_link:Left", "right": "base_link:Right"},
+    )
+    messages: list[tuple[str, int, Any]] = []
+    place, yaw, before = 0j, 0.0, (0.0, 0.0)
+    for sample in drive.events(seconds):
+        stamp, arrival = sample.header.utime * 1000, sample.header.host_utime * 1000
+        if isinstance(sample, GpsSample):
+            position = (sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal)
+            messages.append(("/fix", arrival, ros.fix(stamp, position)))
+            messages += [("/gps/filtered", arrival + n, ros.fix(stamp, position)) for n in range(2)]
+        elif isinstance(sample, ImuSample) and sample.angular_velocity and sample.specific_force:
+            messages.append(("/imu/data", arrival, ros.imu(stamp, sample.angular_velocity, sample.specific_force)))
+        elif isinstance(sample, WheelsSample):
+            left, right = (each.travel for each in sample.wheels)
+            forward, turn = 0.5 * (left - before[0] + right - before[1]), (right - before[1] - left + before[0]) / TRACK
+            place, yaw, before = place + cmath.rect(forward, yaw + 0.5 * turn), yaw + turn, (left, right)
+            speeds = [each.speed for each in sample.wheels]
+            moving = {"speed": 0.5 * sum(speeds), "turn": (speeds[1] - speeds[0]) / TRACK}
+            messages.append(("/odom", arrival, ros.odom(stamp, (place.real, place.imag, 0.0), yaw, **moving)))
+    return ros.write(path, sorted(messages, key=lambda each: each[1]))

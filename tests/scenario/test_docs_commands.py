@@ -12,6 +12,7 @@ before a block, are visible in the Markdown:
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -23,7 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from support_lcm import reserved_url
+from support_bags import ROBOT, write_drive
+from support_lcm import invoke, reserved_url
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -50,6 +52,9 @@ IN_SOURCE = [ROOT / "README.md", DOCS / "quick-start.md", DOCS / "own-device.md"
 """Pages whose commands run in the source folder."""
 ON_THE_ROVER = [DOCS / "clients.md", DOCS / "monitoring.md"]
 """Guides whose commands need the rover of the tutorial, driving."""
+FROM_ROS = DOCS / "coming-from-ros.md"
+COMMANDS_FROM_ROS = 6
+"""To a report and to live lookups."""
 AFTER_THE_ROVER = [
     DOCS / name
     for name in (
@@ -232,9 +237,39 @@ def test_given_a_guide_then_every_command_runs(rover: Path, tmp_path: Path, page
     run_page(page, rover, tmp_path / "scratch", lcm_url)
 
 
+EKF = f"""
+ekf_filter_node:
+  ros__parameters:
+    frequency: 50.0
+    two_d_mode: true
+    base_link_frame: base_link
+    odom0: odom
+    odom0_config: [{"false, " * 6}true, {"false, " * 4}true, false, false, false]
+    imu0: imu/data
+    imu0_config: [{"false, " * 11}true, true, false, false]
+    odom1: odometry/gps
+"""
+
+
+def test_given_a_bag_a_urdf_and_an_ekf_then_the_page_leads_to_a_report_and_to_lookups(
+    tmp_path: Path, lcm_url: str
+) -> None:
+    (tmp_path / "robot.urdf").write_text(ROBOT)
+    (tmp_path / "ekf.yaml").write_text(EKF)
+    write_drive(tmp_path / "drive.bag", tmp_path / "robot.urdf")
+    run_page(FROM_ROS, tmp_path, tmp_path / "scratch", lcm_url)
+    poses = ("--poses", str(tmp_path / "poses.csv"), "--json")
+    done = invoke("", "replay", str(tmp_path / "drive.lcm"), "-c", str(tmp_path / "rover" / "vehicle.yaml"), *poses)
+    found = json.loads(done.stdout)
+    assert found["valid"] > 0.7 * found["poses"]
+    assert (tmp_path / "report.html").stat().st_size > 50_000
+    assert (tmp_path / "scratch" / "log").read_text().count("base_link:Origin in World:ENU\n") >= 3
+    assert sum(block.text.count("modelserver ") for block in blocks_of(FROM_ROS)) == COMMANDS_FROM_ROS
+
+
 # --- the marks --------------------------------------------------------------------------------------------------------
 
-TESTED = [TUTORIAL, *IN_SOURCE, *ON_THE_ROVER, *AFTER_THE_ROVER]
+TESTED = [TUTORIAL, FROM_ROS, *IN_SOURCE, *ON_THE_ROVER, *AFTER_THE_ROVER]
 
 
 def test_given_the_pages_then_blocks_that_do_not_run_are_few_and_have_a_known_reason() -> None:
