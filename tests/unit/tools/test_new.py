@@ -139,6 +139,11 @@ def test_given_files_that_exist_then_none_is_touched_without_force(tmp_path: Pat
         (("--vehicle", "skit"), "did you mean skid?"),
         (("--gps", "novatell"), "did you mean novatel?"),
         (("--name", "a: b"), "a name begins with a letter"),
+        (("--name", "on"), "on is a value in YAML"),
+        (("--gps", "ublox@vn100"), "'vn100': the line of ublox is the path of a port, e.g. /dev/ttyUSB0 or HOST:PORT"),
+        (("--imu", "gx1@y"), "'y': the line of gx1 is the path of a port"),
+        (("--gps", "gpsd@/dev/ttyUSB0"), "the line of gpsd is HOST:PORT"),
+        (("--wheels", "y"), "'y': the line of wheels is a CAN interface, e.g. can0"),
         (("--base-frame", "Cart:Base"), "goes with --from-urdf"),
     ],
 )

@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 import typer
+import yaml
 
 from modelserver.errors import ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.formats import check_file, save_model
@@ -791,22 +792,22 @@ class Questions:
         if name in (NONE, OWN):
             return Device(None) if name == OWN else None
         kind = kinds[name]
-        line = self.text(f"{what}: its port", line, propose_line(kind, self._used))
+        line = _check_line(self.text(f"{what}: its port", line, propose_line(kind, self._used)), kind, option_name)
         self._used.add(line)
         return Device(kind, line)
 
     def head(self, given: str) -> Device | None:
         """Return the pan-tilt head that carries the camera; None for none."""
         question = "Port of the pan-tilt head below the camera (none: it is fixed)"
-        line = self.text(question, given, NONE)
-        return None if line == NONE else Device(KINDS["text_joints"], line)
+        line, kind = self.text(question, given, NONE), KINDS["text_joints"]
+        return None if line == NONE else Device(kind, _check_line(line, kind, "--pan-tilt"))
 
     def wheels(self, given: str, default: str) -> Device | None:
         """Return the wheels on a CAN bus; None for none."""
         channel = self.text("CAN channel of the wheel encoders (own: others publish them, none)", given, default)
         if channel in (NONE, OWN):
             return Device(None) if channel == OWN else None
-        return Device(KINDS["wheels"], channel)
+        return Device(KINDS["wheels"], _check_line(channel, KINDS["wheels"], "--wheels"))
 
 
 def propose_line(kind: DeviceKind, used: Collection[str]) -> str:
@@ -832,7 +833,23 @@ def _check_name(name: str) -> str:
             f"{quote(name, 60)}: a name begins with a letter and has letters, digits, - and _, at most {MAX_NAME}",
             param_hint="--name",
         )
+    if not isinstance(yaml.safe_load(name), str):
+        raise typer.BadParameter(f"{name} is a value in YAML, and no name: choose another", param_hint="--name")
     return name
+
+
+def _check_line(line: str, kind: DeviceKind, option_name: str) -> str:
+    """Return the line of a device. Raises typer.BadParameter for one that has not the form of any of its kind."""
+    forms = {
+        SerialSettings: (r"/.+", "the path of a port, e.g. /dev/ttyUSB0"),
+        TcpSettings: (r"[^/\s]+:\d{1,5}", "HOST:PORT"),
+        CanSettings: (r"[A-Za-z][\w.-]*\d[\w.-]*", "a CAN interface, e.g. can0"),
+    }
+    known = [forms[each] for each in kind.lines]
+    if not any(re.fullmatch(form, line) for form, _ in known):
+        form = " or ".join(text for _, text in known)
+        raise typer.BadParameter(f"{quote(line, 40)}: the line of {kind.name} is {form}", param_hint=option_name)
+    return line
 
 
 def _load_geometry(file: Path) -> Model:
