@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from support_samples import VEHICLE, write_vehicle
 
 from mstools.cli import COMMAND_ALIASES, COMMANDS, COMPLETION_VARIABLE, main
 
@@ -40,6 +43,37 @@ def test_given_a_log_that_there_is_not_then_those_there_are_are_reported(
 def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -> None:
     assert set(COMMAND_ALIASES.values()) <= COMMANDS.keys()
     assert not COMMAND_ALIASES.keys() & COMMANDS.keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("modelserver query Cam", ["Camera", "Camera:Origin"]),
+        ("modelserver query Camera Odom", ["Odom:Origin"]),
+        ("modelserver query Camera m", ["map"]),
+        ("modelserver query a --expressed-in Cart:M", ["Cart:Mast"]),
+        ("modelserver query --model missing.yaml Cam", []),
+        ("modelserver replay a.lcm --frame Cart:A", ["Cart:Antenna"]),
+        ("modelserver replay a.lcm --channel POSE_O", ["POSE_ODOM"]),
+        ("modelserver driver fro", ["front"]),
+        ("modelserver emulate x", []),
+    ],
+)
+def test_given_a_vehicle_file_then_the_shell_completes_its_names(
+    words: str,
+    expected: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_vehicle(tmp_path, VEHICLE + "drivers: {front: {device: gpsd, address: 'localhost:2947'}}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert (ended.value.code, capsys.readouterr().out.split()) == (0, expected)
 
 
 @pytest.mark.parametrize(

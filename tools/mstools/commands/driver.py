@@ -27,6 +27,7 @@ from modelserver.errors import (
 from modelserver.server.log import set_up_logging
 from modelserver.server.supervision import Notifier
 from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
+from mstools.terminal.completion import complete_driver
 from mstools.terminal.options import UrlOption, argument, choose_name, option
 from mstools.terminal.output import escape, print_problems
 
@@ -91,7 +92,9 @@ COMMAND_POLL_S = 0.02
 
 
 def command(
-    name: Annotated[str, argument("[NAME]", "Name of the driver in the vehicle file.")] = "",
+    name: Annotated[
+        str, argument("[NAME]", "Name of the driver in the vehicle file.", autocompletion=complete_driver)
+    ] = "",
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     list_ports: Annotated[
         bool, option("--list", "List the ports and the drivers of the vehicle file, then exit.")
@@ -538,7 +541,7 @@ SCENARIOS = ("eight", "circle", "stand", "straight", "city")
 
 
 def emulate(
-    name: Annotated[str, argument("NAME", "Name of the driver in the vehicle file.")],
+    name: Annotated[str, argument("NAME", "Name of the driver in the vehicle file.", autocompletion=complete_driver)],
     config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
     pty: Annotated[bool, option("--pty", "Create a pseudo-terminal and print its path.")] = False,
     link: Annotated[Path | None, option("--link PATH", "With --pty: create a symbolic link to it here.")] = None,

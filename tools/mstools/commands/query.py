@@ -40,6 +40,7 @@ from modelserver.messages import (
 )
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
+from mstools.terminal.completion import complete_frame
 from mstools.terminal.options import (
     JsonOption,
     ModelOption,
@@ -198,8 +199,8 @@ POLICIES = {policy.name.lower(): policy for policy in Policy}
 
 
 def command(
-    frame_of_interest: Annotated[str, argument("INTEREST", "Frame of interest.")],
-    frame_of_reference: Annotated[str, argument("REFERENCE", "Frame of reference.")],
+    frame_of_interest: Annotated[str, argument("INTEREST", "Frame of interest.", autocompletion=complete_frame)],
+    frame_of_reference: Annotated[str, argument("REFERENCE", "Frame of reference.", autocompletion=complete_frame)],
     model: ModelOption = None,
     settings: Variables = None,
     log: Annotated[
@@ -222,7 +223,9 @@ def command(
     ] = 0.0,
     explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
     motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
-    expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
+    expressed_in: Annotated[
+        str, option("--expressed-in FRAME", "Axes of the vectors of --motion.", autocompletion=complete_frame)
+    ] = "",
     max_horizontal: Annotated[
         float, option("--max-horizontal M", "Demand that the horizontal error is within this, meters.")
     ] = 0.0,

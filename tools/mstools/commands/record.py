@@ -18,7 +18,7 @@ from modelserver.files import check_links
 from modelserver.wire.codec import decode, type_name_of
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.recordings.drive import follow_bus
-from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, argument, option
+from mstools.terminal.options import ChannelsOption, JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, check_writable, escape, format_count, format_table
 
 PARTS = 8
@@ -34,7 +34,7 @@ STATUS_S = 1.0
 def command(
     log: Annotated[Path, argument("LOG", "LCM event log to write, e.g. drive.lcm.")],
     seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: at Ctrl-C.", min=0.1)] = math.inf,
-    channel: Annotated[list[str] | None, option("--channel NAME", "Only this channel; may be repeated.")] = None,
+    channel: ChannelsOption = None,
     split_mb: Annotated[
         float, option("--split-mb N", "Begin a new file at this size: drive-0000.lcm, ...", min=MIN_MB)
     ] = math.inf,

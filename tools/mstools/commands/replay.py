@@ -22,7 +22,8 @@ from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.options import JsonOption, UrlOption, argument, option
+from mstools.terminal.completion import complete_frame
+from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, open_atomic, show_progress, to_json
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def command(
         option("--decisions JSONL", "Offline: write the decision on each measurement here, one JSON object per line."),
     ] = "",
     report: Annotated[str, option("--report HTML", "Replay offline, and write a report for a browser.")] = "",
-    frame: Annotated[str, option("--frame BODY:FRAME", "Frame of the poses. Default: the base frame.")] = "",
+    frame: Annotated[
+        str, option("--frame BODY:FRAME", "Frame of the poses. Default: the base frame.", autocompletion=complete_frame)
+    ] = "",
     rate: Annotated[float | None, option("--rate HZ", "Poses per second. Default: 50.")] = None,
     at_times: Annotated[
         Path | None, option("--at-times FILE", "Poses at these times: one utime per line, ascending.")
@@ -56,7 +59,7 @@ def command(
     restamp: Annotated[
         bool, option("--restamp", "Shift the stamps of samples to now, as if the sensors were live.")
     ] = False,
-    channel: Annotated[list[str] | None, option("--channel NAME", "Only this channel; may be repeated.")] = None,
+    channel: ChannelsOption = None,
     everything: Annotated[
         bool, option("--all", "On the bus, also publish recorded poses, requests and replies.")
     ] = False,

@@ -10,18 +10,19 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from modelserver.errors import find_nearest_names, quote
+from mstools.terminal.completion import complete_channel
 
 
-def option(declaration: str, about: str, **limits: Any) -> Any:
-    """Declare an option as its usage shows it, e.g. `--config -c FILE`; `limits`: typer's `min` and `max`."""
+def option(declaration: str, about: str, **more: Any) -> Any:
+    """Declare an option as its usage has it, e.g. `--config -c FILE`; `more`: typer's min, max, autocompletion."""
     words = declaration.split()
     names = [word for word in words if word.startswith("-")]
-    return typer.Option(*names, metavar=" ".join(words[len(names) :]) or None, help=about, **limits)
+    return typer.Option(*names, metavar=" ".join(words[len(names) :]) or None, help=about, **more)
 
 
-def argument(metavar: str, about: str) -> Any:
-    """Declare an argument as its usage shows it."""
-    return typer.Argument(metavar=metavar, help=about)
+def argument(metavar: str, about: str, **more: Any) -> Any:
+    """Declare an argument as its usage shows it; `more`: typer's `autocompletion`."""
+    return typer.Argument(metavar=metavar, help=about, **more)
 
 
 Variables: TypeAlias = Annotated[
@@ -40,6 +41,10 @@ KeyOption = Annotated[
     Path | None, option("--key FILE", "The vehicle's key file, to sign with. Default: $MODELSERVER_KEY_FILE.")
 ]
 TimeoutOption = Annotated[float, option("--timeout SECONDS", "Timeout of one try.", min=0.01, max=3600.0)]
+ChannelsOption = Annotated[
+    list[str] | None,
+    option("--channel NAME", "Only this channel; may be repeated.", autocompletion=complete_channel),
+]
 JsonOption = Annotated[bool, option("--json", "Print JSON, for scripts.")]
 
 _ASSIGNMENT = re.compile(r"(\w+)=(.*)", re.ASCII | re.DOTALL)
