@@ -99,8 +99,6 @@ SUPPLEMENT = {
     "CanSettings.interface": "Interface name of python-can.",
     "CanSettings.bitrate": "Bits per second; 0: already set up, e.g. by `ip link`.",
     "GpsSettings.delay_sigma": "Standard deviation of `delay`, seconds.",
-    "Gx1Settings.delay_sigma": "Standard deviation of `delay`, seconds.",
-    "Gx1Settings.poll_period": "Seconds between two polls.",
     "ModbusSettings.address": "HOST:PORT of the Modbus/TCP server.",
     "ModbusSettings.unit_id": "Device behind the server.",
     "SerialSettings.baud": "Baud rate; 0: the factory setting of the device.",

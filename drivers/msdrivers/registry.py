@@ -350,7 +350,7 @@ _KINDS = (
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load("gx1.driver", "Gx1"),
+        _load("gx1", "Gx1"),
         _emulate("imu", lambda emulators, inputs: emulators.Gx1Emulator(inputs.samples)),
         38400,
         faults={**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"},

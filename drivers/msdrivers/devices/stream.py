@@ -434,6 +434,8 @@ class ByteSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds are above 0, got {self.bauds}")
 
     @property
     def bauds(self) -> tuple[int, ...]:
@@ -453,8 +455,6 @@ class StreamSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, answer_timeout=(0.05, 60.0), attempts=(1, 100))
-        if any(baud <= 0 for baud in self.bauds):
-            raise ValueError(f"bauds are above 0, got {self.bauds}")
 
 
 class StreamDriver(ABC, Generic[M]):

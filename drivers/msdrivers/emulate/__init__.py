@@ -77,9 +77,6 @@ class HasOwnFaults(Protocol):
     def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         """Apply a fault, if it is one of the device's own; return whether it is."""
 
-    def corrupt(self, unit: Any) -> Any:
-        """Return a damaged unit, as the line would."""
-
 
 class FaultInjector(Generic[U]):
     """An `Endpoint` that wraps another and applies faults in the order of their times.
@@ -178,30 +175,31 @@ class FaultInjector(Generic[U]):
             elif self._pending["corrupt"] > 0:
                 self._pending["corrupt"] -= 1
                 self._counts["fault.corrupted"] += 1
-                damage = self._inner.corrupt if isinstance(self._inner, HasOwnFaults) else corrupt_unit
-                passed.append(Send(damage(output.unit)))
+                passed.append(Send(corrupt_unit(output.unit)))
             else:
                 passed.append(output)
         return passed
 
 
 def corrupt_unit(unit: Any) -> Any:
-    """Return a unit with one bit flipped in its middle; one without anything in it as it is."""
+    """Return bytes with one bit flipped in their middle, a CAN frame or registers without the last one.
+
+    What is empty stays.
+    """
     if isinstance(unit, bytes):
         middle = len(unit) // 2
         return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
     if isinstance(unit, CanFrame):
-        return replace(unit, data=corrupt_unit(unit.data))
-    if isinstance(unit, Registers) and unit.values:
-        return replace(unit, values=(unit.values[0] ^ 0x10, *unit.values[1:]))
+        return replace(unit, data=unit.data[:-1])
+    if isinstance(unit, Registers):
+        return replace(unit, values=unit.values[:-1])
     return unit
 
 
 class CanEmulator(ABC, Generic[S]):
     """Base of an emulator on a CAN bus that sends samples at their stamps.
 
-    If the first stamp is in the past when the line is first opened, all are shifted equally. A corrupt frame lacks its
-    last byte.
+    If the first stamp is in the past when the line is first opened, all are shifted equally.
     """
 
     def __init__(self, text: str, samples: Iterable[S]):
@@ -237,9 +235,6 @@ class CanEmulator(ABC, Generic[S]):
 
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
         return []
-
-    def corrupt(self, unit: CanFrame) -> CanFrame:
-        return replace(unit, data=unit.data[:-1])
 
     def _get_sample_ns(self) -> int | None:
         if self._next is None or self._started is None:

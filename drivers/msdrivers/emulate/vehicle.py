@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
@@ -294,8 +294,8 @@ class AxisUnit:
 class AxisEmulator:
     """An `Endpoint` of `ModbusUnit` that answers requests.
 
-    Faults of its own: a corrupt reply lacks a register. restart: it restarts with its first limits and rate. jump: its
-    angle jumps by `amount` degrees. exception: the next request gets exception code `amount`.
+    Faults of its own: restart: it restarts with its first limits and rate. jump: its angle jumps by `amount` degrees.
+    exception: the next request gets exception code `amount`.
     """
 
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
@@ -348,9 +348,6 @@ class AxisEmulator:
         elif fault.kind == "restart":
             self._switch_on(now.monotonic_ns + round(fault.amount * 1e9))
         return fault.kind in ("exception", "jump", "restart")
-
-    def corrupt(self, unit: ModbusUnit) -> ModbusUnit:
-        return replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
 
     def _advance(self, at_ns: int) -> None:
         """Turn on to an instant, and measure at the last instant of its own before."""

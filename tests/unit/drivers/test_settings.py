@@ -371,7 +371,7 @@ drivers:
   imu:
     device: gx1
     port: /dev/ttyUSB0
-    polld: 3
+    messge: 3
   gps: {device: novatell, port: /dev/ttyUSB1}
 """
 
@@ -384,7 +384,7 @@ def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_
     found, wrong = read_drivers(config.drivers, SourceMap(str(path), read_config_lines(path)))
     assert not found
     assert [(problem.file, problem.line, problem.nearest[:1]) for problem in wrong] == [
-        (str(path), 8, ("polled",)),
+        (str(path), 8, ("message",)),
         (str(path), 9, ("novatel",)),
     ]
 
@@ -392,7 +392,7 @@ def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_
 def test_given_a_name_with_nothing_after_it_then_it_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.yaml"
     path.write_text(
-        VEHICLE.replace("polld", "polled")
+        VEHICLE.replace("messge", "message")
         .replace(": 3\n", ": 0x03\n")
         .replace("{device: novatell, port: /dev/ttyUSB1}", "# later")
     )
