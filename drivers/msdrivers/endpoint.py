@@ -26,6 +26,16 @@ class HostTime(NamedTuple):
     utime: int
 
 
+class TimeSource(Protocol):
+    """A clock, and a way to wait."""
+
+    def now(self) -> HostTime:
+        """Return the instant."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+
 class EndpointPhase(Enum):
     """Phase of the connection to the device."""
 

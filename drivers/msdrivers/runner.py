@@ -37,10 +37,10 @@ from msdrivers.endpoint import (
     Output,
     Reopen,
     Send,
+    TimeSource,
     U,
 )
 from msdrivers.links import EndOfRecordingError, Link, LinkError
-from msdrivers.raw_log import TimeSource
 from msdrivers.registry import CHANNELS
 
 HEALTH_CHANNEL = "DRIVER_HEALTH"

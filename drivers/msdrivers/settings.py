@@ -5,7 +5,7 @@
 
 `device` is the kind. The other keys follow from the dataclasses of the kind's lines and settings, which alone define
 names, types and limits. `SectionReader` validates a section as `modelserver.config.reader` does a file, and collects
-every problem with its line and fix. Of the settings drivers, emulators, links and codecs are made (`make_driver`).
+every problem with its line and fix. Of the settings drivers, emulators and links are made (`make_driver`).
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ import dataclasses
 import json
 import os
 import re
-import struct
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from modelserver.config.reader import Path_, SettingsReader, get_adapter, get_value, list_known_keys
+from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
 from modelserver.errors import (
     ConfigError,
     Location,
@@ -34,9 +33,8 @@ from modelserver.errors import (
     suggest_name,
 )
 from msdrivers.emulate import InjectedFault
-from msdrivers.endpoint import CanFrame, Endpoint, ModbusUnit
+from msdrivers.endpoint import Endpoint
 from msdrivers.links import Link
-from msdrivers.raw_log import BYTES_CODEC, UnitCodec
 from msdrivers.registry import (
     KINDS,
     CanSettings,
@@ -351,52 +349,6 @@ NTRIP_FIELD = "ntrip"
 
 COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
 """Keys that every driver has."""
-
-_CAN_HEADER = struct.Struct(">IB")
-
-_EXTENDED_FLAG, _ERROR_FLAG = 1, 2
-
-
-def _pack_frame(frame: CanFrame) -> bytes:
-    flags = _EXTENDED_FLAG * frame.is_extended + _ERROR_FLAG * frame.is_error
-    return _CAN_HEADER.pack(frame.arbitration_id, flags) + frame.data
-
-
-def _unpack_frame(data: bytes) -> CanFrame:
-    if len(data) < _CAN_HEADER.size:
-        raise ValueError(f"{len(data)} bytes are no CAN frame")
-    identifier, flags = _CAN_HEADER.unpack_from(data)
-    return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
-
-
-def _pack_modbus(unit: ModbusUnit) -> bytes:
-    fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
-    return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
-
-
-def _unpack_modbus(data: bytes) -> ModbusUnit:
-    try:
-        name, fields = json.loads(data)
-        unit: ModbusUnit = get_adapter(_MODBUS_TYPES[name]).validate_python(fields)
-    except (TypeError, KeyError) as error:
-        raise ValueError(f"no Modbus unit: {error}") from None
-    return unit
-
-
-_MODBUS_TYPES: Mapping[str, Any] = {kind.__name__: kind for kind in get_args(ModbusUnit)}
-
-CAN_CODEC = UnitCodec("can", _pack_frame, _unpack_frame)
-"""The identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); the data."""
-
-MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
-"""JSON of the unit's kind and fields."""
-
-
-def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
-    """Return how the units of a driver's line are recorded."""
-    if isinstance(settings.line, CanSettings):
-        return CAN_CODEC
-    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:

@@ -73,13 +73,13 @@ def test_given_the_recording_of_another_device_then_it_is_refused_with_whose_it_
     for name, kind in (("imu", "gx1"), ("nmea", "nmea"), ("axis", "axis")):
         code, _, err = run("driver", name, "--play-raw", str(raw))
         assert code == 1
-        assert f"{raw}: recording of bytes of a novatel (driver gps), but driver {name} is a {kind}" in err
+        assert f"{raw}: recording of a novatel (driver gps), but driver {name} is a {kind}" in err
 
 
 def test_given_the_vehicle_file_to_record_into_then_it_stays(run: Callable[..., Output], vehicle: Path) -> None:
     code, _, err = run("driver", "gps", "--record-raw", str(vehicle))
     assert code == 1
-    assert "vehicle.yaml is there, is no recording of a driver, and stays; name another" in err
+    assert "vehicle.yaml is there already, and stays; name another" in err
     assert vehicle.read_text() == VEHICLE
 
 

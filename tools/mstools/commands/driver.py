@@ -19,7 +19,6 @@ from modelserver.errors import (
     ConfigError,
     ModelServerError,
     Problem,
-    RecordingError,
     find_nearest_names,
     has_error,
     quote,
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.messages import Sample
     from modelserver.transforms.so3 import Vector3
+    from msdrivers.endpoint import TimeSource
     from msdrivers.links import Link
-    from msdrivers.raw_log import TimeSource
     from msdrivers.registry import DeviceKind
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
@@ -97,7 +96,6 @@ def command(
         bool, option("--list", "List the ports and the drivers of the vehicle file, then exit.")
     ] = False,
     record_raw: Annotated[Path | None, option("--record-raw FILE", "Record the bytes of the connection.")] = None,
-    record_limit: Annotated[float, option("--record-limit MB", "Largest size of the recording.", min=0.001)] = 1000.0,
     play_raw: Annotated[Path | None, option("--play-raw FILE", "Read a recording instead of the device.")] = None,
     url: UrlOption = "",
     log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
@@ -132,7 +130,7 @@ def command(
     set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
     warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
-        link = _make_link(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
+        link = _make_link(stack, settings, record_raw, play_raw)
         run(vehicle, settings, link, config.parent, url, start)
 
 
@@ -238,27 +236,23 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
 
 
 def _make_link(
-    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
+    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, play: Path | None
 ) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
+    from msdrivers.registry import SerialSettings, TcpSettings
     from msdrivers.runner import SystemTimeSource
-    from msdrivers.settings import make_codec, make_link
+    from msdrivers.settings import make_link
 
-    codec = make_codec(settings)
+    names = settings.name, settings.kind.name
     if play is not None:
-        reader = open_for_reading(play)
-        stack.callback(reader.stream.close)
-        if (reader.kind, reader.device) != (codec.name, settings.kind.name):
-            found = f"{reader.kind} of a {reader.device} (driver {reader.source})"
-            raise RecordingError(f"{play}: recording of {found}, but driver {settings.name} is a {settings.kind.name}")
-        return ReplayLink(reader, codec.unpack, SystemTimeSource())
+        return ReplayLink(stack.enter_context(open_for_reading(play, *names)), str(play), SystemTimeSource())
     link = make_link(settings)
     if record is None:
         return link
-    writer = stack.enter_context(open_for_writing(record, limit))
-    writer.begin(codec.name, settings.name, settings.kind.name)
-    return RecordingLink(link, codec, writer, SystemTimeSource())
+    if not isinstance(settings.line, SerialSettings | TcpSettings):
+        raise typer.BadParameter("only bytes are recorded; a bus by candump or tcpdump", param_hint="--record-raw")
+    return RecordingLink(link, stack.enter_context(open_for_writing(record)), *names, SystemTimeSource())
 
 
 def run(
