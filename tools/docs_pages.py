@@ -98,7 +98,6 @@ SUPPLEMENT = {
     "CanSettings.can": "Channel of the bus, e.g. `can0`; with `udp_multicast` GROUP:PORT.",
     "CanSettings.interface": "Interface name of python-can.",
     "CanSettings.bitrate": "Bits per second; 0: already set up, e.g. by `ip link`.",
-    "GpsSettings.delay_sigma": "Standard deviation of `delay`, seconds.",
     "ModbusSettings.address": "HOST:PORT of the Modbus/TCP server.",
     "ModbusSettings.unit_id": "Device behind the server.",
     "SerialSettings.baud": "Baud rate; 0: the factory setting of the device.",

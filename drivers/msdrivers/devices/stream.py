@@ -443,18 +443,10 @@ class ByteSettings:
         return ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamSettings(ByteSettings):
-    """Settings of a device that is configured."""
-
-    answer_timeout: float = 0.5
-    """Timeout for an answer, seconds."""
-    attempts: int = 3
-    """How often an unanswered message is sent."""
-
-    def __post_init__(self) -> None:
-        ByteSettings.__post_init__(self)
-        check_ranges(self, answer_timeout=(0.05, 60.0), attempts=(1, 100))
+def check_silence(silence: float, rate_hz: float) -> None:
+    """Raise ValueError for a timeout that a device at this rate would exceed."""
+    if silence < 1.5 / rate_hz:
+        raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {silence:g}")
 
 
 class StreamDriver(ABC, Generic[M]):
@@ -466,6 +458,10 @@ class StreamDriver(ABC, Generic[M]):
     """What is looked for, e.g. "u-blox receiver"."""
     awaited: str
     """What it streams, e.g. "NAV-PVT"."""
+    answer_timeout = 0.5
+    """Timeout for an answer, seconds."""
+    attempts = 3
+    """How often an unanswered message is sent."""
 
     def __init__(self, settings: ByteSettings, stream: FrameScanner[M]) -> None:
         self._settings, self._stream = settings, stream
@@ -646,8 +642,7 @@ class StreamDriver(ABC, Generic[M]):
         self._restart_silence_timer()
 
     def _make_request(self, frame: bytes) -> RequestStep:
-        assert isinstance(self._settings, StreamSettings)
-        return RequestStep(frame, self._settings.answer_timeout, self._settings.attempts)
+        return RequestStep(frame, self.answer_timeout, self.attempts)
 
     def _restart_silence_timer(self) -> None:
         self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)

@@ -23,12 +23,12 @@ from modelserver.transforms.so3 import Quaternion
 from msdrivers.devices import check_ranges
 from msdrivers.devices.stream import (
     NO_FRAME,
+    ByteSettings,
     FrameScanner,
     ParsedFrame,
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -216,7 +216,7 @@ MAX_RATE, MAX_ACCELERATION = 40.0, 400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VectornavSettings(StreamSettings):
+class VectornavSettings(ByteSettings):
     """Settings of a VN-100. Raises ValueError with the key for an invalid value."""
 
     rate_hz: float = 100.0
@@ -227,11 +227,9 @@ class VectornavSettings(StreamSettings):
     """What the yaw of its orientation is measured against: `magnetic`, or `none` where its magnetometers are off."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    answer_timeout: float = 0.3
-    """Timeout for an answer, seconds."""
 
     def __post_init__(self) -> None:
-        StreamSettings.__post_init__(self)
+        ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
         if self.heading not in ("magnetic", "none"):
             raise ValueError(f"heading is magnetic or none, got '{self.heading}'")
@@ -246,6 +244,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
     device = "vectornav"
     description = "VectorNav unit"
     awaited = "binary output"
+    answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
         super().__init__(settings, VnStream())

@@ -20,12 +20,12 @@ from modelserver.transforms.so3 import Quaternion
 from msdrivers.devices import check_ranges
 from msdrivers.devices.stream import (
     NO_FRAME,
+    ByteSettings,
     FrameScanner,
     ParsedFrame,
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -223,7 +223,7 @@ MAX_ACCELERATION: Final = 400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class XsensSettings(StreamSettings):
+class XsensSettings(ByteSettings):
     """Settings of an MTi. Raises ValueError with the key for an invalid value."""
 
     rate_hz: int = 100
@@ -234,11 +234,9 @@ class XsensSettings(StreamSettings):
     """What the yaw of its orientation is measured against: `magnetic`, `none` (VRU), or `true` (with declination)."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400, 2000000)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    attempts: int = 5
-    """How often an unanswered message is sent: some units do not answer after power-up."""
 
     def __post_init__(self) -> None:
-        StreamSettings.__post_init__(self)
+        ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1, 400), field_strength=(0.0, 1e-3))
         if self.heading not in _YAW_SOURCES:
             raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
@@ -275,6 +273,8 @@ class XsensDriver(StreamDriver[XbusMessage]):
     device = "xsens"
     description = "Xsens MTi"
     awaited = "MTData2"
+    attempts = 5
+    """Some units do not answer after power-up."""
 
     def __init__(self, settings: XsensSettings) -> None:
         super().__init__(settings, XbusStream())

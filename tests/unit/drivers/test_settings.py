@@ -311,18 +311,18 @@ def test_given_rules_of_the_section_that_are_broken_then_they_are_reported_besid
         "port": "p",
         "rate_hz": -4,
         "silence": math.nan,
-        "attempts": "three",
+        "log_format": 3,
         "bauds": 9600,
-        "hold": -1,
+        "delay": -9,
     }
     with pytest.raises(ConfigError) as caught:
         read_driver("gps", section)
     assert {problem.element.rpartition(".")[2]: problem.message for problem in caught.value.problems} == {
-        "attempts": "attempts is a whole number, got 'three'",
+        "log_format": "log_format is text, got 3",
         "bauds": "bauds is a list, got 9600",
-        "rate_hz": "rate_hz: must be 0.1 to 20 Hz, got -4",
-        "silence": "silence: must be 0.1 to 3600 s, got nan",
-        "hold": "hold: must be 0 to 3600 s, got -1",
+        "rate_hz": "rate_hz is between 0.1 and 20, got -4",
+        "silence": "silence is between 0.05 and 3600, got nan",
+        "delay": "delay is between -5 and 5, got -9",
     }
     assert len(caught.value.problems) == 5
 
