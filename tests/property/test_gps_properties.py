@@ -21,7 +21,6 @@ from msdrivers.devices.gps.novatel import (
     PositionType,
     SolutionStatus,
     TimeStatus,
-    UtmPosition,
     Velocity,
     crc32,
     encode,
@@ -109,26 +108,6 @@ bodies = {
         count,
     ),
     "BESTVEL": st.builds(Velocity, status, kind, sigma, sigma, sigma, st.floats(0.0, 360.0), small),
-    "BESTUTM": st.builds(
-        UtmPosition,
-        status,
-        kind,
-        st.integers(1, 60),
-        st.sampled_from("CNX"),
-        st.floats(0, 1e7),
-        st.floats(0, 1e6),
-        small,
-        small,
-        st.just(61),
-        sigma,
-        sigma,
-        sigma,
-        station,
-        sigma,
-        sigma,
-        count,
-        count,
-    ),
 }
 headers = st.builds(
     LogHeader,
@@ -187,7 +166,7 @@ fields = st.one_of(numbers, st.text("0123456789.eE+-naifNAIF", max_size=12), st.
 
 
 @given(
-    st.sampled_from(("#BESTPOSA", "#BESTVELA", "#BESTUTMA", "#HEADINGA", "#HEADING2A", "%BESTPOSSA", "%RAWIMUSA")),
+    st.sampled_from(("#BESTPOSA", "#BESTVELA", "#HEADINGA", "#HEADING2A", "%BESTPOSSA", "%RAWIMUSA")),
     st.lists(st.tuples(st.integers(0, 40), fields), min_size=1, max_size=4),
 )
 def test_given_a_text_log_with_any_fields_and_a_right_checksum_then_nothing_is_raised_and_the_next_is_read(
@@ -197,7 +176,6 @@ def test_given_a_text_log_with_any_fields_and_a_right_checksum_then_nothing_is_r
     bodies = {
         "#BESTPOSA": f'{kind},50,-111,700,-20,WGS84,1,2,3,"",0,0,8,8,8,0,0,02,00,01',
         "#BESTVELA": f"{kind},0.1,0,1.5,90,0.1,0",
-        "#BESTUTMA": f'{kind},12,N,5e6,5e5,700,-20,WGS84,1,2,3,"",0,0,8,8,8,0,0,02,00,01',
         "#HEADINGA": f'{kind},2,90,1,0,0.1,0.2,"AA",10,9,9,9,00,00,00',
         "#HEADING2A": f'{kind},2,90,1,0,0.1,0.2,"AA","BB",10,9,9,9,00,00,00',
     }

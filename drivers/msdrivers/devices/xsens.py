@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -48,7 +48,7 @@ class MessageId(IntEnum):
 
 
 class ItemId(IntEnum):
-    """Identifiers of items of MTData2, without format and frame."""
+    """Identifiers of items of MTData2, in float32 and against ENU, as they are asked for."""
 
     TEMPERATURE = 0x0810
     PACKET_COUNTER = 0x1020
@@ -59,8 +59,6 @@ class ItemId(IntEnum):
     MAGNETIC_FIELD = 0xC020
     STATUS_WORD = 0xE020
 
-
-FRAME_ENU, FRAME_NED = 0x0, 0x4
 
 TICK: Final = 1e-4
 """Seconds of SampleTimeFine."""
@@ -150,29 +148,15 @@ class MtData:
         data = self.items.get(item)
         return None if data is None else int.from_bytes(data, "big")
 
-    def get_numbers(self, item: ItemId, count: int, frame: int = 0) -> tuple[float, ...] | None:
-        """Return `count` numbers in any of the formats; None if they are missing, or of another size."""
-        for form, size in enumerate(_SIZES):
-            data = self.items.get(item | frame | form)
-            if data is not None and len(data) == size * count:
-                return tuple(_READERS[form](data[n * size : (n + 1) * size]) for n in range(count))
-        return None
+    def get_numbers(self, item: int, count: int) -> tuple[float, ...] | None:
+        """Return `count` numbers of float32, as they are asked for; None if they are missing, or of another size."""
+        data = self.items.get(item)
+        return struct.unpack(f">{count}f", data) if data is not None and len(data) == 4 * count else None
 
     @property
     def is_clipped(self) -> bool:
         """Whether a measurement was beyond its range."""
         return bool((self.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
-
-
-_SIZES: Final = (4, 4, 6, 8)
-_READERS: Final[tuple[Callable[[bytes], float], ...]] = (
-    lambda data: float(struct.unpack(">f", data)[0]),
-    lambda data: int.from_bytes(data, "big", signed=True) / (1 << 20),
-    # the fraction first, then the whole part
-    lambda data: int.from_bytes(data[4:], "big", signed=True) + int.from_bytes(data[:4], "big") / (1 << 32),
-    lambda data: float(struct.unpack(">d", data)[0]),
-)
-"""By number format: float32, fixed point 12.20, fixed point 16.32, float64."""
 
 
 def encode_items(items: Iterable[tuple[int, bytes]]) -> bytes:
@@ -326,7 +310,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)
-        orientation, reference = _find_orientation(data)
+        orientation = _find_orientation(data)
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
             angular_velocity=self._read_vector(rate, MAX_RATE),
@@ -335,20 +319,18 @@ class XsensDriver(StreamDriver[XbusMessage]):
             if self._own.field_strength
             else None,
             orientation=orientation,
-            orientation_reference=reference,
+            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.ENU,
             yaw_source=YawSource.NONE if orientation is None else _YAW_SOURCES[self._own.heading],
             temperature_celsius=self._celsius,
         )
         return self._publish(sample, now, TICK)
 
 
-def _find_orientation(data: MtData) -> tuple[Quaternion | None, OrientationReference]:
-    """Return the unit's own orientation (w, x, y, z) and its reference; None if it has none, or in another frame."""
-    for frame, reference in ((FRAME_ENU, OrientationReference.ENU), (FRAME_NED, OrientationReference.NED)):
-        values = data.get_numbers(ItemId.QUATERNION, 4, frame)
-        if values is not None:
-            norm = math.sqrt(sum(each * each for each in values))
-            if abs(norm - 1.0) < 0.01:
-                w, x, y, z = (each / norm for each in values)
-                return (w, x, y, z), reference
-    return None, OrientationReference.NONE
+def _find_orientation(data: MtData) -> Quaternion | None:
+    """Return the unit's own orientation (w, x, y, z) against ENU; None if it has none."""
+    values = data.get_numbers(ItemId.QUATERNION, 4)
+    norm = 0.0 if values is None else math.sqrt(sum(each * each for each in values))
+    if values is None or abs(norm - 1.0) >= 0.01:
+        return None
+    w, x, y, z = (each / norm for each in values)
+    return (w, x, y, z)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -111,22 +110,6 @@ def test_given_a_packet_then_its_items_are_read(frame: str) -> None:
         assert data.get_numbers(ItemId.RATE_OF_TURN, 3) == pytest.approx(rate, rel=1e-5)
     if orientation is not None:
         assert data.get_numbers(ItemId.QUATERNION, 4) == pytest.approx(orientation, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("form", "data"),
-    [
-        (0, struct.pack(">fff", 1.5, -2.25, 9.75)),
-        (1, b"".join(round(each * (1 << 20)).to_bytes(4, "big", signed=True) for each in (1.5, -2.25, 9.75))),
-        (2, b"".join(
-            (int(each * (1 << 32)) & 0xFFFFFFFF).to_bytes(4, "big") + math.floor(each).to_bytes(2, "big", signed=True)
-            for each in (1.5, -2.25, 9.75)
-        )),
-        (3, struct.pack(">ddd", 1.5, -2.25, 9.75)),
-    ],
-)  # fmt: skip
-def test_given_a_format_of_numbers_then_they_are_the_same(form: int, data: bytes) -> None:
-    assert MtData({ItemId.ACCELERATION | form: data}).get_numbers(ItemId.ACCELERATION, 3) == (1.5, -2.25, 9.75)
 
 
 def test_given_the_setup_of_the_document_then_it_is_encoded_alike() -> None:

@@ -167,28 +167,6 @@ class Velocity(NamedTuple):
     vertical: float
 
 
-class UtmPosition(NamedTuple):
-    """Body of BESTUTM. Meters; zone by number and letter; otherwise as `Position`."""
-
-    status: int
-    type: int
-    zone: int
-    letter: str
-    northing: float
-    easting: float
-    height: float
-    undulation: float
-    datum: int
-    sigma_northing: float
-    sigma_easting: float
-    sigma_height: float
-    station: str
-    differential_age: float
-    solution_age: float
-    tracked: int
-    used: int
-
-
 class HeadingLog(NamedTuple):
     """Body of HEADING and HEADING2: from the antenna whose position is given to the other one.
 
@@ -207,7 +185,7 @@ class HeadingLog(NamedTuple):
     used: int
 
 
-Body: TypeAlias = Position | Velocity | UtmPosition | HeadingLog
+Body: TypeAlias = Position | Velocity | HeadingLog
 
 
 class NovatelLog(NamedTuple):
@@ -301,12 +279,6 @@ def _enumeration(kind: type[IntEnum]) -> _Column:
     )
 
 
-def _decode_letter(number: int) -> str:
-    if not 65 <= number <= 90:
-        raise ValueError(f"{number} is no letter of a zone")
-    return chr(number)
-
-
 _SOLUTION = (_enumeration(SolutionStatus), _enumeration(PositionType))
 _COUNTS = (_Column("B", partial(parse_integer, most=0xFF)),) * 2
 _STATION = _Column(
@@ -321,12 +293,9 @@ _DATUM = _Column(
     lambda word: DATUMS.get(word, 0),
     lambda number: next((name for name, each in DATUMS.items() if each == number), "USER"),
 )
-_ZONE = (_Column("I", partial(parse_integer, most=0xFFFF_FFFF)), _Column("I", str, str, _decode_letter, ord))
 _RESERVED = _Column("4x", text="0.0")
 _TAIL = (_Column("x", text="0"),) * 3 + (_Column("x", text="00"),) * 3
 """Counts of observations and masks that end several logs."""
-_FIX = (_DATUM, *(_real("f", 4),) * 3, _STATION, *(_real("f", 3),) * 2, *_COUNTS, *_TAIL)
-"""What BESTPOS and BESTUTM have after the place: datum, sigmas, station, ages, satellites."""
 _BASELINE = (*_SOLUTION, _real("f", 4), *(_real("f", 6),) * 2, _RESERVED, *(_real("f", 4),) * 2, _STATION)
 
 
@@ -379,7 +348,12 @@ _POSITION = BodyLayout(
     *(_real("d", 11),) * 2,
     _real("d", 4),
     _real("f", 4),
-    *_FIX,
+    _DATUM,
+    *(_real("f", 4),) * 3,
+    _STATION,
+    *(_real("f", 3),) * 2,
+    *_COUNTS,
+    *_TAIL,
 )
 
 BODIES = {
@@ -396,7 +370,6 @@ BODIES = {
         _real("d", 4),
         _RESERVED,
     ),
-    "BESTUTM": BodyLayout(UtmPosition, lambda _: True, *_SOLUTION, *_ZONE, *(_real("d", 4),) * 3, _real("f", 4), *_FIX),
     "HEADING": BodyLayout(HeadingLog, lambda body: 0.0 <= body.heading <= 360.0, *_BASELINE, *_COUNTS, *_TAIL),
     "HEADING2": BodyLayout(
         HeadingLog,
