@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files import read_regular
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 class SerialSettings:
     """A serial port: its path, and symbols a second; 0: what the device has from its maker."""
 
-    description: ClassVar[str] = "a serial port"
     port: str
     baud: int = 0
 
@@ -47,7 +46,6 @@ class SerialSettings:
 class TcpSettings:
     """A device server: `HOST:PORT`."""
 
-    description: ClassVar[str] = "a server"
     address: str
 
     def __post_init__(self) -> None:
@@ -64,7 +62,6 @@ class CanSettings:
     bitrate 0: the interface is set up already, as socketcan's are by `ip link`.
     """
 
-    description: ClassVar[str] = "a CAN bus"
     can: str
     interface: str = "socketcan"
     bitrate: int = 0
@@ -85,7 +82,6 @@ class CanSettings:
 class ModbusSettings:
     """A Modbus/TCP server: `HOST:PORT`, the port customarily 502, and the number of the device behind it."""
 
-    description: ClassVar[str] = "a server"
     address: str
     unit_id: int = 1
 
