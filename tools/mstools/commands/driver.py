@@ -9,7 +9,6 @@ import signal
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain, dropwhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -415,12 +414,11 @@ GPS_HZ = 4.0
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """What to measure: an LCM log, or without one a simulated drive of `seconds`.
+    """The simulated drive of `seconds` that a device measures.
 
     start: its start, microseconds of UTC; None: now. own_field: hard iron, tesla along the sensor's axes.
     """
 
-    log: Path | None
     start: int | None
     seconds: float
     scenario: str
@@ -428,85 +426,27 @@ class DriveOptions:
     own_field: Vector3
 
 
-def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
+def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
     """Return the samples that the emulator of a driver's device measures; their end is logged.
 
-    Raises ModelServerError if there are none: a log without the channel, a drive that is already over.
-    """
-    kind, now = settings.kind, time.time_ns() // 1000
-    start = now + START_DELAY_US if wanted.start is None else wanted.start
-    if wanted.log is not None:
-        samples, what = read_logged(wanted.log, vehicle, settings, start), str(wanted.log)
-    elif not kind.follows_samples or (wanted.start is None and kind.command_channel):
-        # without a drive it follows its commands
-        return iter(())
-    else:
-        if start + round(wanted.seconds * 1e6) < now:
-            ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
-            raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
-        samples, what = simulate(vehicle, settings, start, wanted), "the simulated drive"
-    if wanted.start is not None or wanted.log is None:
-        # samples before now are skipped, also those of the time that making the drive took
-        now = time.time_ns() // 1000
-        samples = dropwhile(lambda sample: sample.header.utime < now, samples)
-    if wanted.log is not None:
-        # an error now, not after the driver has connected
-        first = next(samples, None)
-        if first is None:
-            raise ModelServerError(f"--start {wanted.start} is so long ago that {what} is over: no samples are left")
-        samples = chain((first,), samples)
-    return log_end(samples, settings.name, what)
-
-
-def log_end(samples: Iterator[Sample], name: str, what: str) -> Iterator[Sample]:
-    """Yield samples, and log a warning at their end: the emulator continues without measurements."""
-    yield from samples
-    log.warning("%s: %s is over, there are no more measurements", name, what)
-
-
-def read_logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[Sample]:
-    """Yield the samples of a driver's channel in a log, with stamps shifted so that the first is at `start_utime`.
-
-    Raises ModelServerError if there are none.
-    """
-    from modelserver.wire.channels import BY_NAME
-    from modelserver.wire.codec import decode
-    from modelserver.wire.eventlog import LogFile
-    from msdrivers.registry import CHANNELS
-
-    kind = settings.kind.sample
-    channel = f"{vehicle.lcm.channel_prefix}{channels_of(vehicle, settings).get(kind) or CHANNELS[kind]}"
-    shift = None
-    with LogFile(file) as events:
-        for event in events:
-            if event.channel == channel:
-                sample: Sample = decode(BY_NAME[CHANNELS[kind]].type_name, event.data)
-                header = sample.header
-                shift = start_utime - header.utime if shift is None else shift
-                host = header.host_utime + shift if header.host_utime else 0
-                yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
-    if shift is None:
-        raise ModelServerError(f"{file} has no messages on {channel}; expected the driver's channel")
-
-
-def simulate(
-    vehicle: VehicleConfig, settings: DriverSettings, start_utime: int, wanted: DriveOptions
-) -> Iterator[Sample]:
-    """Return the samples of a driver's sensor on a simulated drive from `start_utime` on.
-
     A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
-    wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a sensor without a
-    section in the vehicle file.
+    wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a drive that is already
+    over, and a sensor without a section in the vehicle file.
     """
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
     from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
     from mstools.launch.drive import WHEELS_HZ, make_simulation
 
+    now = time.time_ns() // 1000
+    start = now + START_DELAY_US if wanted.start is None else wanted.start
     sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
     sensors, kind = vehicle.sensors, settings.kind.sample
-    if kind not in sections:
-        # it follows its commands
-        return iter(())
+    follows_commands = not settings.kind.follows_samples or (wanted.start is None and settings.kind.command_channel)
+    if follows_commands or kind not in sections:
+        return
+    if start + round(wanted.seconds * 1e6) < now:
+        ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
+        raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
     if getattr(sensors, sections[kind]) is None:
         raise ModelServerError(
             f"the vehicle file has no section sensors.{sections[kind]}, which has the sensor's frame"
@@ -516,7 +456,7 @@ def simulate(
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
     run = make_simulation(
         vehicle,
-        start_utime,
+        start,
         wanted.seconds,
         wanted.scenario,
         wanted.seed,
@@ -525,7 +465,12 @@ def simulate(
         imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=wanted.own_field)),
         wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
-    return (sample for sample in run.events(wanted.seconds) if isinstance(sample, kind))
+    # samples before now are skipped, also those of the time that making the drive took
+    now = time.time_ns() // 1000
+    for sample in run.events(wanted.seconds):
+        if isinstance(sample, kind) and sample.header.utime >= now:
+            yield sample
+    log.warning("%s: the simulated drive is over, there are no more measurements", settings.name)
 
 
 SCENARIOS = ("eight", "circle", "stand", "straight", "city")
@@ -538,7 +483,6 @@ def emulate(
     link: Annotated[Path | None, option("--link PATH", "With --pty: create a symbolic link to it here.")] = None,
     tcp: Annotated[int | None, option("--tcp PORT", "Listen on loopback; 0: any port.", min=0, max=65535)] = None,
     can: Annotated[str, option("--can CHANNEL", "Connect to a CAN bus.")] = "",
-    log: Annotated[Path | None, option("--from LOG", "Replay the samples of an LCM log.")] = None,
     scenario: Annotated[str, option("--scenario NAME", f"The simulated drive: {', '.join(SCENARIOS)}.")] = SCENARIOS[0],
     faults: Annotated[
         list[str] | None,
@@ -557,7 +501,7 @@ def emulate(
         ),
     ] = None,
 ) -> None:
-    """Emulate a device: answer its driver, and measure a simulated drive or replay a log.
+    """Emulate a device: answer its driver, and measure a simulated drive.
 
     Prints the line to put into the vehicle file, and speaks until SIGTERM, Ctrl-C or --seconds.
 
@@ -565,7 +509,7 @@ def emulate(
     Examples:
       modelserver emulate gps -c config/raptor/vehicle.yaml --pty --link /tmp/gps
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
-      modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
+      modelserver emulate wheels -c vehicle.yaml --can vcan0 --scenario city
     """
     from msdrivers.emulate import parse_fault
 
@@ -579,14 +523,10 @@ def emulate(
         wanted = tuple(parse_fault(text, settings.kind.faults) for text in faults or ())
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--fault") from None
-    if log is not None and not settings.kind.follows_samples:
-        raise typer.BadParameter(
-            f"device {settings.kind.name} follows its commands and cannot replay a log", param_hint="--from"
-        )
     own_field = _parse_field(iron)
     line = _make_device_link(settings, link, tcp, can)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
+    samples = simulate(vehicle, settings, DriveOptions(start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_emulator
