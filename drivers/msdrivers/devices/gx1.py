@@ -6,8 +6,8 @@ plus every 16-bit word after it, modulo 65536. There is no sync byte, so random 
 MicroStrain, "3DM-GX1 Data Communications Protocol", and public drivers that follow it.
 
 Ticks (`TickUnwrapper`): 16 bits, unwrapped. They are plausible if they are ahead of the previous ones by no more than
-the elapsed time (plus 0.5 s). They may be ahead by less: replies that a busy host reads late arrive all at once. Three
-consecutive implausible replies that agree with each other mean that the counter has jumped.
+the elapsed time (plus 0.5 s). They may be ahead by less: replies that a busy host reads late arrive all at once. After
+a jump of the counter none is plausible, and the setup is repeated as after any silence.
 
 Scaling: a vector's word times its gain (a word of the EEPROM) by 32768000 is gauss, g or rad/s.
 
@@ -224,26 +224,19 @@ SLACK_NS = 500_000_000
 MIN_TICK_S = 0.005
 """Shortest possible tick, used while its length is unknown."""
 
-MIN_AGREEING = 3
-"""Consecutive replies that agree with each other but not with the previous ones: the counter has jumped."""
-
 
 class TickUnwrapper:
     """Unwraps ticks and checks their plausibility. Instants are the host's monotonic nanoseconds.
 
-    The unwrapped count starts above zero, never goes back, and advances by more than `COUNTER_RANGE` when the counter
-    has jumped or `reset` was called.
+    The unwrapped count starts above zero, never goes back, and advances by more than `COUNTER_RANGE` when `reset` was
+    called.
     """
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._at_ns = 0
-        self._candidate: tuple[int, int] = (0, 0)
-        self._agreeing_count = 0
         self._count = COUNTER_RANGE
         self._ticks_per_ns = 1e-9 / MIN_TICK_S
-        self.has_jumped = False
-        """The counter has jumped since `reset`."""
 
     def set_tick(self, tick_s: float) -> None:
         """Set the length of a tick; the device's clock and the host's may differ by 5 %."""
@@ -252,40 +245,16 @@ class TickUnwrapper:
     def reset(self) -> None:
         """Accept any next count: the device may have restarted."""
         self._last = None
-        self._agreeing_count = 0
         self._count = (self._count // COUNTER_RANGE + 2) * COUNTER_RANGE
-        self.has_jumped = False
 
     def unwrap(self, ticks: int, at_ns: int) -> int | None:
         """Return the unwrapped ticks of a reply; None if they are implausible."""
-        if self._last is None:
-            return self._restart(ticks, at_ns)
-        ahead = (ticks - self._last) % COUNTER_RANGE
-        if ahead <= self._max_advance(at_ns - self._at_ns):
-            self._count += ahead
-            self._last, self._at_ns = ticks, at_ns
-            self._agreeing_count = 0
-            return self._count
-        return self._on_outlier(ticks, at_ns)
-
-    def _max_advance(self, elapsed_ns: int) -> float:
-        return (elapsed_ns + SLACK_NS) * self._ticks_per_ns + 1.0
-
-    def _restart(self, ticks: int, at_ns: int) -> int:
-        self._last, self._at_ns, self._agreeing_count = ticks, at_ns, 0
-        self._count = self._count // COUNTER_RANGE * COUNTER_RANGE + ticks
-        return self._count
-
-    def _on_outlier(self, ticks: int, at_ns: int) -> int | None:
-        before, since_ns = self._candidate
-        agrees = self._agreeing_count > 0 and (ticks - before) % COUNTER_RANGE <= self._max_advance(at_ns - since_ns)
-        self._agreeing_count = self._agreeing_count + 1 if agrees else 1
-        self._candidate = (ticks, at_ns)
-        if self._agreeing_count < MIN_AGREEING:
+        ahead = ticks if self._last is None else (ticks - self._last) % COUNTER_RANGE
+        if self._last is not None and ahead > (at_ns - self._at_ns + SLACK_NS) * self._ticks_per_ns + 1.0:
             return None
-        self.reset()
-        self.has_jumped = True
-        return self._restart(ticks, at_ns)
+        self._count += ahead
+        self._last, self._at_ns = ticks, at_ns
+        return self._count
 
 
 def make_poll(command: int) -> bytes:
@@ -703,8 +672,6 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
             self._stream.reject("content")
             return []
         count = self._ticks.unwrap(packet.ticks or 0, now.monotonic_ns)
-        if self._ticks.has_jumped:
-            return self._restart("its ticks jumped, so it has restarted or is another one", now)
         if count is None or count == self._newest:
             self._stream.reject("ticks" if count is None else "repeated")
             return []
@@ -743,12 +710,8 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         return self._set_status(EndpointPhase.STREAMING, text, is_warning=True) if self._is_tick_wrong else []
 
     def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
-        return self._restart(f"no usable {self.awaited} for {self._settings.silence:g} s", now)
-
-    def _restart(self, why: str, now: HostTime) -> list[Output[bytes]]:
         self._counts["restarts"] += 1
-        status = self._set_status(EndpointPhase.SILENT, f"{self._product}: {why}; repeating the setup")
-        return [*status, *self._setup.start(self._run_setup(), now)]
+        return super()._on_silence(now)
 
 
 def _is_plausible(packet: Gx1Packet) -> bool:

@@ -648,7 +648,7 @@ class StreamDriver(ABC, Generic[M]):
         self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)
 
     def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
-        text = f"no {self.awaited} for {self._settings.silence:g} s, setting the device up again"
+        text = f"no usable {self.awaited} for {self._settings.silence:g} s, setting the device up again"
         return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
     def _try_next_baud(self) -> Script:
