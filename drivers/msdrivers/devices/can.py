@@ -40,9 +40,6 @@ from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
 
-if TYPE_CHECKING:
-    from cantools.database.can import Message
-
 
 def check_signal(signal: str, key: str = "signal") -> None:
     """Raise ValueError unless the text is a signal path."""
@@ -112,7 +109,6 @@ class BoundSignal:
     offset: float
     minimum: float
     maximum: float
-    unit: str = ""
     names: Mapping[int, str] = field(default_factory=dict)
     is_j1939: bool = False
 
@@ -284,7 +280,6 @@ def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
         float(signal.offset),
         -inf if signal.minimum is None else float(signal.minimum),
         inf if signal.maximum is None else float(signal.maximum),
-        signal.unit or "",
         {int(number): str(name) for number, name in (signal.choices or {}).items()},
         message.protocol == "j1939",
     )

@@ -504,14 +504,6 @@ class StreamDriver(ABC, Generic[M]):
     def _describe_wait(self) -> str:
         return f"waiting for an answer: {self.description}"
 
-    def _describe_input(self) -> str:
-        """Describe what was received since the last search, with what to do."""
-        return recognize_line(self._first_bytes, self.device)
-
-    def _explain_absence(self) -> str:
-        """Explain that no device was found, by what was tried."""
-        return f"no {self.description} answers on this line: {'; '.join(self._tried)}"
-
     # --- endpoint ---
 
     @property
@@ -652,14 +644,15 @@ class StreamDriver(ABC, Generic[M]):
         return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
     def _try_next_baud(self) -> Script:
-        bauds, found = self._settings.bauds, self._describe_input()
+        bauds, found = self._settings.bauds, recognize_line(self._first_bytes, self.device)
         baud = bauds[self._baud_index] if bauds else None
         self._tried.append(f"at {baud} baud {found}" if baud else found)
         if len(self._tried) >= max(1, len(bauds)):
             # the text differs with the noise: rate limit
             if self._phase is not EndpointPhase.SILENT or self._now.monotonic_ns >= self._next_warning_ns:
                 self._next_warning_ns = self._now.monotonic_ns + WARNING_INTERVAL_NS
-                yield from self._set_status(EndpointPhase.SILENT, self._explain_absence())
+                text = f"no {self.description} answers on this line: {'; '.join(self._tried)}"
+                yield from self._set_status(EndpointPhase.SILENT, text)
             self._tried = []
         if len(bauds) > 1:
             self._baud_index = (self._baud_index + 1) % len(bauds)

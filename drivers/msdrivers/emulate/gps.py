@@ -49,12 +49,12 @@ _FIXES = {
     FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
     FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
-"""Position type, quality in GGA, mode in RMC and VTG."""
+"""Position type, quality in GGA, mode in RMC."""
 
 
 def is_known(name: str) -> bool:
     """Return whether a log or sentence is written here, e.g. "bestposb" or "gpgga"."""
-    return name in NMEA or (name[:-1] in NOVATEL and name[-1] in "ab")
+    return name in NMEA or (name[:-1] in NOVATEL and name[-1] == "b")
 
 
 def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes:
@@ -62,8 +62,7 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_of(utime)
-    status, binary = TimeStatus.FINESTEERING, name[-1] == "b"
-    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, status, port, 0, 0, binary)
+    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, TimeStatus.FINESTEERING, port, 0, 0, True)
     return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
@@ -130,8 +129,6 @@ def _make_heading(sample: GpsSample) -> HeadingLog:
 
 NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
     "bestpos": _make_position,
-    "psrpos": _make_position,
-    "rtkpos": _make_position,
     "bestvel": _make_velocity,
     "heading": _make_heading,
     "heading2": _make_heading,
@@ -163,13 +160,6 @@ def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     return nmea.encode("GP", "RMC", fields)
 
 
-def _format_vtg(sample: GpsSample, utime: int) -> bytes:
-    speed, course, _ = _get_motion(sample)
-    track = nmea.format_number(_track_from_course(course), 4)
-    speeds = (nmea.format_number(speed / nmea.KNOT, 4), "N", nmea.format_number(speed / nmea.KMH, 4), "K")
-    return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _FIXES[sample.fix_type][2]))
-
-
 def _format_gsa(sample: GpsSample, utime: int) -> bytes:
     dimension = {FixType.NONE: "1", FixType.FIX_2D: "2"}.get(sample.fix_type, "3")
     dilution = (nmea.format_number(each, 2) for each in (sample.pdop, sample.hdop, sample.vdop))
@@ -182,10 +172,6 @@ def _format_gst(sample: GpsSample, utime: int) -> bytes:
     return nmea.encode("GP", "GST", (_format_clock(utime), *[""] * 4, *fields))
 
 
-def _format_hdt(sample: GpsSample, utime: int) -> bytes:
-    return nmea.encode("GP", "HDT", (nmea.format_number(_track_from_course(sample.baseline_yaw), 4), "T"))
-
-
 def _format_zda(sample: GpsSample, utime: int) -> bytes:
     day = datetime.fromtimestamp(utime // SECOND, UTC)
     return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
@@ -194,10 +180,8 @@ def _format_zda(sample: GpsSample, utime: int) -> bytes:
 NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
     "gpgga": _format_gga,
     "gprmc": _format_rmc,
-    "gpvtg": _format_vtg,
     "gpgsa": _format_gsa,
     "gpgst": _format_gst,
-    "gphdt": _format_hdt,
     "gpzda": _format_zda,
 }
 """Sentence -> its bytes."""

@@ -311,14 +311,14 @@ def test_given_rules_of_the_section_that_are_broken_then_they_are_reported_besid
         "port": "p",
         "rate_hz": -4,
         "silence": math.nan,
-        "log_format": 3,
+        "heading_log": 3,
         "bauds": 9600,
         "delay": -9,
     }
     with pytest.raises(ConfigError) as caught:
         read_driver("gps", section)
     assert {problem.element.rpartition(".")[2]: problem.message for problem in caught.value.problems} == {
-        "log_format": "input should be a valid string, got '3'",
+        "heading_log": "input should be a valid string, got '3'",
         "bauds": "input should be a valid array, got '9600'",
         "rate_hz": "rate_hz is between 0.1 and 20, got -4",
         "silence": "silence is between 0.05 and 3600, got nan",

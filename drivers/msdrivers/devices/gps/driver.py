@@ -58,7 +58,6 @@ from msdrivers.devices.stream import (
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 PROTOCOLS = ("novatel", "nmea")
-FORMATS = ("binary", "ascii")
 HEADING_LOGS = ("", "HEADING", "HEADING2")
 POSITION_LOG = "BESTPOS"
 
@@ -79,8 +78,6 @@ class GpsSettings(ByteSettings):
     """`novatel` configures the receiver by commands; `nmea` only sends `commands` and reads."""
     rate_hz: float = 4.0
     """Of the logs that a NovAtel receiver is asked for, 0.1 to 20."""
-    log_format: str = "binary"
-    """`binary` or `ascii`."""
     heading_log: str = ""
     """`HEADING` or `HEADING2` of a dual-antenna receiver, empty for none."""
     commands: tuple[str, ...] = ()
@@ -94,7 +91,7 @@ class GpsSettings(ByteSettings):
 
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
-        for name, known in (("protocol", PROTOCOLS), ("log_format", FORMATS), ("heading_log", HEADING_LOGS)):
+        for name, known in (("protocol", PROTOCOLS), ("heading_log", HEADING_LOGS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} is one of {', '.join(filter(None, known))}, got '{getattr(self, name)}'")
         check_ranges(self, rate_hz=(0.1, 20.0))
@@ -122,7 +119,7 @@ class GpsSettings(ByteSettings):
         return tuple(f"unlog thisport {log}" for log in self._list_log_names())
 
     def _list_log_names(self) -> tuple[str, ...]:
-        return tuple(log.lower() + ("b" if self.log_format == "binary" else "a") for log in self.logs)
+        return tuple(f"{log.lower()}b" for log in self.logs)
 
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
