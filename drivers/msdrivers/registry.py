@@ -6,7 +6,6 @@ A kind's modules are named in the table and imported on demand, so that a driver
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -176,20 +175,17 @@ def find_channel_problem(channel: str, interface: str) -> str:
 
 
 def split_group(channel: str) -> tuple[str, int]:
-    """Return group and port of `GROUP:PORT` or `GROUP`; IPv6 with a port is `[GROUP]:PORT`. Raises ValueError."""
-    found = _GROUP_PORT.fullmatch(channel)
-    group, port = (found[1] or found[2], int(found[3] or MULTICAST_PORT)) if found else (channel, MULTICAST_PORT)
+    """Return group (IPv4) and port of `GROUP:PORT` or `GROUP`. Raises ValueError."""
+    group, colon, number = channel.partition(":")
     try:
-        is_group = ip_address(group).is_multicast
+        port = int(number) if colon else MULTICAST_PORT
+        is_group = ip_address(group).is_multicast and 0 < port < 65536
     except ValueError:
         is_group = False
-    if not is_group or not 0 < port < 65536:
+    if not is_group:
         raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {quote(channel)}")
     return group, port
 
-
-_GROUP_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::([0-9]{1,5}))?")
-"""IPv6 in brackets, or a group without a colon; an IPv6 group alone has none of either."""
 
 CHANNELS: Mapping[type[Sample], str] = {
     GpsSample: "GPS",

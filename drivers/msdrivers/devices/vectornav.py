@@ -174,11 +174,6 @@ def encode_binary(fields: Mapping[tuple[int, int], bytes]) -> bytes:
     return bytes((SYNC,)) + body + crc_hqx(body, 0).to_bytes(2, "big")
 
 
-def compute_size(keys: tuple[tuple[int, int], ...]) -> int:
-    """Return the bytes of a binary message with these fields."""
-    return 1 + 1 + 2 * len({group for group, _ in keys}) + sum(FIELD_BYTES[group][bit] for group, bit in keys) + 2
-
-
 def make_setup(rate_hz: float, port: int) -> tuple[SetupStep, ...]:
     """Return what sets a unit up, in its volatile memory: ASCII output off on both ports, then the binary output.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from modelserver.messages import ImuSample, OrientationReference
@@ -32,12 +32,12 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
     START_NS = 5_000_000_000
     """Its clock at its first sample."""
 
-    def __init__(self, samples: Iterable[ImuSample], baud: int = 115200) -> None:
-        """`baud` is that of its line, by which it rejects too much output."""
+    def __init__(self, samples: Iterable[ImuSample], error: int = 0) -> None:
+        """`error` is the code by which it rejects binary output; 0: it takes it."""
         super().__init__(samples)
-        self._baud = baud
+        self._error = error
         self._stream = VnStream()
-        self._text_hz = {1: 40, 2: 0}
+        self._is_text = True
         self._keys: tuple[tuple[int, int], ...] = ()
         self._divisor = 0
         self._sent_us: int | None = None
@@ -54,52 +54,30 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
     def _execute(self, words: tuple[str, ...]) -> int:
         """Apply a command; return the code of an error, 0 for none."""
         try:
-            numbers = [int(word) for word in words[1:4]]
-        except ValueError:
-            return 0x07
-        if words[0] == "RRG":
-            return 0 if numbers[:1] == [1] else 0x08
-        if words[0] != "WRG" or len(numbers) < 2:
-            return 0x04
-        register, value, *rest = numbers
-        if register == 6:
-            port = rest[0] if rest else 1
-            before, self._text_hz[port] = self._text_hz.get(port, 0), 40 if value else 0
-            if self._compute_load() > self._baud:
-                self._text_hz[port] = before
-                return 0x0C
-            return 0
-        return self._set_binary(value, rest, words) if register == 75 else 0x08
-
-    def _set_binary(self, port: int, rest: list[int], words: tuple[str, ...]) -> int:
-        try:
+            register = int(words[1])
+            if words[0] == "RRG":
+                return 0 if register == 1 else 0x08
+            if register == 6:
+                self._is_text = words[2] != "0"
+                return 0
+            if register != 75 or self._error:
+                return self._error or 0x08
             groups, masks = int(words[4], 16), [int(word, 16) for word in words[5:]]
-        except (ValueError, IndexError):
-            return 0x05
-        present = [bit + 1 for bit in range(8) if groups >> bit & 1]
-        if len(masks) != len(present) or any(group not in FIELD_BYTES for group in present):
+            present = [bit + 1 for bit in range(8) if groups >> bit & 1]
+            self._keys = tuple(
+                (group, bit)
+                for group, mask in zip(present, masks, strict=True)
+                for bit in range(len(FIELD_BYTES[group]))
+                if mask >> bit & 1
+            )
+            self._divisor = int(words[3])
+        except (ValueError, IndexError, KeyError):
             return 0x07
-        before = self._keys, self._divisor
-        self._keys = tuple(
-            (group, bit)
-            for group, mask in zip(present, masks, strict=True)
-            for bit in range(len(FIELD_BYTES[group]))
-            if mask >> bit & 1
-        )
-        self._divisor = rest[0] if port else 0
-        if self._compute_load() > self._baud:
-            self._keys, self._divisor = before
-            return 0x0C
         return 0
-
-    def _compute_load(self) -> float:
-        """Return the bits a second of all outputs together; a line of text has 122 bytes."""
-        text = sum(self._text_hz.values()) * 122 * 10
-        return text + (vn.compute_size(self._keys) * 10 * vn.BASE_RATE_HZ / self._divisor if self._divisor else 0.0)
 
     def _encode(self, sample: ImuSample) -> bytes:
         utime = sample.header.utime
-        rate_hz = vn.BASE_RATE_HZ / self._divisor if self._divisor else self._text_hz[1]
+        rate_hz = vn.BASE_RATE_HZ / self._divisor if self._divisor else 40 * self._is_text
         if not rate_hz or (self._sent_us is not None and utime - self._sent_us < 1e6 / rate_hz - 500):
             return b""
         self._sent_us = utime
@@ -139,7 +117,6 @@ def _to_finite(value: float) -> float:
 class XsensEmulator(SampleEmulator[ImuSample]):
     """An `Endpoint` of bytes that speaks as an MTi does. `samples` are in the order of their stamps."""
 
-    MAX_HZ = 400
     CELSIUS = 28.0
     FIRST_TICKS = 12_345
     """Its clock at its first sample."""
@@ -147,21 +124,21 @@ class XsensEmulator(SampleEmulator[ImuSample]):
     def __init__(
         self,
         samples: Iterable[ImuSample],
-        baud: int = 921600,
+        error: int = 0,
         has_orientation: bool = True,
         field_strength: float = 5e-5,
     ) -> None:
-        """`baud` is that of its line; has_orientation: it is more than an IMU; `field_strength` it reports as 1, tesla.
+        """`error` is the code by which it rejects outputs; `field_strength` is what it reports as 1, tesla.
 
-        It starts in measurement, with the outputs of an earlier configuration.
+        has_orientation: it is more than an IMU. It starts in measurement, with outputs of an earlier configuration.
         """
         super().__init__(samples)
-        self._baud, self._has_orientation, self._field_strength = baud, has_orientation, field_strength
+        self._error, self._has_orientation, self._field_strength = error, has_orientation, field_strength
         self._stream = XbusStream()
         self._outputs = {int(ItemId.PACKET_COUNTER): xsens.AS_SENT, int(ItemId.QUATERNION): 100}
         self._is_measuring = True
         self._counter = 0
-        self._sent: dict[int, int] = {}
+        self._sent_us: int | None = None
 
     def _answer(self, unit: bytes) -> list[bytes]:
         return [self._execute(message) for message in self._stream.feed(unit)]
@@ -178,48 +155,26 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         if message.id != MessageId.SET_OUTPUT:
             return xsens.encode(MessageId.ERROR, b"\x04")
         pairs = [struct.unpack_from(">HH", message.data, at) for at in range(0, len(message.data) - 3, 4)]
-        error = self._find_error(pairs)
+        has_orientation = any(item == ItemId.QUATERNION for item, _ in pairs)
+        error = 0x21 if has_orientation and not self._has_orientation else self._error
         self.counts["rejected" if error else "accepted"] += 1
         if error:
             return xsens.encode(MessageId.ERROR, bytes((error,)))
         self._outputs = dict(pairs)
         return xsens.encode(MessageId.SET_OUTPUT_ACK, message.data)
 
-    def _find_error(self, pairs: Sequence[tuple[int, int]]) -> int:
-        """Return the code of what is wrong with outputs and their rates, 0 for nothing."""
-        for item, rate in pairs:
-            if item == ItemId.QUATERNION and not self._has_orientation:
-                return 0x21
-            if rate != xsens.AS_SENT and rate > self.MAX_HZ:
-                return 0x21
-        hertz = max((rate for _, rate in pairs if rate != xsens.AS_SENT), default=0)
-        size = 5 + sum(3 + _SIZES.get(item, 4) for item, _ in pairs)
-        return 0x29 if size * 10 * hertz > self._baud else 0
-
     def _encode(self, sample: ImuSample) -> bytes:
         utime = sample.header.utime
-        if not self._is_measuring:
+        hertz = max((rate for rate in self._outputs.values() if rate != xsens.AS_SENT), default=0)
+        is_early = self._sent_us is not None and utime - self._sent_us < 1e6 / max(hertz, 1) - 500
+        if not self._is_measuring or not hertz or is_early:
             return b""
-        due = [
-            item for item, rate in self._outputs.items() if rate != xsens.AS_SENT and self._is_due(item, rate, utime)
-        ]
-        if not due:
-            return b""
-        self._sent.update(dict.fromkeys(due, utime))
+        self._sent_us = utime
         self._counter = (self._counter + 1) & 0xFFFF
         self.counts["packets"] += 1
         ticks = (self.FIRST_TICKS + round((utime - self._first_utime) * 1e-6 / xsens.TICK)) % (1 << 32)
-        items: list[tuple[int, bytes]] = []
-        for item, rate in self._outputs.items():
-            if rate == xsens.AS_SENT or item in due:
-                data = self._encode_item(item, sample, ticks)
-                if data is not None:
-                    items.append((item, data))
-        return xsens.encode_items(items)
-
-    def _is_due(self, item: int, rate: int, utime: int) -> bool:
-        sent = self._sent.get(item)
-        return rate > 0 and (sent is None or utime - sent >= 1e6 / rate - 500)
+        items = ((item, self._encode_item(item, sample, ticks)) for item in self._outputs)
+        return xsens.encode_items([(item, data) for item, data in items if data is not None])
 
     def _encode_item(self, item: int, sample: ImuSample, ticks: int) -> bytes | None:
         numbers: Sequence[float] | None = None
@@ -241,13 +196,6 @@ class XsensEmulator(SampleEmulator[ImuSample]):
             numbers = sample.orientation
         return None if numbers is None else struct.pack(f">{len(numbers)}f", *numbers)
 
-
-_SIZES: Mapping[int, int] = {
-    ItemId.QUATERNION: 16,
-    ItemId.ACCELERATION: 12,
-    ItemId.RATE_OF_TURN: 12,
-    ItemId.MAGNETIC_FIELD: 12,
-}
 
 CELSIUS = 25.0
 

@@ -38,13 +38,13 @@ def turn(seconds: float, rate_hz: float = 200.0) -> Iterator[ImuSample]:
         )
 
 
-def connect_vectornav(seconds: float = 20.0, unit_baud: int = 115200, **more: object) -> Line:
-    device = VectornavEmulator(turn(seconds), unit_baud)
+def connect_vectornav(seconds: float = 20.0, error: int = 0, **more: object) -> Line:
+    device = VectornavEmulator(turn(seconds), error)
     return Line(VectornavDriver(VectornavSettings("imu")), device, **more)  # type: ignore[arg-type]
 
 
-def connect_xsens(seconds: float = 20.0, unit_baud: int = 921600, has_orientation: bool = True, **more: object) -> Line:
-    device = XsensEmulator(turn(seconds), unit_baud, has_orientation)
+def connect_xsens(seconds: float = 20.0, error: int = 0, has_orientation: bool = True, **more: object) -> Line:
+    device = XsensEmulator(turn(seconds), error, has_orientation)
     return Line(XsensDriver(XsensSettings("imu", field_strength=5e-5)), device, **more)  # type: ignore[arg-type]
 
 
@@ -201,9 +201,9 @@ def test_given_a_restarted_unit_then_it_is_set_up_again(connect: Callable[..., L
 
 
 def test_given_too_much_for_the_baud_rate_then_the_error_of_the_unit_is_reported_with_what_to_do() -> None:
-    line = connect_vectornav(unit_baud=38400).open().run(5.0)
+    line = connect_vectornav(error=0x0C).open().run(5.0)
     assert "rejected 100 Hz binary output: error 0C, the baud rate is too low for this output" in line.status_text
-    line = connect_xsens(unit_baud=19200).open().run(5.0)
+    line = connect_xsens(error=0x29).open().run(5.0)
     assert "rejected 100 Hz of acceleration and rate of turn: error 29, the data exceed the baud rate" in (
         line.status_text
     )

@@ -147,9 +147,6 @@ def test_given_a_can_line_that_cannot_be_then_the_key_is_named(
     [
         ("239.74.163.9", ("239.74.163.9", 43113)),
         ("239.74.163.9:5000", ("239.74.163.9", 5000)),
-        ("ff15::1", ("ff15::1", 43113)),
-        ("[ff15::1]:5000", ("ff15::1", 5000)),
-        ("[ff15::1]", ("ff15::1", 43113)),
     ],
 )
 def test_given_a_group_of_multicast_then_its_port_is_parsed(channel: str, parts: tuple[str, int]) -> None:
