@@ -31,7 +31,6 @@ from msdrivers.endpoint import (
     CommandableEndpoint,
     Endpoint,
     EndpointStatus,
-    HasMaxSilence,
     HostTime,
     MeasuredSample,
     Output,
@@ -282,7 +281,7 @@ class Runner(Generic[U]):
         self._link = link
         self._publish, self._publish_health = publish, publish_health
         self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
-        max_silence = endpoint.max_silence if isinstance(endpoint, HasMaxSilence) else 0.0
+        max_silence = getattr(endpoint, "max_silence", 0.0)
         self._silence = max(settings.silence, max_silence)
         self._reopen_timeout = max(settings.reopen_timeout, 2.0 * max_silence)
         self._stamper = Stamper(DeviceClock())

@@ -1,8 +1,8 @@
 """Emulators of what moves on a vehicle: wheel encoders and the drive-by-wire controller (CAN), a nodding axis, joints.
 
-The controller takes commands with a dead-man timer and sends its status; speed and steering approach the command, each
-at a limited rate. The axis is a register map on Modbus/TCP: it turns at the commanded rate, reverses at the limits, and
-measures its angle in whole steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
+The controller takes commands with a dead-man timer and sends its status; the vehicle follows them at once. The axis is
+a register map on Modbus/TCP: it turns at the commanded rate, reverses at the limits, and measures its angle in whole
+steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ MAX_REJECTED_COUNT = 255
 
 @dataclass(frozen=True, slots=True)
 class VehicleUnit:
-    """The controller and its vehicle: seconds, m/s, m/s2, radians."""
+    """The controller and its vehicle: seconds, m/s, radians."""
 
     mode: VehicleMode = VehicleMode.AUTONOMOUS
     status_period: float = 0.05
@@ -126,9 +126,6 @@ class VehicleUnit:
     max_speed: float = 5.0
     """Faster commands are rejected."""
     max_steering: float = 0.6
-    acceleration: float = 1.5
-    braking: float = 3.0
-    steering_rate: float = 0.6
     supply_voltage: float = 13.8
     engine_speed: float = 150.0
     fault_bits: int = 0
@@ -161,13 +158,12 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         self._target = (0.0, 0.0)
         self._commanded_ns: int | None = None
         self._alive: float | None = None
-        self._updated_ns = 0
         self._status_ns = 0
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start at the first opening; later the vehicle has continued."""
         if self._started is None:
-            self._updated_ns = self._status_ns = now.monotonic_ns
+            self._status_ns = now.monotonic_ns
         return super().on_open(now)
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
@@ -196,7 +192,6 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
-        self._advance(at_ns)
         if command.alive is not None:
             if raw[command.alive.name] == self._alive:
                 self.counts["rejected.repeated"] += 1
@@ -219,24 +214,13 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         self._target = (requested[0] if enabled else 0.0, requested[1])
         self._commanded_ns = at_ns
 
-    def _advance(self, at_ns: int) -> None:
-        """Simulate up to an instant: follow the command until the dead-man timer expires, then stop."""
-        ends = self._updated_ns if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
-        held = min(max(ends, self._updated_ns), at_ns)
-        drives = self.mode is VehicleMode.AUTONOMOUS
-        self._drive((held - self._updated_ns) * 1e-9, self._target[0] if drives else 0.0, self._target[1])
-        self._drive((at_ns - held) * 1e-9, 0.0, self.steering)
-        self._updated_ns = at_ns
-
-    def _drive(self, seconds: float, speed: float, steering: float) -> None:
+    def _drive(self, at_ns: int) -> None:
+        """Follow the command at once, until the dead-man timer expires."""
         if self._follows_samples:
             return
-        unit = self.unit
-        slows = abs(speed) < abs(self.speed) or speed * self.speed < 0.0
-        step = (unit.braking if slows else unit.acceleration) * seconds
-        self.speed += min(max(speed - self.speed, -step), step)
-        step = unit.steering_rate * seconds
-        self.steering += min(max(steering - self.steering, -step), step)
+        ends = 0 if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
+        is_driving = self.mode is VehicleMode.AUTONOMOUS and at_ns < ends
+        self.speed, self.steering = self._target if is_driving else (0.0, self.steering)
 
     def _make_frames(self, sample: VehicleStatusSample | None, at_ns: int) -> list[CanFrame]:
         if sample is not None:
@@ -245,7 +229,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
             self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
         if self._status_ns > at_ns:
             return []
-        self._advance(at_ns)
+        self._drive(at_ns)
         self._status_ns += round(self.unit.status_period * 1e9)
         status = self._status
         if status is None:

@@ -281,17 +281,6 @@ def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_prima
     assert sum("secondary antenna" in each for each in driven.status_text.splitlines()) == 1
 
 
-def test_given_a_leap_second_when_it_comes_then_the_fix_is_published_without_a_device_time():
-    # week 1930, 18 s is 2017-01-01 00:00:00 UTC
-    body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
-    headers = (
-        LogHeader("BESTPOS", 1930, ms, TimeStatus.FINESTEERING, "COM1", 0, 0, True) for ms in (16_500, 17_500, 18_500)
-    )
-    before, within, after = alone(*(encode(NovatelLog(header, body)) for header in headers)).samples
-    assert after.header.device_utime - before.header.device_utime == SECOND
-    assert within.header.device_utime == 0
-
-
 @pytest.mark.parametrize("date", ["141123", "300304"])
 def test_given_an_nmea_date_that_rolled_over_when_it_comes_then_the_time_is_of_these_days(date: str):
     fields = ("221320.00", "A", "5000.0", "N", "11100.0", "W", "1.0", "90.0", date, "", "", "A")

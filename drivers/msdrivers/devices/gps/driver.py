@@ -24,7 +24,6 @@ from msdrivers.devices.gps import (
     DAY,
     WEEK,
     course_from_track,
-    is_in_leap_second,
     resolve_rollover,
     to_covariance,
     utime_of,
@@ -369,15 +368,12 @@ class FixAssembler:
 
 
 def get_log_utime(header: LogHeader, pivot: int) -> int:
-    """Return the utime of a log; 0 if the receiver's time is not usable or within a leap second."""
-    microseconds = header.milliseconds * 1000
-    if header.time_status not in USABLE_TIME or is_in_leap_second(header.week, microseconds, pivot):
-        return 0
-    return utime_of(header.week, microseconds, pivot)
+    """Return the utime of a log; 0 if the receiver's time is not usable."""
+    return utime_of(header.week, header.milliseconds * 1000, pivot) if header.time_status in USABLE_TIME else 0
 
 
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
-    if epoch.time_of_day is None or epoch.is_leap_second:
+    if epoch.time_of_day is None:
         return 0
     if epoch.utime:
         return resolve_rollover(epoch.utime, pivot)

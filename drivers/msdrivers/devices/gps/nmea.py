@@ -119,11 +119,10 @@ def format_angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
 
 
 def format_time_of_day(microseconds: int) -> str:
-    """Return `hhmmss.sss`, up to 23:59:60.999."""
+    """Return `hhmmss.sss`."""
     seconds, fraction = divmod(microseconds, 1_000_000)
-    leap = max(0, seconds - 86_399)
-    hours, rest = divmod(seconds - leap, 3600)
-    return f"{hours:02d}{rest // 60:02d}{rest % 60 + leap:02d}.{fraction // 1000:03d}"
+    hours, rest = divmod(seconds, 3600)
+    return f"{hours:02d}{rest // 60:02d}{rest % 60:02d}.{fraction // 1000:03d}"
 
 
 def format_number(value: float, digits: int) -> str:
@@ -405,9 +404,8 @@ class NmeaEpoch(NmeaValues):
     """Data of one instant; nan or -1 where missing.
 
     start: bytes from the beginning of the stream to the epoch's first sentence. kinds: the sentences it was made of.
-    utime: microseconds of UTC; 0 before the first date. leap_second: the instant is within 23:59:60, and
-    utime is that of the second after it. Units as in `NmeaSentence`; coordinates are kept where the fix is flagged
-    invalid, with `fix_type` NONE.
+    utime: microseconds of UTC; 0 before the first date. Units as in `NmeaSentence`; the coordinates stay where the fix
+    is flagged invalid, with `fix_type` NONE.
     """
 
     start: int
@@ -416,11 +414,6 @@ class NmeaEpoch(NmeaValues):
     time_of_day: int | None
     fix_type: FixType
     satellites: int = -1
-
-    @property
-    def is_leap_second(self) -> bool:
-        """Whether the instant lies in an inserted second."""
-        return self.time_of_day is not None and self.time_of_day >= DAY
 
 
 class EpochAssembler:
@@ -487,14 +480,8 @@ class EpochAssembler:
         """Return the utime of a time of day on the day that is nearest to the last received date."""
         if instant is None or self._reference is None:
             return 0
-        day, clock = divmod(self._reference, DAY)
-        if instant >= DAY and clock < SECOND:
-            # within a leap second, whose own date names the day before
-            day -= 1
-        utime = day * DAY + instant
-        utime += round((self._reference - utime) / DAY) * DAY
-        self._reference = utime
-        return utime
+        self._reference = instant + round((self._reference - instant) / DAY) * DAY
+        return self._reference
 
 
 def merge_sentences(sentences: list[NmeaSentence], instant: int | None, utime: int) -> NmeaEpoch:
