@@ -196,62 +196,8 @@ def corrupt_unit(unit: Any) -> Any:
     return unit
 
 
-class CanEmulator(ABC, Generic[S]):
-    """Base of an emulator on a CAN bus that sends samples at their stamps.
-
-    If the first stamp is in the past when the line is first opened, all are shifted equally.
-    """
-
-    def __init__(self, text: str, samples: Iterable[S]):
-        """`text` is the status when the line is opened."""
-        self._text = text
-        self._samples: Iterator[S] = iter(samples)
-        self._next: S | None = next(self._samples, None)
-        self._started: tuple[int, int] | None = None
-        self.counts: Counter[str] = Counter()
-
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start at the first opening; later the device has continued."""
-        if self._started is None:
-            first = now.utime if self._next is None else self._next.header.utime
-            self._started = (now.monotonic_ns, min(now.utime, first))
-        return [EndpointStatus(EndpointPhase.STREAMING, self._text), *self.on_timer(now)]
-
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        return []
-
-    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send the frames that are due."""
-        outputs: list[Output[CanFrame]] = []
-        while (due := self.get_deadline()) is not None and due <= now.monotonic_ns:
-            sample = None
-            if self._get_sample_ns() == due:
-                sample, self._next = self._next, next(self._samples, None)
-            outputs += [Send(each) for each in self._make_frames(sample, due)]
-        return outputs
-
-    def get_deadline(self) -> int | None:
-        return self._get_sample_ns()
-
-    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        return []
-
-    def _get_sample_ns(self) -> int | None:
-        if self._next is None or self._started is None:
-            return None
-        return self._started[0] + (self._next.header.utime - self._started[1]) * 1000
-
-    @abstractmethod
-    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
-        """Apply a fault, if it is one of the device's own; return whether it is."""
-
-    @abstractmethod
-    def _make_frames(self, sample: S | None, at_ns: int) -> Iterable[CanFrame]:
-        """Make the frames of an instant; `sample` is the one that is due, if any."""
-
-
-class SampleEmulator(ABC, Generic[S]):
-    """An `Endpoint` of bytes at the device's end of a line. `samples` are in the order of their stamps.
+class SampleEmulator(ABC, Generic[S, U]):
+    """An `Endpoint` at the device's end of a line. `samples` are in the order of their stamps.
 
     `latency` is the time from the instant of a sample to its first byte, seconds.
     """
@@ -266,29 +212,28 @@ class SampleEmulator(ABC, Generic[S]):
         """What was sent and received, by kind."""
 
     @abstractmethod
-    def _encode(self, sample: S) -> bytes:
-        """Return what the device sends for a sample; empty for nothing."""
+    def _encode(self, sample: S) -> Iterable[U]:
+        """Return the units that the device sends for a sample; empty ones are not sent."""
 
-    def _answer(self, unit: bytes) -> Iterable[bytes]:
-        """Yield the answers to received bytes."""
+    def _answer(self, unit: U) -> Iterable[U]:
+        """Yield the answers to a received unit."""
         return ()
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[U]]:
         """The host's end of the line is open; a device does not notice."""
         self._now = now
         return []
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
         self._now = now
         return [Send(each) for each in self._answer(unit) if each]
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
         """Send the samples up to now."""
         self._now = now
-        out: list[Output[bytes]] = []
+        out: list[Output[U]] = []
         while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:
-            if data := self._encode(self._next):
-                out.append(Send(data))
+            out += [Send(each) for each in self._encode(self._next) if each]
             self._next = next(self._samples, None)
         return out
 
@@ -297,5 +242,5 @@ class SampleEmulator(ABC, Generic[S]):
             return None
         return self._now.monotonic_ns + (self._next.header.utime + self._latency_us - self._now.utime) * 1000
 
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_close(self, now: HostTime) -> Sequence[Output[U]]:
         return []

@@ -223,7 +223,7 @@ def make_gps_emulator(settings: GpsSettings, samples: Iterable[GpsSample]) -> Gp
     return GpsEmulator(samples, GpsUnit(saved=saved, is_answering=False))
 
 
-class GpsEmulator(SampleEmulator[GpsSample]):
+class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
@@ -264,7 +264,7 @@ class GpsEmulator(SampleEmulator[GpsSample]):
                 answer = f"<ERROR:{error}" if error else "<OK"
                 yield f"\r\n{answer}\r\n".encode("ascii") + _PROMPT
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         utime = sample.header.utime
         logs = b""
         for name, wanted in self._logs.items():
@@ -274,7 +274,7 @@ class GpsEmulator(SampleEmulator[GpsSample]):
             wanted.last = utime
             logs += encode_sample(name, sample, utime, _PORT)
             self.counts[name] += 1
-        return logs
+        return (logs,)
 
     def _execute(self, line: str) -> str:
         """Carry a command out. Return what is wrong with it; empty if nothing is."""
@@ -318,7 +318,7 @@ LATENCY = 0.03
 _STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
 
 
-class GpsdEmulator(SampleEmulator[GpsSample]):
+class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as gpsd does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], *, has_gst: bool = True) -> None:
@@ -346,15 +346,15 @@ class GpsdEmulator(SampleEmulator[GpsSample]):
         known = {key: value for key, value in fields.items() if not (isinstance(value, float) and math.isnan(value))}
         return json.dumps(known, separators=(",", ":")).encode() + b"\r\n"
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         if not self._is_watched:
-            return b""
+            return ()
         when = datetime.fromtimestamp(sample.header.utime // 1000 / 1e3, UTC)
         head = {"device": RECEIVER, "time": when.isoformat(timespec="milliseconds").replace("+00:00", "Z")}
         dilution = {"hdop": sample.hdop, "vdop": sample.vdop, "pdop": sample.pdop}
         out = self._report(**{"class": "SKY"}, **head, **dilution, uSat=sample.satellites)
         if sample.fix_type is FixType.NONE:
-            return out + self._report(**{"class": "TPV"}, **head, mode=1)
+            return (out + self._report(**{"class": "TPV"}, **head, mode=1),)
         east, north, up = sample.velocity or (math.nan,) * 3
         mode = 2 if sample.fix_type is FixType.FIX_2D else 3
         status = {"status": _STATUS[sample.fix_type]} if sample.fix_type in _STATUS else {}
@@ -366,7 +366,7 @@ class GpsdEmulator(SampleEmulator[GpsSample]):
         if self._has_gst and sample.position_covariance is not None:
             longitude, latitude, height = (math.sqrt(each) for each in sample.position_covariance[::4])
             out += self._report(**{"class": "GST"}, **head, lat=latitude, lon=longitude, alt=height)
-        return out
+        return (out,)
 
 
 UBX_PORT: Final = "UART1"
@@ -407,7 +407,7 @@ class _CommandFormat(UbxFormat):
         return found
 
 
-class UbloxEmulator(SampleEmulator[GpsSample]):
+class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: UbloxUnit | None = None) -> None:
@@ -475,14 +475,14 @@ class UbloxEmulator(SampleEmulator[GpsSample]):
         payload += b"".join(text.encode().ljust(30, b"\0") for text in texts)
         return _encode_ubx("MON-VER", payload=payload)
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         milliseconds = sample.header.utime // 1000
         if self._last_ms is not None and milliseconds - self._last_ms < self._period_ms - 1:
-            return b""
+            return ()
         self._last_ms = milliseconds
         names = [name for name in ORDER if name in self._messages]
         self.counts.update(names)
-        return b"".join(encode_ubx(name, sample) for name in names)
+        return (b"".join(encode_ubx(name, sample) for name in names),)
 
 
 def encode_ubx(name: str, sample: GpsSample) -> bytes:

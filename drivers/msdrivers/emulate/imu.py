@@ -25,7 +25,7 @@ from msdrivers.emulate import InjectedFault, SampleEmulator
 from msdrivers.endpoint import HostTime
 
 
-class VectornavEmulator(SampleEmulator[ImuSample]):
+class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
     """An `Endpoint` of bytes that speaks as a VN-100 does. `samples` are in the order of their stamps."""
 
     CELSIUS = 31.5
@@ -75,19 +75,19 @@ class VectornavEmulator(SampleEmulator[ImuSample]):
             return 0x07
         return 0
 
-    def _encode(self, sample: ImuSample) -> bytes:
+    def _encode(self, sample: ImuSample) -> Iterable[bytes]:
         utime = sample.header.utime
         rate_hz = vn.BASE_RATE_HZ / self._divisor if self._divisor else 40 * self._is_text
         if not rate_hz or (self._sent_us is not None and utime - self._sent_us < 1e6 / rate_hz - 500):
-            return b""
+            return ()
         self._sent_us = utime
         self.counts["messages"] += 1
         if not self._divisor:
             field, force, rate = sample.magnetic_field, sample.specific_force, sample.angular_velocity
             values = ((0.0,) * 3, [x / vn.GAUSS for x in field or (0.0,) * 3], force or (0.0,) * 3, rate or (0.0,) * 3)
-            return vn.encode_text("YMR," + ",".join(f"{number:+.4f}" for each in values for number in each))
+            return (vn.encode_text("YMR," + ",".join(f"{number:+.4f}" for each in values for number in each)),)
         time_ns = self.START_NS + (utime - self._first_utime) * 1000
-        return vn.encode_binary({key: self._encode_field(key, sample, time_ns) for key in self._keys})
+        return (vn.encode_binary({key: self._encode_field(key, sample, time_ns) for key in self._keys}),)
 
     def _encode_field(self, key: tuple[int, int], sample: ImuSample, time_ns: int) -> bytes:
         if key == vn.TIME:
@@ -114,7 +114,7 @@ def _to_finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-class XsensEmulator(SampleEmulator[ImuSample]):
+class XsensEmulator(SampleEmulator[ImuSample, bytes]):
     """An `Endpoint` of bytes that speaks as an MTi does. `samples` are in the order of their stamps."""
 
     CELSIUS = 28.0
@@ -163,18 +163,18 @@ class XsensEmulator(SampleEmulator[ImuSample]):
         self._outputs = dict(pairs)
         return xsens.encode(MessageId.SET_OUTPUT_ACK, message.data)
 
-    def _encode(self, sample: ImuSample) -> bytes:
+    def _encode(self, sample: ImuSample) -> Iterable[bytes]:
         utime = sample.header.utime
         hertz = max((rate for rate in self._outputs.values() if rate != xsens.AS_SENT), default=0)
         is_early = self._sent_us is not None and utime - self._sent_us < 1e6 / max(hertz, 1) - 500
         if not self._is_measuring or not hertz or is_early:
-            return b""
+            return ()
         self._sent_us = utime
         self._counter = (self._counter + 1) & 0xFFFF
         self.counts["packets"] += 1
         ticks = (self.FIRST_TICKS + round((utime - self._first_utime) * 1e-6 / xsens.TICK)) % (1 << 32)
         items = ((item, self._encode_item(item, sample, ticks)) for item in self._outputs)
-        return xsens.encode_items([(item, data) for item, data in items if data is not None])
+        return (xsens.encode_items([(item, data) for item, data in items if data is not None]),)
 
     def _encode_item(self, item: int, sample: ImuSample, ticks: int) -> bytes | None:
         numbers: Sequence[float] | None = None
@@ -200,17 +200,17 @@ class XsensEmulator(SampleEmulator[ImuSample]):
 CELSIUS = 25.0
 
 
-class TextImuEmulator(SampleEmulator[ImuSample]):
+class TextImuEmulator(SampleEmulator[ImuSample, bytes]):
     """An `Endpoint` of bytes that sends a line for each sample. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[ImuSample], settings: TextSettings) -> None:
         super().__init__(samples)
         self._settings = settings
 
-    def _encode(self, sample: ImuSample) -> bytes:
+    def _encode(self, sample: ImuSample) -> Iterable[bytes]:
         self.counts["lines"] += 1
         values = {name: self._get_value(sample, name) for name in self._settings.mapped}
-        return encode_line(self._settings, values)
+        return (encode_line(self._settings, values),)
 
     def _get_value(self, sample: ImuSample, name: str) -> float:
         if name == "time":
@@ -257,7 +257,7 @@ _NED_FROM_ENU: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """Rotation by 180 degrees about the axis between east and north."""
 
 
-class Gx1Emulator(SampleEmulator[ImuSample]):
+class Gx1Emulator(SampleEmulator[ImuSample, bytes]):
     """An `Endpoint` of bytes that answers as a 3DM-GX1 does. `samples` are in the order of their stamps.
 
     It streams one sample a tick at most; its time jumps by ticks. Missing vectors are zero, a missing orientation is
@@ -289,13 +289,13 @@ class Gx1Emulator(SampleEmulator[ImuSample]):
             round((utime - self._first_utime) * 1e-6 * (1.0 + self.unit.drift) / self._tick_s) + self._offset
         ) % 65536
 
-    def _encode(self, sample: ImuSample) -> bytes:
+    def _encode(self, sample: ImuSample) -> Iterable[bytes]:
         ticks = self._count_ticks(sample.header.utime)
         if not self.streamed or ticks == self._sent_ticks:
-            return b""
+            return ()
         self._sent_ticks = ticks
         self.counts["sent"] += 1
-        return self._measure(self.streamed, sample, ticks)
+        return (self._measure(self.streamed, sample, ticks),)
 
     def _measure(self, command: int, sample: ImuSample, ticks: int) -> bytes:
         orientation = so3.IDENTITY if sample.orientation is None else sample.orientation

@@ -19,7 +19,7 @@ from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
-from msdrivers.emulate import CanEmulator, InjectedFault
+from msdrivers.emulate import InjectedFault, SampleEmulator
 from msdrivers.endpoint import (
     MAX_READ,
     MAX_WRITE,
@@ -41,7 +41,7 @@ from msdrivers.endpoint import (
 )
 
 
-class WheelsEmulator(CanEmulator[WheelsSample]):
+class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
     """An `Endpoint` of CAN frames. Missing values of a sample keep the last one; signals that are not mapped are 0."""
 
     def __init__(
@@ -52,7 +52,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         first_count: int = 0,
     ):
         """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
-        super().__init__(f"{len(wheels)} wheels emulated", samples)
+        super().__init__(samples)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
@@ -71,9 +71,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
                 self._offset[name] = -self._counted[name]
         return fault.kind in ("jump", "restart")
 
-    def _make_frames(self, sample: WheelsSample | None, at_ns: int) -> list[CanFrame]:
-        if sample is None:
-            return []
+    def _encode(self, sample: WheelsSample) -> list[CanFrame]:
         wheels = {wheel.name: wheel for wheel in sample.wheels}
         for wheel in self._wheels:
             if wheel.name in wheels:
@@ -131,7 +129,7 @@ class VehicleUnit:
     fault_bits: int = 0
 
 
-class VehicleEmulator(CanEmulator[VehicleStatusSample]):
+class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
     """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones."""
 
     def __init__(
@@ -143,7 +141,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         samples: Iterable[VehicleStatusSample] = (),
     ):
         """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
-        super().__init__("vehicle controller emulated", samples)
+        super().__init__(samples)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
         """Driving mode; set it to press the emergency stop."""
@@ -160,30 +158,35 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         self._alive: float | None = None
         self._status_ns = 0
 
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[CanFrame]]:
         """Start at the first opening; later the vehicle has continued."""
-        if self._started is None:
+        if self._now is None:
             self._status_ns = now.monotonic_ns
-        return super().on_open(now)
+        super().on_open(now)
+        return self.on_timer(now)
 
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+    def on_receive(self, unit: CanFrame, now: HostTime) -> Sequence[Output[CanFrame]]:
         outputs = self.on_timer(now)
         command = self._command
-        is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
-        if command is None or not is_command:
-            return outputs
-        try:
-            self._on_command(command, self._database.decode(unit), now.monotonic_ns)
-        except FrameError as error:
-            self.counts[f"rejected.{error.reason}"] += 1
+        if command is not None and not unit.is_error and unit.key == command.forward_speed.key:
+            try:
+                self._on_command(command, self._database.decode(unit), now.monotonic_ns)
+            except FrameError as error:
+                self.counts[f"rejected.{error.reason}"] += 1
+        return outputs
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[CanFrame]]:
+        """Send each status that is due."""
+        super().on_timer(now)
+        outputs: list[Output[CanFrame]] = []
+        while self._status_ns <= now.monotonic_ns:
+            outputs += [Send(each) for each in self._make_status(self._status_ns)]
+            self._status_ns += round(self.unit.status_period * 1e9)
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when the next status, sample or fault is due, monotonic nanoseconds."""
-        if self._started is None:
-            return None
         other = super().get_deadline()
-        return self._status_ns if other is None else min(self._status_ns, other)
+        return None if self._now is None else min(self._status_ns, self._status_ns if other is None else other)
 
     def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "restart":
@@ -222,15 +225,15 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         is_driving = self.mode is VehicleMode.AUTONOMOUS and at_ns < ends
         self.speed, self.steering = self._target if is_driving else (0.0, self.steering)
 
-    def _make_frames(self, sample: VehicleStatusSample | None, at_ns: int) -> list[CanFrame]:
-        if sample is not None:
-            self.mode = sample.mode
-            self.speed = sample.forward_speed if math.isfinite(sample.forward_speed) else self.speed
-            self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
-        if self._status_ns > at_ns:
-            return []
+    def _encode(self, sample: VehicleStatusSample) -> tuple[CanFrame, ...]:
+        """Take its state from a sample; it is sent with the next status."""
+        self.mode = sample.mode
+        self.speed = sample.forward_speed if math.isfinite(sample.forward_speed) else self.speed
+        self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
+        return ()
+
+    def _make_status(self, at_ns: int) -> list[CanFrame]:
         self._drive(at_ns)
-        self._status_ns += round(self.unit.status_period * 1e9)
         status = self._status
         if status is None:
             return []
