@@ -12,7 +12,6 @@ import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -206,14 +205,6 @@ class GpsUnit:
     is_answering: bool = True
 
 
-@dataclass(slots=True)
-class _LogRequest:
-    """A log that was asked for: its period in microseconds, 0 for each sample, and when it was last written."""
-
-    period: int
-    last: int | None = None
-
-
 def make_gps_emulator(settings: GpsSettings, samples: Iterable[GpsSample]) -> GpsEmulator:
     """Return the receiver that a driver with these settings expects: NovAtel, or one that only sends NMEA."""
     if settings.protocol != "nmea":
@@ -229,11 +220,13 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
         super().__init__(samples, self._unit.latency)
-        self._logs: dict[str, _LogRequest] = {}
+        self._logs: dict[str, int] = {}
+        """Periods of the logs that are on, microseconds."""
+        self._written: dict[str, int] = {}
+        """When each log was written last."""
         self._line = bytearray()
         for line in self._unit.saved:
-            if error := self._execute(line):
-                raise ValueError(f"saved configuration, '{line}': {error}")
+            self._execute(line)
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -267,46 +260,30 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         utime = sample.header.utime
         logs = b""
-        for name, wanted in self._logs.items():
+        for name, period in self._logs.items():
             # half a millisecond of grace: stamps are rounded
-            if wanted.last is not None and utime - wanted.last < wanted.period - 500:
+            if utime - self._written.get(name, 0) < period - 500:
                 continue
-            wanted.last = utime
+            self._written[name] = utime
             logs += encode_sample(name, sample, utime, _PORT)
             self.counts[name] += 1
         return (logs,)
 
     def _execute(self, line: str) -> str:
         """Carry a command out. Return what is wrong with it; empty if nothing is."""
-        words = line.lower().split()
-        command, fields = words[0], words[1:]
-        if fields and command in ("log", "unlog", "unlogall") and fields[0] in ("thisport", _PORT.lower()):
-            fields = fields[1:]
-        if command == "unlogall":
-            self._logs.clear()
-            return ""
-        if command in _NO_EFFECT_COMMANDS:
-            return ""
-        if command not in ("log", "unlog"):
-            return f"Invalid Message. Field = {command}"
-        if not fields or not is_known(fields[0]):
-            return f"Invalid Message. Field = {fields[0] if fields else ''}"
-        if command == "unlog":
-            self._logs.pop(fields[0], None)
-            return ""
-        return self._execute_log(fields)
-
-    def _execute_log(self, fields: Sequence[str]) -> str:
-        trigger = fields[1] if len(fields) > 1 else "onchanged"
-        period = 0.0
-        if trigger == "ontime" and len(fields) > 2:
-            with suppress(ValueError):
-                period = float(fields[2])
-            if not 0.05 <= period <= 86_400.0:
-                return "Invalid period"
-        elif trigger not in ("onnew", "onchanged"):
-            return "Invalid trigger"
-        self._logs[fields[0]] = _LogRequest(round(period * 1e6))
+        command, *fields = line.lower().split()
+        try:
+            if command == "unlogall":
+                self._logs.clear()
+            elif command == "unlog":
+                self._logs.pop(fields[1], None)
+            elif command == "log" and is_known(fields[1]):
+                # log PORT NAME ontime SECONDS
+                self._logs[fields[1]] = round(float(fields[3]) * 1e6)
+            elif command not in _NO_EFFECT_COMMANDS:
+                return f"Invalid Message. Field = {command}"
+        except (IndexError, ValueError):
+            return f"Invalid Message. Field = {line}"
         return ""
 
 

@@ -1,7 +1,7 @@
 """Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
 
 Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
-(`FixAssembler`); NMEA epochs are used only while the position log is missing. Missing values stay nan.
+(`FixAssembler`), or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
 
 A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
@@ -242,11 +242,10 @@ WGS84_DATUM = 61
 @dataclass(frozen=True, slots=True)
 class GpsFix:
     """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
-    than that. origin: name of the log, or NMEA."""
+    than that."""
 
     host_utime: int
     device_utime: int
-    origin: str
     solution: NmeaEpoch | Position
     velocity: Velocity | None = None
     heading: HeadingLog | None = None
@@ -264,18 +263,17 @@ class FixAssembler:
     logs: the names of the position log and of what belongs to it; empty for NMEA only.
     """
 
-    def __init__(self, logs: Sequence[str], silence_ns: int) -> None:
-        self._logs, self._silence_ns = tuple(logs), silence_ns
+    def __init__(self, logs: Sequence[str]) -> None:
+        self._logs = tuple(logs)
         self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
         self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
         self._last_log: tuple[int, int] | None = None
-        self._last_log_ns: int | None = None
         self._last_epoch: tuple[int, int | None] | None = None
         self._last_solution = -1
         self._problems: list[str] = []
         self._reported: set[str] = set()
         self.counts: Counter[str] = Counter()
-        """`repeated`: duplicate instants. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
+        """`repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
         positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
         `unknown_type`: fixes published as none for their type."""
 
@@ -283,7 +281,6 @@ class FixAssembler:
         """Discard pending data: the line was closed, or the receiver has restarted."""
         self._parts.clear()
         self._waiting = None
-        self._last_log_ns = None
 
     def pop_problems(self) -> list[str]:
         found, self._problems = self._problems, []
@@ -303,7 +300,7 @@ class FixAssembler:
 
     def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
         """Process an NMEA epoch whose first byte was received at `host_utime`."""
-        if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
+        if self._logs:
             self.counts["superseded"] += 1
             return []
         instant = (epoch.utime, epoch.time_of_day)
@@ -311,7 +308,7 @@ class FixAssembler:
             self.counts["repeated"] += 1
             return []
         self._last_epoch = instant
-        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), "NMEA", epoch)]
+        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), epoch)]
 
     def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
         """Process a log whose first byte was received at `host_utime`."""
@@ -343,9 +340,9 @@ class FixAssembler:
                 "the receiver names a position type that is not known here: its fixes are published as none"
             )
         fixes = self._release()
-        self._last_log, self._last_log_ns = instant, now.monotonic_ns
+        self._last_log = instant
         device = get_log_utime(log.header, now.utime)
-        fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
+        fix = GpsFix(host_utime, device, log.body, delay=max(0.0, log.body.solution_age))
         self._waiting = (fix, instant, now.monotonic_ns + HOLD_NS)
         return fixes + self._release_if_complete(instant)
 
@@ -401,8 +398,8 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self._is_novatel = settings.protocol == "novatel"
         self.device = settings.protocol
         self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
-        self.awaited = POSITION_LOG
-        self._fixes = FixAssembler(settings.logs, round(settings.silence * SECOND_NS))
+        self.awaited = POSITION_LOG if self._is_novatel else "NMEA"
+        self._fixes = FixAssembler(settings.logs)
         self._counts_before: Mapping[str, int] = {}
         """Those of the stream at the last fix or search."""
         self._last_byte_ns: int | None = None
@@ -463,9 +460,6 @@ class GpsDriver(StreamDriver[GpsMessage]):
         out: list[Output[bytes]] = []
         for fix in fixes:
             self._counts_before = self._stream.counts
-            if self._phase is EndpointPhase.STREAMING and fix.origin != self.awaited:
-                out += self._set_status(EndpointPhase.STREAMING, f"receiving {fix.origin}")
-            self.awaited = fix.origin
             header = self._make_header(fix.host_utime, fix.device_utime)
             out += self._publish(fix.to_sample(header), now, delay=fix.delay)
         for problem in self._fixes.pop_problems():
