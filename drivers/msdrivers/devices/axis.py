@@ -17,10 +17,10 @@ import contextlib
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices import STRICT, check_ranges
+from msdrivers.devices import Strict, check_ranges
 from msdrivers.devices.stream import BoundedCounter
 from msdrivers.endpoint import (
     LAST_ADDRESS,
@@ -47,10 +47,8 @@ from msdrivers.endpoint import (
 
 
 @dataclass(frozen=True, slots=True)
-class RegisterMap:
+class RegisterMap(Strict):
     """A number in degrees or degrees a second: the registers' whole number times `scale_deg` plus `offset_deg`."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     address: int
     """Address of the protocol, from 0: what manuals call 40001 is 0."""
@@ -115,10 +113,8 @@ class RegisterMap:
 
 
 @dataclass(frozen=True, slots=True)
-class AxisRegisters:
+class AxisRegisters(Strict):
     """Registers of the axis. Angles and rates are the joint's, in its positive direction."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     angle: RegisterMap
     """Angle of the axis."""
@@ -171,10 +167,8 @@ MIN_POLL_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class NodSettings:
+class NodSettings(Strict):
     """Nodding motion. Degrees and degrees per second."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     lower_deg: float
     """Lower limit."""
@@ -189,10 +183,8 @@ class NodSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class AxisSettings:
+class AxisSettings(Strict):
     """Settings of an axis. Raises ValueError with the key for an invalid value."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     source: str
     """Source of the samples."""
@@ -214,10 +206,6 @@ class AxisSettings:
     """Highest nodding rate, degrees per second; faster readings are rejected."""
     poll_hz: float = 100.0
     """Poll rate."""
-    reply_timeout: float = 0.1
-    """Reply timeout, seconds."""
-    retry_delay: float = 0.5
-    """Delay before a retry after an exception, seconds."""
     silence: float = 1.0
     """Seconds without a usable reply after which the driver is SILENT and reopens the line."""
 
@@ -227,7 +215,7 @@ class AxisSettings:
         check_ranges(self, poll_hz=(MIN_POLL_HZ, 1000.0), step_deg=(0.0, 10.0))
         check_ranges(self, lowest_deg=(-3600.0, 3600.0), highest_deg=(-3600.0, 3600.0))
         check_ranges(self, slowest_deg=(0.0, 3600.0), fastest_deg=(0.01, 3600.0))
-        check_ranges(self, reply_timeout=(0.005, 10.0), retry_delay=(0.01, 60.0), silence=(0.05, 3600.0))
+        check_ranges(self, silence=(0.05, 3600.0))
         if not self.lowest_deg < self.highest_deg:
             raise ValueError(f"lowest_deg is below highest_deg, {self.highest_deg:g}, got {self.lowest_deg:g}")
         if not self.slowest_deg <= self.fastest_deg:
@@ -327,6 +315,12 @@ class ReadingValidator:
         return abs(after.degrees - before.degrees) <= reach
 
 
+REPLY_TIMEOUT_NS = 100_000_000
+"""A controller on the vehicle's network answers within milliseconds; a lost request must not cost many readings."""
+
+RETRY_DELAY_NS = 500_000_000
+"""Delay before a retry after an exception: a device that rejects is asked twice a second, and not at each poll."""
+
 BUSY_EXCEPTIONS = (5, 6)
 """Exception codes after which a retry makes sense: acknowledge, busy."""
 
@@ -365,7 +359,7 @@ class AxisDriver:
         self._pending: _PendingRequest | None = None
         self._transaction = 0
         self._period_ns = round(1e9 / settings.poll_hz)
-        self._reply_ns, self._silence_ns = round(settings.reply_timeout * 1e9), round(settings.silence * 1e9)
+        self._silence_ns = round(settings.silence * 1e9)
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = 0
         self._silent_ns: int | None = None
         self._is_open = False
@@ -420,7 +414,7 @@ class AxisDriver:
     def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Process timeouts; send the next request."""
         outputs: list[Output[ModbusUnit]] = []
-        if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + self._reply_ns:
+        if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + REPLY_TIMEOUT_NS:
             outputs += self._on_timeout(now)
         if self._silent_ns is not None and now.monotonic_ns >= self._silent_ns:
             self._silent_ns = None
@@ -436,7 +430,7 @@ class AxisDriver:
         if not self._is_open:
             return None
         if self._pending is not None:
-            next_ns = self._pending.sent_ns + self._reply_ns
+            next_ns = self._pending.sent_ns + REPLY_TIMEOUT_NS
         else:
             next_ns = min(self._next_ns, self._step_ns) if self._step is not None else self._next_ns
         return next_ns if self._silent_ns is None else min(next_ns, self._silent_ns)
@@ -540,13 +534,13 @@ class AxisDriver:
         self.counts.add(f"rejected.exception_{failure.code}")
         self._pending = None
         self._received_ns = now.monotonic_ns
-        again_ns = now.monotonic_ns + round(self.settings.retry_delay * 1e9)
+        again_ns = now.monotonic_ns + RETRY_DELAY_NS
         if pending.is_poll:
             self._next_ns = again_ns
             if failure.code not in BUSY_EXCEPTIONS:
                 self._phase = EndpointPhase.SILENT
             text = f"the axis rejects {describe_request(pending.request)}: {explain_exception(failure.code)}"
-            retry = f"retried every {self.settings.retry_delay:g} s, nothing is published"
+            retry = f"retried every {RETRY_DELAY_NS * 1e-9:g} s, nothing is published"
             return self._warn_once("rejected", f"{text}; {retry}")
         text = f"the axis rejects {self._step[0] if self._step else ''}: {explain_exception(failure.code)}"
         if failure.code in BUSY_EXCEPTIONS:

@@ -34,7 +34,7 @@ from modelserver.errors import (
     quote,
     suggest_name,
 )
-from msdrivers.devices import Strict, check_factor
+from msdrivers.devices import Strict, check_factor, check_ranges
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey, HostTime, Output, Reopen
 
 if TYPE_CHECKING:
@@ -70,6 +70,29 @@ class SignalMap(Strict):
 
     def from_si(self, value: float) -> float:
         return (value - self.offset) / self.scale
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusSettings(Strict):
+    """Settings that drivers on a CAN bus have. Raises ValueError with the key for an invalid value."""
+
+    source: str
+    """Source of the samples."""
+    dbc: str
+    """Path of the DBC file, relative to the file that holds these settings."""
+    window: float = 0.02
+    """Seconds to wait for the other frames of an instant; shorter than the time between two instants."""
+    silence: float = 1.0
+    """Timeout for usable frames, seconds."""
+    delay: float = 0.0
+    """Seconds from the measurement to the frame's arrival, as far as known."""
+    delay_sigma: float = 0.0
+    """Standard deviation of `delay`, seconds."""
+
+    def __post_init__(self) -> None:
+        if not self.dbc:
+            raise ValueError("dbc is the path of a DBC file, got nothing")
+        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
 
 
 _UNUSED_FIX = "correct it, or leave it: the other messages can be used"

@@ -17,13 +17,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
 from modelserver.messages import NAN, SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices import STRICT, Strict, check_ranges
+from msdrivers.devices import Strict, check_ranges
 from msdrivers.devices.can import (
     BoundSignal,
+    BusSettings,
     CanDatabase,
     CanDriver,
     CanFrameSet,
@@ -233,10 +234,8 @@ def _round_trip(signal: BoundSignal, physical: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class CommandLimits:
+class CommandLimits(Strict):
     """Limits of commands, to which they are clamped; 0 forbids the motion."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     forward_speed: float = 2.0
     """Highest speed forward, m/s."""
@@ -249,16 +248,10 @@ class CommandLimits:
         check_ranges(self, forward_speed=(0.0, 100.0), reverse_speed=(0.0, 100.0), steering_angle=(0.0, 1.6))
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleSettings(BusSettings):
     """Settings of the vehicle controller. Raises ValueError with the key for an invalid value."""
 
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
-
-    source: str
-    """Source of the samples."""
-    dbc: str
-    """Path of the DBC file, relative to the file that holds these settings."""
     status: StatusMap | None = None
     """Signals of the status; None: nothing is published."""
     command: CommandMap | None = None
@@ -275,23 +268,13 @@ class VehicleSettings:
     """Period of the frames of a command, or of the stop after it, seconds."""
     clock_slack: float = 0.2
     """Seconds by which the clock of a command's source may be ahead of ours."""
-    window: float = 0.02
-    """Seconds to wait for the other frames of a status; shorter than the time between two."""
-    silence: float = 1.0
-    """Timeout for usable frames, seconds."""
-    delay: float = 0.0
-    """Seconds from the measurement to the frame's arrival, as far as known."""
-    delay_sigma: float = 0.0
-    """Standard deviation of `delay`, seconds."""
 
     def __post_init__(self) -> None:
-        if not self.dbc:
-            raise ValueError("dbc is the path of a DBC file, got nothing")
+        BusSettings.__post_init__(self)
         if self.status is None and self.command is None:
             raise ValueError("status or command is needed: without both there is nothing to do")
         check_ranges(self, dead_man=(0.05, 5.0), max_validity=(0.05, 60.0))
         check_ranges(self, command_period=(0.005, 1.0), clock_slack=(0.0, 5.0))
-        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
         if self.max_validity < self.dead_man:
             raise ValueError(
                 f"max_validity is at least dead_man, {self.dead_man:g}, got {self.max_validity:g}: a command would end "
