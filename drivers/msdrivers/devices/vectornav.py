@@ -19,8 +19,7 @@ from operator import xor
 from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -282,7 +281,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             self._counts["lost"] += max(0, round(step) - 1) if step < 1000.0 else 0
         self._last_ns = time_ns
         magnetic, celsius = message.get_floats(MAGNETIC), message.get_floats(TEMPERATURE)
-        orientation = _to_quaternion(message.get_floats(QUATERNION))
+        x, y, z, w = message.get_floats(QUATERNION) or (math.nan,) * 4
+        orientation = to_rotation(w, x, y, z)
         sample = ImuSample(
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
@@ -296,15 +296,6 @@ class VectornavDriver(StreamDriver[VnMessage]):
             temperature_celsius=celsius[0] if celsius is not None and math.isfinite(celsius[0]) else NAN,
         )
         return self._publish(sample, now)
-
-
-def _to_quaternion(values: tuple[float, ...] | None) -> Quaternion | None:
-    """Return w, x, y, z of a quaternion x, y, z, w; None for one that is no rotation."""
-    if values is None:
-        return None
-    x, y, z, w = values
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return (w / norm, x / norm, y / norm, z / norm) if abs(norm - 1.0) < 0.01 else None
 
 
 def _describe_error(words: tuple[str, ...]) -> str:

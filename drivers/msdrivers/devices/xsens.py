@@ -16,8 +16,7 @@ from enum import IntEnum
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -310,7 +309,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)
-        orientation = _find_orientation(data)
+        orientation = to_rotation(*(data.get_numbers(ItemId.QUATERNION, 4) or (math.nan,) * 4))
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
             angular_velocity=self._read_vector(rate, MAX_RATE),
@@ -324,13 +323,3 @@ class XsensDriver(StreamDriver[XbusMessage]):
             temperature_celsius=self._celsius,
         )
         return self._publish(sample, now, TICK)
-
-
-def _find_orientation(data: MtData) -> Quaternion | None:
-    """Return the unit's own orientation (w, x, y, z) against ENU; None if it has none."""
-    values = data.get_numbers(ItemId.QUATERNION, 4)
-    norm = 0.0 if values is None else math.sqrt(sum(each * each for each in values))
-    if values is None or abs(norm - 1.0) >= 0.01:
-        return None
-    w, x, y, z = (each / norm for each in values)
-    return (w, x, y, z)

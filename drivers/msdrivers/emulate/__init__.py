@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
@@ -70,21 +70,13 @@ def parse_fault(text: str, known: Mapping[str, str] = FAULT_AMOUNTS) -> Injected
     return fault
 
 
-@runtime_checkable
-class HasOwnFaults(Protocol):
-    """An emulator that applies some faults itself."""
-
-    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
-        """Apply a fault, if it is one of the device's own; return whether it is."""
-
-
 class FaultInjector(Generic[U]):
     """An `Endpoint` that wraps another and applies faults in the order of their times.
 
     drop: `amount` units are lost. corrupt: `amount` units are damaged. stall, restart, bus_off: nothing passes for
     `amount` seconds, then a restarted device is replaced by a new one; after bus_off the interface reports it. jump:
-    the device's clock is shifted. What a device applies itself (`HasOwnFaults`) is left to it. `make` returns the
-    device as after power-on.
+    the device's clock is shifted. A device may have a method `apply_fault(fault, now)`, which returns whether the fault
+    is one that it applies itself. `make` returns the device as after power-on.
     """
 
     def __init__(self, make: Callable[[], Endpoint[U]], faults: Iterable[InjectedFault]):
@@ -154,7 +146,7 @@ class FaultInjector(Generic[U]):
             if fault.kind in ("stall", "restart", "bus_off"):
                 self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
             self._pending[fault.kind] += round(fault.amount)
-            if isinstance(self._inner, HasOwnFaults) and self._inner.apply_fault(fault, now):
+            if getattr(self._inner, "apply_fault", lambda *_: False)(fault, now):
                 continue
             self._is_restarting = self._is_restarting or fault.kind == "restart"
             if fault.kind == "jump":

@@ -102,23 +102,18 @@ class GpsSettings(ByteSettings):
     @property
     def logs(self) -> tuple[str, ...]:
         """The names of the logs that a NovAtel receiver is asked for."""
-        if self.protocol != "novatel":
-            return ()
-        return (POSITION_LOG, "BESTVEL", *((self.heading_log,) if self.heading_log else ()))
+        return (POSITION_LOG, "BESTVEL", *filter(None, [self.heading_log])) if self.protocol == "novatel" else ()
 
     def make_setup_commands(self) -> tuple[str, ...]:
         """Return the commands that set the receiver up, in order."""
         if self.protocol != "novatel":
             return self.commands
-        wanted = (f"log thisport {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._list_log_names())
+        wanted = (f"log thisport {log.lower()}b ontime {1.0 / self.rate_hz:.6g}" for log in self.logs)
         return ("unlogall thisport", *self.commands, *wanted)
 
     def make_undo_commands(self) -> tuple[str, ...]:
         """Return the commands that stop the logs again."""
-        return tuple(f"unlog thisport {log}" for log in self._list_log_names())
-
-    def _list_log_names(self) -> tuple[str, ...]:
-        return tuple(f"{log.lower()}b" for log in self.logs)
+        return tuple(f"unlog thisport {log.lower()}b" for log in self.logs)
 
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
@@ -270,8 +265,6 @@ class FixAssembler:
         self._last_log: tuple[int, int] | None = None
         self._last_epoch: tuple[int, int | None] | None = None
         self._last_solution = -1
-        self._problems: list[str] = []
-        self._reported: set[str] = set()
         self.counts: Counter[str] = Counter()
         """`repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
         positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
@@ -281,15 +274,6 @@ class FixAssembler:
         """Discard pending data: the line was closed, or the receiver has restarted."""
         self._parts.clear()
         self._waiting = None
-
-    def pop_problems(self) -> list[str]:
-        found, self._problems = self._problems, []
-        return found
-
-    def _add_problem(self, text: str) -> None:
-        if text not in self._reported:
-            self._reported.add(text)
-            self._problems.append(text)
 
     def get_deadline(self) -> int | None:
         return self._waiting[2] if self._waiting else None
@@ -316,9 +300,6 @@ class FixAssembler:
             return []
         if log.header.is_secondary:
             self.counts["rejected.secondary_antenna"] += 1
-            self._add_problem(
-                f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
-            )
             return []
         instant = (log.header.week, log.header.milliseconds)
         if not isinstance(log.body, Position):
@@ -332,13 +313,9 @@ class FixAssembler:
         self._last_solution = solution
         if log.body.datum != WGS84_DATUM:
             self.counts["rejected.datum"] += 1
-            self._add_problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
             return []
         if log.body.type not in PositionType.__members__.values():
             self.counts["unknown_type"] += 1
-            self._add_problem(
-                "the receiver names a position type that is not known here: its fixes are published as none"
-            )
         fixes = self._release()
         self._last_log = instant
         device = get_log_utime(log.header, now.utime)
@@ -379,6 +356,13 @@ def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
     return max(0, days * DAY + epoch.time_of_day)
 
 
+_PROBLEMS = {
+    "rejected.secondary_antenna": "logs of the secondary antenna, such as BESTPOSB_1, are not used",
+    "rejected.datum": 'positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`',
+    "unknown_type": "the receiver names a position type that is not known here: its fixes are published as none",
+}
+"""What is reported once, by the counter of the fixes."""
+
 _EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_field")
 """Counters by which the baud rate is right."""
 
@@ -402,6 +386,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self._fixes = FixAssembler(settings.logs)
         self._counts_before: Mapping[str, int] = {}
         """Those of the stream at the last fix or search."""
+        self._seen_problems: set[str] = set()
         self._last_byte_ns: int | None = None
         self._answered_ns: int | None = None
 
@@ -462,8 +447,9 @@ class GpsDriver(StreamDriver[GpsMessage]):
             self._counts_before = self._stream.counts
             header = self._make_header(fix.host_utime, fix.device_utime)
             out += self._publish(fix.to_sample(header), now, delay=fix.delay)
-        for problem in self._fixes.pop_problems():
-            out += self._set_status(self._phase, problem)
+        for name in [each for each in _PROBLEMS if self._fixes.counts[each] and each not in self._seen_problems]:
+            self._seen_problems.add(name)
+            out += self._set_status(self._phase, _PROBLEMS[name])
         return out
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
