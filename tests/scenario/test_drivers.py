@@ -435,10 +435,10 @@ def test_given_mistyped_names_then_the_nearest_is_reported(bench: Bench) -> None
         assert "write bauds" in output
 
 
-def test_given_list_then_ports_and_drivers_are_shown(bench: Bench) -> None:
-    shown = invoke(bench.url, "driver", "--list", "-c", bench.vehicle)
+def test_given_list_then_ports_are_shown(bench: Bench) -> None:
+    shown = invoke(bench.url, "driver", "--list")
     assert shown.returncode == 0, shown.stderr
-    assert "novatel: NovAtel OEM4" in shown.stdout
+    assert "serial port" in shown.stdout or "/dev/" in shown.stdout
 
 
 def test_given_a_port_in_use_then_the_emulator_reports_it(bench: Bench) -> None:

@@ -520,9 +520,6 @@ def _describe(error: _RejectedError, statement: _Statement, name: str) -> Proble
 MAX_SEEN = 8
 """Identifiers that are remembered for the status text."""
 
-MAX_FLAWS = 3
-"""Warnings about the DBC file at a start: `modelserver check` has all."""
-
 
 def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
     """Return the receive time of a frame that is read `now`: its own stamp if it has one."""
@@ -546,7 +543,7 @@ class CanDriver(ABC):
         """Frames, samples, incomplete instants, silences, commands, and rejections by reason. `rejected.reserved`:
         values that stand for no measurement; `rejected.empty`: instants without a usable value."""
         self.problems = database.warnings
-        """What is wrong with parts of the DBC file that are not used."""
+        """What is wrong with parts of the DBC file that are not used, which `modelserver check` reports."""
         self._database, self._needed, self._silence_s = database, needed, silence
         self._assembler = CanFrameAssembler(frozenset(needed), round(window * 1e9))
         self._seq = 0
@@ -562,12 +559,8 @@ class CanDriver(ABC):
         self.phase, self.is_bus_off = EndpointPhase.WAITING, False
         self._reported.clear()
         self._restart_silence_timer(now)
-        flaws = [
-            EndpointStatus(EndpointPhase.WAITING, str(each), is_warning=True) for each in self.problems[:MAX_FLAWS]
-        ]
-        if not self._needed:
-            return [*flaws]
-        return [*flaws, EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")]
+        text = f"waiting for {self._format_needed()}"
+        return [EndpointStatus(EndpointPhase.WAITING, text)] if self._needed else []
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
         if unit.is_error:

@@ -501,9 +501,6 @@ class StreamDriver(ABC, Generic[M]):
         """Do what the device's own deadline is for."""
         return []
 
-    def _describe_wait(self) -> str:
-        return f"waiting for an answer: {self.description}"
-
     # --- endpoint ---
 
     @property
@@ -520,7 +517,7 @@ class StreamDriver(ABC, Generic[M]):
         if (out := self._setup.reopen(now)) is not None:
             return out
         is_silent = self._phase is EndpointPhase.SILENT
-        status = [] if is_silent else self._set_status(EndpointPhase.WAITING, self._describe_wait())
+        status = [] if is_silent else self._set_status(EndpointPhase.WAITING, f"waiting for {self.description}")
         return [*status, *self._setup.start(self._run_setup(), now)]
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:

@@ -1,6 +1,6 @@
 """The vehicle controller on a CAN bus: mapping of status and command, and the driver with limits and a dead-man timer.
 
-A valid command is clamped to the limits and sent to the controller at once and every `command_period`,
+A valid command is clamped to the limits (or rejected) and sent to the controller at once and every `command_period`,
 for the shortest of its `valid_for`, `max_validity` since its `utime`, and `dead_man` since its arrival. Then the
 dead-man timer expires and stop is sent periodically instead. Before the first command nothing is sent, so that a person
 can drive. Stop keeps the steering angle: to straighten the wheels of a moving vehicle would swerve it.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
 from modelserver.messages import NAN, SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
@@ -235,7 +235,7 @@ def _round_trip(signal: BoundSignal, physical: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class CommandLimits(Strict):
-    """Limits of commands, to which they are clamped; 0 forbids the motion."""
+    """Limits of commands; 0 forbids the motion."""
 
     forward_speed: float = 2.0
     """Highest speed forward, m/s."""
@@ -243,9 +243,13 @@ class CommandLimits(Strict):
     """Highest speed backward, m/s, as a positive number."""
     steering_angle: float = 0.5
     """Greatest steering angle to either side, radians."""
+    over_limit: Literal["clamp", "reject"] = "clamp"
+    """What happens to a command above a limit: clamp it, or reject it."""
 
     def __post_init__(self) -> None:
         check_ranges(self, forward_speed=(0.0, 100.0), reverse_speed=(0.0, 100.0), steering_angle=(0.0, 1.6))
+        if self.over_limit not in ("clamp", "reject"):
+            raise ValueError(f"over_limit is clamp or reject, got {self.over_limit!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -362,6 +366,8 @@ class VehicleDriver(CanDriver):
         remaining = min(command.valid_for, self.settings.max_validity) - (now.utime - command.utime) * 1e-6
         reason, why = self._find_reject_reason(command, remaining, now)
         limited, beyond = self._clamp(command)
+        if not reason and beyond and self.settings.limits.over_limit == "reject":
+            reason, why = "limit", beyond
         if reason:
             return self.reject_command(reason, f"command of {quote(command.source, 40)} rejected: {why}", now)
         outputs: list[Output[CanFrame]] = []

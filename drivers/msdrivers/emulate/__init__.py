@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from modelserver.errors import find_nearest_names, quote
-from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
+from modelserver.messages import GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
 from msdrivers.endpoint import (
     CanFrame,
     Endpoint,
@@ -26,7 +26,7 @@ from msdrivers.endpoint import (
     make_bus_off_frame,
 )
 
-S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample)
+S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample, JointsSample)
 
 
 class InjectedFault(NamedTuple):

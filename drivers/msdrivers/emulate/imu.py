@@ -1,6 +1,6 @@
 """Emulators of inertial units: VectorNav VN-100, Xsens MTi, lines of text, MicroStrain 3DM-GX1.
 
-The VN-100 applies commands and sends its binary output, or text as it does from its maker. The MTi has a configuration
+The VN-100 applies commands and sends its binary output. The MTi has a configuration
 and a measurement mode and sends MTData2. Choices where the documents of the 3DM-GX1 are silent: it starts without
 continuous mode, and reads its timer words at start.
 """
@@ -37,7 +37,6 @@ class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
         super().__init__(samples)
         self._error = error
         self._stream = VnStream()
-        self._is_text = True
         self._keys: tuple[tuple[int, int], ...] = ()
         self._divisor = 0
         self._sent_us: int | None = None
@@ -57,11 +56,8 @@ class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
             register = int(words[1])
             if words[0] == "RRG":
                 return 0 if register == 1 else 0x08
-            if register == 6:
-                self._is_text = words[2] != "0"
-                return 0
             if register != 75 or self._error:
-                return self._error or 0x08
+                return 0 if register == 6 else self._error or 0x08
             groups, masks = int(words[4], 16), [int(word, 16) for word in words[5:]]
             present = [bit + 1 for bit in range(8) if groups >> bit & 1]
             self._keys = tuple(
@@ -77,15 +73,11 @@ class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
 
     def _encode(self, sample: ImuSample) -> Iterable[bytes]:
         utime = sample.header.utime
-        rate_hz = vn.BASE_RATE_HZ / self._divisor if self._divisor else 40 * self._is_text
-        if not rate_hz or (self._sent_us is not None and utime - self._sent_us < 1e6 / rate_hz - 500):
+        is_early = self._sent_us is not None and utime - self._sent_us < 1e6 * self._divisor / vn.BASE_RATE_HZ - 500
+        if not self._divisor or is_early:
             return ()
         self._sent_us = utime
         self.counts["messages"] += 1
-        if not self._divisor:
-            field, force, rate = sample.magnetic_field, sample.specific_force, sample.angular_velocity
-            values = ((0.0,) * 3, [x / vn.GAUSS for x in field or (0.0,) * 3], force or (0.0,) * 3, rate or (0.0,) * 3)
-            return (vn.encode_text("YMR," + ",".join(f"{number:+.4f}" for each in values for number in each)),)
         time_ns = self.START_NS + (utime - self._first_utime) * 1000
         return (vn.encode_binary({key: self._encode_field(key, sample, time_ns) for key in self._keys}),)
 

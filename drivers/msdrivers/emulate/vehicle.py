@@ -11,9 +11,18 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Final
 
-from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from modelserver.messages import (
+    Direction,
+    JointsSample,
+    SensorHeader,
+    VehicleMode,
+    VehicleStatusSample,
+    WheelSample,
+    WheelsSample,
+)
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
@@ -424,38 +433,22 @@ SWEEP_S: Final = 8.0
 """Period of the first joint, seconds; that of each further one is a third shorter."""
 
 
-class TextJointsEmulator:
-    """An `Endpoint` of bytes that sends a line every `PERIOD_US`."""
+class TextJointsEmulator(SampleEmulator[JointsSample, bytes]):
+    """An `Endpoint` of bytes that sends a line every `PERIOD_US` from its first opening on."""
 
     def __init__(self, settings: TextSettings) -> None:
+        super().__init__(())
         self._settings = settings
-        self._first: HostTime | None = None
-        self._sent = 0
-        self.counts: Counter[str] = Counter()
-        """Lines sent."""
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        self._first = self._first or now
-        return []
+        if self._now is None:
+            self._first_utime = now.utime
+            self._samples = (JointsSample(SensorHeader(utime), ()) for utime in count(now.utime, PERIOD_US))
+            self._next = next(self._samples)
+        return super().on_open(now)
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        return []
-
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the lines that are due, the newest only after a pause."""
-        assert self._first is not None
-        due = (now.monotonic_ns - self._first.monotonic_ns) // (1000 * PERIOD_US)
-        if due < self._sent:
-            return []
-        self._sent = due + 1
-        self.counts["lines"] += 1
-        return [Send(encode_line(self._settings, self.get_values(due * PERIOD_US * 1e-6)))]
-
-    def get_deadline(self) -> int | None:
-        return None if self._first is None else self._first.monotonic_ns + self._sent * PERIOD_US * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        return []
+    def _encode(self, sample: JointsSample) -> tuple[bytes]:
+        return (encode_line(self._settings, self.get_values((sample.header.utime - self._first_utime) * 1e-6)),)
 
     def get_values(self, seconds: float) -> dict[str, float]:
         """Return the fields of a line, `seconds` after the first."""

@@ -357,7 +357,7 @@ def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[s
 
 def test_given_outputs_when_opened_then_the_first_word_is_waiting():
     outputs = GpsDriver(GpsSettings("gps", bauds=(9600,))).on_open(now_at(START))
-    assert outputs[0] == EndpointStatus(EndpointPhase.WAITING, "waiting for a receiver at 9600 baud")
+    assert outputs[0] == EndpointStatus(EndpointPhase.WAITING, "waiting for NovAtel receiver")
     assert outputs[1] == Send(b"\r\nunlogall thisport\r\n")
     assert not any(isinstance(each, MeasuredSample) for each in outputs)
 

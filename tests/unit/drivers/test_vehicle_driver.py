@@ -223,6 +223,18 @@ def test_given_a_command_beyond_the_limits_then_the_limit_is_commanded_and_repor
     assert wire.status_text().count("the limit is commanded") == 1
 
 
+def test_given_limits_that_reject_then_nothing_is_commanded() -> None:
+    limits = CommandLimits(3.0, 1.0, 0.5, "reject")
+    wire, driver, _ = connect(settings=vehicle_settings(limits=limits))
+    wire.run(0.5)
+    wire.send_command(lambda now: driver.on_command(make_command(0.5, 1, speed=3.5), now))
+    assert wire.sent == []
+    assert driver.counts["rejected.limit"] == 1
+    assert "forward_speed 3.5 m/s is outside -1 to 3 m/s" in wire.status_text()
+    wire.run(1.0)
+    assert statuses(wire)[-1].commands_rejected == 1
+
+
 @pytest.mark.parametrize(
     ("command", "reason"),
     [
@@ -369,6 +381,8 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
 def test_given_limits_that_cannot_be_then_the_key_is_named() -> None:
     with pytest.raises(ValueError, match="steering_angle is between"):
         CommandLimits(steering_angle=2.0)
+    with pytest.raises(ValueError, match="over_limit is clamp or reject"):
+        CommandLimits(over_limit="perhaps")  # type: ignore[arg-type]
 
 
 def test_given_limits_that_the_frame_cannot_represent_then_it_is_reported() -> None:

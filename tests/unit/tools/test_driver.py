@@ -13,7 +13,7 @@ from support_formats import YAML
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import ModelServerError
 from mstools.cli import main
-from mstools.commands.driver import DriveOptions, load_driver, simulate, warn_of_names
+from mstools.commands.driver import DriveOptions, load_driver, simulate
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 
@@ -78,30 +78,11 @@ def test_given_the_vehicle_file_to_record_into_then_it_stays(run: Callable[..., 
     assert vehicle.read_text() == VEHICLE
 
 
-def test_given_a_name_with_nothing_after_it_then_driver_and_list_report_it(run: Callable[..., Output]) -> None:
-    for words in (("driver", "later"), ("driver", "--list"), ("emulate", "later", "--pty")):
+def test_given_a_name_with_nothing_after_it_then_driver_and_emulate_report_it(run: Callable[..., Output]) -> None:
+    for words in (("driver", "later"), ("emulate", "later", "--pty")):
         code, _, err = run(*words)
         assert code == 1
         assert "vehicle.yaml:8: error: drivers.later is empty: device is missing" in err
-
-
-def test_given_list_then_drivers_stand_beside_what_is_wrong_with_them(
-    run: Callable[..., Output], vehicle: Path
-) -> None:
-    vehicle.write_text(VEHICLE.replace("  later:\n", ""))
-    code, out, err = run("driver", "--list")
-    assert code == 0
-    assert "imu              gx1: MicroStrain" in out
-    assert "warning: the geometry has no constraint 'CameraFixd'" in err
-
-
-def test_given_a_driver_of_a_mistyped_joint_then_it_warns(vehicle: Path, caplog: pytest.LogCaptureFixture) -> None:
-    warn_of_names(*load_driver("axis", vehicle))
-    assert "vehicle.yaml:12 (drivers.axis.joint): the geometry has no constraint 'CameraFixd'" in caplog.text
-    assert "write CameraFixed" in caplog.text
-    caplog.clear()
-    warn_of_names(*load_driver("gps", vehicle))
-    assert not caplog.text
 
 
 def make_options(start: int | None = None, seconds: float = 60.0) -> DriveOptions:
@@ -132,9 +113,10 @@ def test_given_a_drive_that_is_over_then_it_is_reported_before_a_line_is_opened(
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:
-    from mstools.commands.driver import constraints_of, find_driver_problems
+    from modelserver.formats import examine_file
+    from mstools.commands.driver import find_driver_problems
 
     path = RAPTOR / "vehicle.yaml"
     config = load_config(path)
-    found = find_driver_problems(config, str(path), constraints_of(config))
+    found = find_driver_problems(config, str(path), examine_file(config.geometry, config.variables).constraints)
     assert [each for each in found if each.element != "drivers.front_axis.joint"] == []

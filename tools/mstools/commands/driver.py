@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,14 +20,13 @@ from modelserver.errors import (
     ModelServerError,
     Problem,
     find_nearest_names,
-    has_error,
     quote,
 )
 from modelserver.server.log import set_up_logging
 from modelserver.server.supervision import Notifier
 from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
 from mstools.terminal.options import UrlOption, argument, choose_name, option
-from mstools.terminal.output import escape, print_problems
+from mstools.terminal.output import escape
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -74,16 +74,6 @@ def find_misnamed(
             yield from find_unknown_joint(driver, constraints)
 
 
-def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...] | None:
-    """Return the constraints of a vehicle file's geometry; None if it cannot be read."""
-    from modelserver.formats import examine_file
-
-    try:
-        return examine_file(vehicle.geometry, vehicle.variables).constraints
-    except OSError:
-        return None
-
-
 COMMAND_POLL_S = 0.02
 """Poll period of a driver with commands, seconds."""
 
@@ -91,9 +81,7 @@ COMMAND_POLL_S = 0.02
 def command(
     name: Annotated[str, argument("[NAME]", "Name of the driver in the vehicle file.")] = "",
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
-    list_ports: Annotated[
-        bool, option("--list", "List the ports and the drivers of the vehicle file, then exit.")
-    ] = False,
+    list_ports: Annotated[bool, option("--list", "List the ports, then exit.")] = False,
     record_raw: Annotated[Path | None, option("--record-raw FILE", "Record the bytes of the connection.")] = None,
     play_raw: Annotated[Path | None, option("--play-raw FILE", "Read a recording instead of the device.")] = None,
     url: UrlOption = "",
@@ -116,8 +104,6 @@ def command(
     check_log_options(log_level, log_format)
     if list_ports:
         show_ports()
-        if config is not None:
-            show_drivers(config)
         return
     if config is None:
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
@@ -127,7 +113,6 @@ def command(
     with start.wait_on_error():
         vehicle, settings = load_driver(name, config)
     set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
-    warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, play_raw)
         run(vehicle, settings, link, config.parent, url, start)
@@ -160,17 +145,6 @@ def show_plugins() -> None:
         typer.echo(escape(f"{name:<16} measurement of an installed package: {'; '.join(found.values)}"))
     for name, why in MEASUREMENT_TYPES.problems.items():
         typer.echo(escape(f"{name:<16} measurement of an installed package, not usable: {why}"), err=True)
-
-
-def show_drivers(config: Path) -> None:
-    """Print the drivers of a vehicle file, and their problems as `modelserver check` does."""
-    vehicle, drivers = load_drivers(config)
-    for name, driver in drivers.items():
-        typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
-    problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
-    print_problems(problems)
-    if has_error(problems):
-        raise typer.Exit(1)
 
 
 def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]]:
@@ -208,14 +182,6 @@ def load_driver(
     near = find_nearest_names(name, vehicle.drivers)
     hint = f"did you mean {near[0]}? " if near else ""
     raise typer.BadParameter(f"{quote(name, 40)} is an unknown driver; {hint}{known}", param_hint="NAME")
-
-
-def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
-    """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
-    has_joints = any(hasattr(settings.device_settings, name) for name in ("joint", "joints"))
-    constraints = constraints_of(vehicle) if has_joints else None
-    for problem in find_misnamed(vehicle, [settings], constraints):
-        logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 
 
 def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
@@ -290,7 +256,7 @@ def run(
     stop_on_signal(runner)
     notifier = Notifier.from_environment()
     try:
-        runner.run(DriverSupervision(runner, notifier).wrap_callback(attend))
+        runner.run(supervise(runner, notifier, attend))
     finally:
         notifier.notify_stopping()
         if corrections is not None:
@@ -358,46 +324,39 @@ READY_PASSES = 2
 """A driver is ready after one complete pass: it has tried its connection and published its health."""
 
 
-class DriverSupervision:
-    """Notify systemd of one runner.
+def supervise(
+    runner: Runner[Any],
+    notifier: Notifier,
+    attend: Callable[[], object],
+    monotonic_ns: Callable[[], int] = time.monotonic_ns,
+) -> Callable[[], object]:
+    """Return the callback before each pass of a runner: `attend`, then the due notifications of systemd.
 
     A missing device does not stop readiness or watchdog: the driver waits for it and reports that. A pass that hangs
     and a driver with nothing but errors do.
     """
+    if not notifier.is_active:
+        return attend
+    from modelserver.server.supervision import StallDetector
 
-    def __init__(self, runner: Runner[Any], notifier: Notifier, monotonic_ns: Callable[[], int] = time.monotonic_ns):
-        from modelserver.server.supervision import StallDetector
+    progress, passes = StallDetector(), count(1)
 
-        self._runner, self._notifier, self._monotonic_ns = runner, notifier, monotonic_ns
-        self._progress = StallDetector()
-        self._passes = 0
-
-    def wrap_callback(self, attend: Callable[[], object]) -> Callable[[], object]:
-        """Return the callback before each pass: `attend`, then the due notifications."""
-        if not self._notifier.is_active:
-            return attend
-
-        def on_pass() -> None:
-            attend()
-            self._notify()
-
-        return on_pass
-
-    def _notify(self) -> None:
-        self._passes += 1
-        if not self._notifier.is_ready:
-            if self._passes >= READY_PASSES:
-                self._notifier.notify_ready(self._format_status())
-            return
-        self._notifier.update_status(self._format_status)
-        runner = self._runner
-        failures = sum(count for name, count in runner.counts.items() if name.startswith("errors."))
-        if self._progress.is_progressing(runner.samples, failures, self._monotonic_ns()):
-            self._notifier.ping_watchdog()
-
-    def _format_status(self) -> str:
-        phase, text = self._runner.state
+    def format_status() -> str:
+        phase, text = runner.state
         return f"{phase.name.lower()}: {text}" if text else phase.name.lower()
+
+    def on_pass() -> None:
+        attend()
+        if not notifier.is_ready:
+            if next(passes) >= READY_PASSES:
+                notifier.notify_ready(format_status())
+            return
+        notifier.update_status(format_status)
+        failures = sum(number for name, number in runner.counts.items() if name.startswith("errors."))
+        if progress.is_progressing(runner.samples, failures, monotonic_ns()):
+            notifier.ping_watchdog()
+
+    return on_pass
 
 
 log = logging.getLogger(__name__)

@@ -403,10 +403,6 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self._last_byte_ns = None
         self._counts_before = self._stream.counts
 
-    def _describe_wait(self) -> str:
-        bauds = self._settings.bauds
-        return "waiting for a receiver" + (f" at {bauds[self._baud_index]} baud" if bauds else "")
-
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         self._last_byte_ns = now.monotonic_ns
         return super().on_receive(unit, now)

@@ -255,16 +255,13 @@ def parse_sentence(text: str, start: int = 0) -> NmeaSentence | None:
         month = parse_integer(raw["month"], 1, 12)
         year = parse_integer(raw["year"], 1980, 9999)
         values["day"] = to_unix_days(day, month, year) if day and month and year else None
-    if not ((status == "A" and (not mode or mode in MODES)) or mode == "E"):
+    if not ((status == "A" and (not mode or mode in _MODE)) or mode == "E"):
         values |= {"speed": NAN, "track": NAN}
     return NmeaSentence(talker, kind, start, **values)
 
 
 KINDS = frozenset({"GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "HDT", "ZDA"})
 """The sentences that are read."""
-
-MODES = frozenset("APDRFE")
-"""Letters of the mode indicator, which NMEA 2.3 added, for measured data. M is manual input, S simulated, N invalid."""
 
 _parse_nonnegative = partial(parse_number, least=0.0)
 
