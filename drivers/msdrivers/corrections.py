@@ -78,9 +78,10 @@ class NtripSession:
         if status.startswith("ICY 200"):
             self.is_answered, self._buffer = True, b""
             return rest
-        if status.startswith("SOURCETABLE"):
-            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
         words = status.split(" ", 2)
+        no_mountpoint = NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+        if words[0] == "SOURCETABLE":
+            raise no_mountpoint
         if not words[0].startswith("HTTP/") or len(words) < 2:
             raise NtripError(f"the server's answer {status[:60]!r} is not that of an NTRIP caster: check caster")
         if words[1] != "200":
@@ -93,7 +94,7 @@ class NtripSession:
             return None
         text = header.decode("latin-1").lower()
         if "gnss/sourcetable" in text:
-            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+            raise no_mountpoint
         self.is_answered, self._buffer = True, b""
         self._is_chunked = "transfer-encoding: chunked" in text
         return body
@@ -119,7 +120,7 @@ class NtripSession:
             try:
                 size = int(line.split(b";")[0], 16)
             except ValueError:
-                raise NtripError("the caster's chunks are damaged") from None
+                size = -1
             if size == 0:
                 raise NtripError("the caster has ended the stream")
             if not 0 < size <= MAX_CHUNK:

@@ -93,20 +93,11 @@ class RecordingLink(LinkWrapper[bytes]):
         super().__init__(link)
         self._stream, self._time_source = stream, time
         self._size = 0
-        self._is_open = False
         self._write(f"{MAGIC}{driver} {device}\n")
 
     def open(self, baud: int | None = None) -> None:
         self._link.open(baud)
-        self._is_open = True
         self._record(EVENT, f"open {self.description} {self.baud}")
-
-    def close(self) -> None:
-        self._link.close()
-        # one that cannot be opened is closed each time that it was tried
-        if self._is_open:
-            self._record(EVENT, "close")
-        self._is_open = False
 
     def poll(self, timeout: float) -> Sequence[bytes]:
         units = self._link.poll(timeout)

@@ -42,7 +42,7 @@ FIELD_BYTES: Final[Mapping[int, tuple[int, ...]]] = {
 """Bytes of the fields of each group, by bit. Groups 4, 6 and 7 (GNSS, INS) do not exist on a VN-100."""
 
 TIME, QUATERNION = (1, 0), (1, 4)
-MAGNETIC, ACCELERATION, RATE, TEMPERATURE, SATURATION = (3, 1), (3, 2), (3, 3), (3, 4), (3, 11)
+MAGNETIC, ACCELERATION, RATE, TEMPERATURE = (3, 1), (3, 2), (3, 3), (3, 4)
 COMPENSATED_RATE, COMPENSATED_ACCELERATION = (1, 5), (1, 8)
 
 WANTED: Final = (TIME, QUATERNION, MAGNETIC, ACCELERATION, RATE, TEMPERATURE)
@@ -232,7 +232,7 @@ class VectornavSettings(ByteSettings):
 class VectornavDriver(StreamDriver[VnMessage]):
     """An `Endpoint` of bytes at the host's end of the unit's line; see `VectornavSettings`.
 
-    Further counts: `lost` samples, by the unit's clock; `saturated` and `rejected.range` vectors.
+    Further counts: `lost` samples, by the unit's clock; `rejected.range` vectors.
     """
 
     device = "vectornav"

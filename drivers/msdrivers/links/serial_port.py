@@ -49,16 +49,13 @@ def _describe_port(port: object) -> str:
 
 
 def suggest_ports(path: str) -> tuple[str, ...]:
-    """Return the ports that a missing one may have been meant for: of the same name but its number, or by their id.
+    """Return the ports that a missing one may have been meant for: of the same letters (/dev/ttyUBS0), or by their id.
 
-    A name of the same letters counts as the same: /dev/ttyUBS0. Others are no help: /dev/ttyS0 is always there.
+    Others are no help: /dev/ttyS0 is always there.
     """
-    known = [port.path for port in find_ports() if _name_letters(port.path) == _name_letters(path)]
+    letters = sorted(path.rstrip("0123456789"))
+    known = [port.path for port in find_ports() if sorted(port.path.rstrip("0123456789")) == letters]
     return (*find_nearest_names(path, known), *sorted(glob.glob("/dev/serial/by-id/*")))
-
-
-def _name_letters(path: str) -> list[str]:
-    return sorted(path.rstrip("0123456789"))
 
 
 def find_access_problem(path: str) -> str:

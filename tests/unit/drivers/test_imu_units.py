@@ -272,16 +272,15 @@ def test_given_any_bytes_then_nothing_is_raised_and_memory_is_bounded(
     assert line.driver._stream.pending_bytes <= 400
 
 
-@both
-def test_given_its_bytes_then_the_device_is_recognized(connect: Callable[..., Line]) -> None:
-    line = connect()
+def test_given_its_bytes_then_the_device_is_recognized() -> None:
+    line = connect_xsens()
     received = bytearray()
     line.to_host = lambda data: [data, received.extend(data) or b""]  # type: ignore[func-returns-value]
     line.open().run(6.0)
-    found = recognize(bytes(received[-4096:]))
-    assert found is not None
-    assert isinstance(line.driver, StreamDriver)
-    assert found.device == line.driver.device
+    for data, device in ((bytes(received[-4096:]), "xsens"), (vn.encode_text("YMR,+1.0,-2.0") * 3, "vectornav")):
+        found = recognize(data)
+        assert found is not None
+        assert found.device == device
 
 
 def test_given_an_endpoint_then_the_drivers_are_some() -> None:
