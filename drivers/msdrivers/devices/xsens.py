@@ -152,11 +152,6 @@ class MtData:
         data = self.items.get(item)
         return struct.unpack(f">{count}f", data) if data is not None and len(data) == 4 * count else None
 
-    @property
-    def is_clipped(self) -> bool:
-        """Whether a measurement was beyond its range."""
-        return bool((self.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
-
 
 def encode_items(items: Iterable[tuple[int, bytes]]) -> bytes:
     data = b"".join(identifier.to_bytes(2, "big") + bytes((len(each),)) + each for identifier, each in items)
@@ -305,7 +300,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
             # such as the packets of a receiver
             self._counts["without_rate"] += 1
             return []
-        self._counts["clipped"] += data.is_clipped
+        self._counts["clipped"] += bool((data.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)

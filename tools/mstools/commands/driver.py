@@ -7,7 +7,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from modelserver.transforms.so3 import Vector3
     from msdrivers.endpoint import TimeSource
     from msdrivers.links import Link
-    from msdrivers.registry import DeviceKind
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
 
@@ -50,28 +49,27 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.settings import SourceMap, find_shared_lines, find_unbuildable_drivers, read_drivers
+    from msdrivers.settings import (
+        SourceMap,
+        find_backward_counters,
+        find_shared_lines,
+        find_unbuildable_drivers,
+        find_unknown_joint,
+        find_unknown_wheels,
+        read_drivers,
+    )
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
-    drivers = found.values()
-    unbuildable = find_unbuildable_drivers(drivers, Path(file).parent)
-    return (*problems, *unbuildable, *find_shared_lines(drivers), *find_misnamed(vehicle, drivers, constraints))
-
-
-def find_misnamed(
-    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
-) -> Iterator[Problem]:
-    """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.settings import find_backward_counters, find_unknown_joint, find_unknown_wheels
-
-    wheels = vehicle.sensors.wheels
+    drivers, wheels = found.values(), vehicle.sensors.wheels
+    misnamed: list[Problem] = []
     for driver in drivers:
-        yield from find_backward_counters(driver)
+        misnamed += find_backward_counters(driver)
         # the server does not receive a driver on another channel
         if wheels is not None and driver.channel in ("", wheels.channel):
-            yield from find_unknown_wheels(driver, wheels.frames)
+            misnamed += find_unknown_wheels(driver, wheels.frames)
         if constraints is not None:
-            yield from find_unknown_joint(driver, constraints)
+            misnamed += find_unknown_joint(driver, constraints)
+    return (*problems, *find_unbuildable_drivers(drivers, Path(file).parent), *find_shared_lines(drivers), *misnamed)
 
 
 COMMAND_POLL_S = 0.02
@@ -157,21 +155,18 @@ def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]
     return vehicle, drivers
 
 
-def load_driver(
-    name: str, config: Path, kinds: Mapping[str, DeviceKind] | None = None
-) -> tuple[VehicleConfig, DriverSettings]:
-    """Return a vehicle file and the settings of one of its drivers; `kinds` default to all device kinds.
+def load_driver(name: str, config: Path) -> tuple[VehicleConfig, DriverSettings]:
+    """Return a vehicle file and the settings of one of its drivers.
 
     Raises ConfigError, OSError, ModelServerError.
     """
     from modelserver.config.vehicle_file import load_config, read_config_lines
-    from msdrivers.registry import KINDS
     from msdrivers.settings import SourceMap, find_empty_sections, read_driver
 
     vehicle = load_config(config)
     place = SourceMap(str(config), read_config_lines(config))
     if name in vehicle.drivers:
-        return vehicle, read_driver(name, vehicle.drivers[name], place, kinds or KINDS)
+        return vehicle, read_driver(name, vehicle.drivers[name], place)
     if problem := find_empty_sections(vehicle.drivers, place).get(name):
         raise ConfigError([problem])
     if not vehicle.drivers:
