@@ -173,15 +173,10 @@ class CorrectionsClient:
         if self._thread.is_alive():
             self._thread.join()
 
-    def wrap_publish(self, publish: Callable[[Sample], object]) -> Callable[[Sample], object]:
-        """Return a function that publishes a sample, and notes the position of a fix for the caster."""
-
-        def publish_and_note(sample: Sample) -> None:
-            if isinstance(sample, GpsSample) and sample.fix_type is not FixType.NONE:
-                self._place = sample
-            publish(sample)
-
-        return publish_and_note
+    def note_place(self, sample: Sample) -> None:
+        """Note the position of a fix for the caster."""
+        if isinstance(sample, GpsSample) and sample.fix_type is not FixType.NONE:
+            self._place = sample
 
     def feed_runner(self, runner: Runner[bytes]) -> Callable[[], object]:
         """Return the function that sends what was received to a runner's device, and counts for its health."""

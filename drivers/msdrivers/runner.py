@@ -72,9 +72,6 @@ LOG_INTERVAL_NS = 60_000_000_000
 MAX_LOGGED_STATES = 100
 """Different states that are remembered for that."""
 
-WARNING_LIFETIME_NS = 60_000_000_000
-"""How long a warning is shown as the likely cause of a silence."""
-
 
 class HealthReporter:
     """Tracks the status of one driver and calls `send` when a report is due. Times in seconds."""
@@ -93,7 +90,7 @@ class HealthReporter:
         self._sample_ns: int | None = None
         self._counted_ns, self._counted = now.monotonic_ns, 0
         self._phase, self._text, self._is_warning = DriverPhase.CLOSED, "not opened yet", False
-        self._last_warning, self._last_warning_ns = "", 0
+        self._last_warning = ""
         self._reported = self._logged = (DriverPhase.CLOSED, "")
         self._changes, self._changed_ns = 0, now.monotonic_ns
         self._logged_ns: dict[tuple[DriverPhase, str], int] = {}
@@ -122,7 +119,7 @@ class HealthReporter:
         A warning is repeated with a silence that follows it, until data arrives or the line is reopened.
         """
         if is_warning:
-            self._last_warning, self._last_warning_ns = text, now.monotonic_ns
+            self._last_warning = text
         elif phase in (DriverPhase.WAITING, DriverPhase.STREAMING):
             self._last_warning = ""
         self._phase, self._text, self._is_warning = phase, text, is_warning
@@ -143,8 +140,6 @@ class HealthReporter:
 
     def on_timer(self, now: HostTime) -> None:
         """Send the regular report if it is due."""
-        if now.monotonic_ns - self._last_warning_ns > WARNING_LIFETIME_NS:
-            self._last_warning = ""
         if now.monotonic_ns < self.next_report_ns:
             return
         if self.state != self._logged and now.monotonic_ns - self._changed_ns >= STABLE_NS:

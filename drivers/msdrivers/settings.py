@@ -380,10 +380,8 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
         # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
         left = [frame for frame in frames if frame not in wheels]
         near = find_suggestion(name, left)
-        if near:
-            fix = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
-        else:
-            fix = f"known: {', '.join(list(frames)[:10])}"
+        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
+        fix = both if near else f"known: {', '.join(list(frames)[:10])}"
         yield driver.make_warning(what, fix, "wheels", name)
 
 

@@ -145,10 +145,7 @@ class Gx1Packet(NamedTuple):
         return self.words[0] & 0xFFFF
 
     def to_bytes(self) -> bytes:
-        """Encode the reply. Raises ValueError for words that do not match its layout."""
-        layout = LAYOUTS[self.command]
-        if len(self.words) != layout.words or (self.ticks is None) == layout.has_ticks:
-            raise ValueError(f"a reply 0x{self.command:02x} has {layout.words} words, ticks: {layout.has_ticks}")
+        """Encode the reply, as a device does."""
         unsigned = [word & 0xFFFF for word in self.words] + ([] if self.ticks is None else [self.ticks])
         checksum = (self.command + sum(unsigned)) & 0xFFFF
         return struct.pack(f">B{len(unsigned) + 1}H", self.command, *unsigned, checksum)

@@ -43,7 +43,6 @@ FIELD_BYTES: Final[Mapping[int, tuple[int, ...]]] = {
 
 TIME, QUATERNION = (1, 0), (1, 4)
 MAGNETIC, ACCELERATION, RATE, TEMPERATURE = (3, 1), (3, 2), (3, 3), (3, 4)
-COMPENSATED_RATE, COMPENSATED_ACCELERATION = (1, 5), (1, 8)
 
 WANTED: Final = (TIME, QUATERNION, MAGNETIC, ACCELERATION, RATE, TEMPERATURE)
 """Fields that are asked for: those of the sensors without the corrections of the unit's own filter, whose estimate of
@@ -268,8 +267,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
 
     def _on_binary(self, message: VnBinary, now: HostTime) -> list[Output[bytes]]:
         time_ns = message.time_ns
-        rate = message.get_floats(RATE) or message.get_floats(COMPENSATED_RATE)
-        force = message.get_floats(ACCELERATION) or message.get_floats(COMPENSATED_ACCELERATION)
+        rate, force = message.get_floats(RATE), message.get_floats(ACCELERATION)
         if rate is None and force is None:
             self._counts["without_rate"] += 1
             return []

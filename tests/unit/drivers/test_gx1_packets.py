@@ -66,13 +66,6 @@ def test_given_a_quaternion_and_vectors_then_the_fields_stand_where_the_sheet_ha
     assert int.from_bytes(raw[27:29], "big") == packet.ticks == 77
 
 
-def test_given_words_of_a_wrong_number_when_written_then_it_is_rejected():
-    with pytest.raises(ValueError, match="has 9 words"):
-        Gx1Packet(0x31, (1, 2), 3).to_bytes()
-    with pytest.raises(ValueError, match="ticks: True"):
-        Gx1Packet(0x07, (1,)).to_bytes()
-
-
 def test_given_requests_then_their_bytes_are_the_sheets():
     assert bytes.fromhex("100000") == requests.STOP
     assert requests.make_stream(0x31) == bytes.fromhex("100031")

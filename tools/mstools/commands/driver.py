@@ -234,13 +234,17 @@ def run(
     if kind.command_channel:
         options = replace(options, poll_timeout=COMMAND_POLL_S)
     time_source = SystemTimeSource()
-    publish: Callable[[Sample], object] = publisher.publish_sample
     corrections = None
     if settings.ntrip is not None:
         from msdrivers.corrections import CorrectionsClient
 
         corrections = CorrectionsClient(settings.ntrip, settings.name)
-        publish = corrections.wrap_publish(publish)
+
+    def publish(sample: Sample) -> None:
+        if corrections is not None:
+            corrections.note_place(sample)
+        publisher.publish_sample(sample)
+
     runner = Runner(station, link, options, time_source, publish, publisher.publish_health)
     attend: Callable[[], object] = lambda: None  # noqa: E731
     if kind.command_channel:
