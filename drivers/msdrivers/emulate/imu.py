@@ -234,8 +234,6 @@ class Gx1Unit:
     streamed_at_start: the command that it streams when the line is opened, 0 for none.
     """
 
-    serial: int = 1234
-    firmware: int = 3100
     tick_offset: int = 0
     drift: float = 0.0
     delay: float = 0.003
@@ -332,8 +330,8 @@ class Gx1Emulator(SampleEmulator[ImuSample, bytes]):
             return Gx1Packet(command, (self.eeprom.get(int.from_bytes(data, "big"), 0),), ticks).to_bytes()
         words = {
             CommandByte.TEMPERATURE: gx1.temperature_to_word(self.unit.celsius),
-            CommandByte.FIRMWARE: self.unit.firmware,
-            CommandByte.SERIAL: self.unit.serial,
+            CommandByte.FIRMWARE: 3100,
+            CommandByte.SERIAL: 1234,
         }
         # a measurement is only streamed here
         word = words.get(CommandByte(command))
