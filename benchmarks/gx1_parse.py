@@ -9,9 +9,8 @@ import time
 from collections.abc import Callable
 
 from benchmarks.support import print_verdict
-from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser, RequestParser
-from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
-from msdrivers.emulate.imu import Eeprom
+from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, Gx1Driver, Gx1Packet, Gx1Settings, Gx1Stream
+from msdrivers.emulate.imu import make_eeprom
 from msdrivers.endpoint import HostTime, MeasuredSample, Send
 
 REPLIES = 50_000
@@ -29,10 +28,10 @@ def _reply(number: int) -> bytes:
     return Gx1Packet(CommandByte.EULER_VECTORS, (number % 1000, 2, 3, 4, 5, 6, 7, 8, -4681), number % 65_536).to_bytes()
 
 
-def make_parser() -> Gx1Parser:
+def make_parser() -> Gx1Stream:
     """Return the most permissive parser: it accepts every measurement by its checksum alone."""
-    made = Gx1Parser()
-    made.set_streamed(*MEASUREMENTS)
+    made = Gx1Stream()
+    made.set_commands(*MEASUREMENTS)
     return made
 
 
@@ -64,20 +63,22 @@ def _count_parsed(chunks: list[bytes]) -> int:
 def _count_samples(chunks: list[bytes], per_chunk: float) -> int:
     """Start a driver, feed it the stream, and return the number of samples."""
     driver, now = Gx1Driver(Gx1Settings("imu")), HostTime(0, 1)
-    requests, eeprom, streamed = RequestParser(), Eeprom.make_factory(), 0
+    eeprom, streamed = make_eeprom(), 0
     outputs = driver.on_open(now)
     while streamed == 0:
         replies = b""
         for output in outputs:
-            for request in requests.feed(output.unit) if isinstance(output, Send) else ():
-                words: tuple[int, ...] = (1234,)
-                if request.command == CommandByte.CONTINUOUS:
-                    streamed = request.data[0]
-                    words = (streamed, 0)
-                elif request.command == CommandByte.READ_EEPROM:
-                    words = (eeprom.read_word(request.data[1]),)
-                ticks = 65_535 if request.command == CommandByte.READ_EEPROM else None
-                replies += Gx1Packet(request.command, words, ticks).to_bytes()
+            if not isinstance(output, Send):
+                continue
+            command = output.unit[0]
+            words: tuple[int, ...] = (1234,)
+            if command == CommandByte.CONTINUOUS:
+                streamed = output.unit[2]
+                words = (streamed, 0)
+            elif command == CommandByte.READ_EEPROM:
+                words = (eeprom.get(output.unit[2], 0),)
+            ticks = 65_535 if command == CommandByte.READ_EEPROM else None
+            replies += Gx1Packet(command, words, ticks).to_bytes()
         due = driver.get_deadline()
         now = HostTime(max(now.monotonic_ns, due or 0), 1)
         outputs = driver.on_receive(replies, now) if replies else driver.on_timer(now)

@@ -1,15 +1,11 @@
-"""Corrections for a receiver from an NTRIP caster: RTCM 3 frames, the NTRIP session, and the thread that receives them.
-
-RTCM: a frame is D3, six zero bits and a length of ten, the message, and CRC-24Q of all before (RTCM 10403.3, 4). The
-first twelve bits of a message are its number; in observations and station messages the reference station follows, also
-twelve bits.
+"""Corrections for a receiver from an NTRIP caster: the NTRIP session, and the thread that receives them.
 
 NTRIP, both versions (RTCM 10410.0 and 10410.1): the client asks for a mountpoint by HTTP. A caster of version 1 answers
 `ICY 200 OK` and sends corrections at once; one of version 2 answers as HTTP does, usually in chunks. For an unknown
 mountpoint it sends its source table.
 
-The driver takes the frames in each pass and sends them to the receiver. Without an answer, or after the connection was
-lost, the thread connects again, later each time.
+The driver takes what was received in each pass and sends it to the receiver, which checks the RTCM messages by their
+checksums. Without an answer, or after the connection was lost, the thread connects again, later each time.
 """
 
 from __future__ import annotations
@@ -22,85 +18,13 @@ import time
 from base64 import b64encode
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 from modelserver.messages import FixType, GpsSample, Sample
 from modelserver.version import __version__
 from msdrivers.devices.gps import DAY, nmea
-from msdrivers.devices.stream import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame
 from msdrivers.registry import NtripSettings, split_address
 from msdrivers.runner import Runner
-
-PREAMBLE: Final = 0xD3
-HEADER_BYTES: Final = 3
-CRC_BYTES: Final = 3
-
-_POLYNOMIAL: Final = 0x1864CFB
-
-
-def _make_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 16
-        for _ in range(8):
-            crc = crc << 1 ^ (_POLYNOMIAL if crc & 0x800000 else 0)
-        table.append(crc & 0xFFFFFF)
-    return tuple(table)
-
-
-_TABLE: Final = _make_table()
-
-
-def compute_crc(data: bytes) -> int:
-    """Return CRC-24Q (Qualcomm) of some bytes."""
-    crc = 0
-    for byte in data:
-        crc = (crc << 8 & 0xFFFFFF) ^ _TABLE[crc >> 16 ^ byte]
-    return crc
-
-
-@dataclass(frozen=True, slots=True)
-class RtcmFrame:
-    """A frame as it was received, the number of its message, and its reference station; -1 where it has none."""
-
-    data: bytes
-    number: int
-    station: int
-
-
-class RtcmFormat:
-    """A `FrameFormat` of RTCM 3."""
-
-    start_bytes = bytes((PREAMBLE,))
-
-    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[RtcmFrame] | RejectedFrame | None:
-        if len(buffer) < at + HEADER_BYTES:
-            return None
-        if buffer[at + 1] & 0xFC:
-            return NO_FRAME
-        end = at + HEADER_BYTES + (buffer[at + 1] << 8 | buffer[at + 2]) + CRC_BYTES
-        if len(buffer) < end:
-            return None
-        data = bytes(buffer[at:end])
-        if compute_crc(data[:-CRC_BYTES]) != int.from_bytes(data[-CRC_BYTES:], "big"):
-            return RejectedFrame("crc")
-        message = data[HEADER_BYTES:-CRC_BYTES]
-        number = message[0] << 4 | message[1] >> 4 if len(message) >= 2 else 0
-        station = (message[1] & 0x0F) << 8 | message[2] if len(message) >= 3 and _has_station(number) else -1
-        return ParsedFrame(end, f"rtcm.{number}", RtcmFrame(data, number, station))
-
-
-def _has_station(number: int) -> bool:
-    """Return whether the station follows the number: observations, station coordinates and antennas, MSM."""
-    return 1001 <= number <= 1012 or number in (1033, 1230) or 1071 <= number <= 1137
-
-
-class RtcmStream(FrameScanner[RtcmFrame]):
-    """Parses bytes to frames. Never raises; memory is bounded."""
-
-    formats = (RtcmFormat(),)
-
 
 MAX_HEADER: Final = 8192
 MAX_CHUNK: Final = 1 << 20
@@ -125,24 +49,23 @@ class NtripError(Exception):
 
 
 class NtripSession:
-    """Bytes of a caster in, frames out. `stream.counts` has the frames by kind and what was rejected."""
+    """Bytes of a caster in, corrections out."""
 
     def __init__(self, mountpoint: str) -> None:
         self._mountpoint = mountpoint
         self._buffer = b""
         self.is_answered = self._is_chunked = False
         self._chunk_left = 0
-        self.stream = RtcmStream()
 
-    def feed(self, data: bytes) -> list[RtcmFrame]:
-        """Return the frames that `data` completes. Raises NtripError."""
+    def feed(self, data: bytes) -> bytes:
+        """Return the corrections in `data`. Raises NtripError."""
         if not self.is_answered:
             self._buffer += data
             body = self._read_header()
             if body is None:
-                return []
+                return b""
             data = body
-        return self.stream.feed(self._read_chunks(data) if self._is_chunked else data)
+        return self._read_chunks(data) if self._is_chunked else data
 
     def _read_header(self) -> bytes | None:
         """Return what follows the header; None while it is incomplete."""
@@ -155,9 +78,10 @@ class NtripSession:
         if status.startswith("ICY 200"):
             self.is_answered, self._buffer = True, b""
             return rest
-        if status.startswith("SOURCETABLE"):
-            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
         words = status.split(" ", 2)
+        no_mountpoint = NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+        if words[0] == "SOURCETABLE":
+            raise no_mountpoint
         if not words[0].startswith("HTTP/") or len(words) < 2:
             raise NtripError(f"the server's answer {status[:60]!r} is not that of an NTRIP caster: check caster")
         if words[1] != "200":
@@ -170,7 +94,7 @@ class NtripSession:
             return None
         text = header.decode("latin-1").lower()
         if "gnss/sourcetable" in text:
-            raise NtripError(f"the caster has no mountpoint {self._mountpoint!r}: check mountpoint")
+            raise no_mountpoint
         self.is_answered, self._buffer = True, b""
         self._is_chunked = "transfer-encoding: chunked" in text
         return body
@@ -196,7 +120,7 @@ class NtripSession:
             try:
                 size = int(line.split(b";")[0], 16)
             except ValueError:
-                raise NtripError("the caster's chunks are damaged") from None
+                size = -1
             if size == 0:
                 raise NtripError("the caster has ended the stream")
             if not 0 < size <= MAX_CHUNK:
@@ -224,7 +148,7 @@ SILENCE_S: Final = 30.0
 FIRST_DELAY_S, LONGEST_DELAY_S = 1.0, 60.0
 """Delays before another attempt, doubled each time."""
 MAX_WAITING: Final = 256
-"""Frames that wait for the driver; of more the oldest are lost: old corrections are of no use."""
+"""Readings that wait for the driver; of more the oldest are lost: old corrections are of no use."""
 
 
 class CorrectionsClient:
@@ -232,12 +156,11 @@ class CorrectionsClient:
 
     def __init__(self, settings: NtripSettings, name: str, monotonic: Callable[[], float] = time.monotonic):
         self._settings, self._name, self._monotonic = settings, name, monotonic
-        self._frames: deque[bytes] = deque()
+        self._waiting: deque[bytes] = deque()
         self._lock = threading.Lock()
         self._is_stopping = threading.Event()
         self._counts: Counter[str] = Counter()
         self._received_s: float | None = None
-        self._station = -1
         self._place: GpsSample | None = None
         self._reported = ""
         self._thread = threading.Thread(target=self._run, name=f"corrections of {name}", daemon=True)
@@ -250,56 +173,50 @@ class CorrectionsClient:
         if self._thread.is_alive():
             self._thread.join()
 
-    def wrap_publish(self, publish: Callable[[Sample], object]) -> Callable[[Sample], object]:
-        """Return a function that publishes a sample, and notes the position of a fix for the caster."""
-
-        def publish_and_note(sample: Sample) -> None:
-            if isinstance(sample, GpsSample) and sample.fix_type is not FixType.NONE:
-                self._place = sample
-            publish(sample)
-
-        return publish_and_note
+    def note_place(self, sample: Sample) -> None:
+        """Note the position of a fix for the caster."""
+        if isinstance(sample, GpsSample) and sample.fix_type is not FixType.NONE:
+            self._place = sample
 
     def feed_runner(self, runner: Runner[bytes]) -> Callable[[], object]:
-        """Return the function that sends the received frames to a runner's device, and counts for its health."""
+        """Return the function that sends what was received to a runner's device, and counts for its health."""
 
         def feed() -> None:
-            for frame in self.pop_frames():
-                runner.send_unit(frame)
+            for data in self.pop_received():
+                runner.send_unit(data)
             for name, number in self.counts.items():
                 runner.counts[name] = number
 
         return feed
 
-    def pop_frames(self) -> list[bytes]:
-        """Return the frames that were received since the last call."""
+    def pop_received(self) -> list[bytes]:
+        """Return what was received since the last call."""
         with self._lock:
-            frames = list(self._frames)
-            self._frames.clear()
-        return frames
+            received = list(self._waiting)
+            self._waiting.clear()
+        return received
 
     @property
     def counts(self) -> dict[str, int]:
-        """Counters for the health report: `corrections.frames`, `.connects`, `.lost`, `.station`, and `.age_s`, whole
-        seconds since the last frame; -1 for none."""
+        """Counters for the health report: `corrections.bytes`, `.connects`, `.lost`, and `.age_s`, whole seconds since
+        the last ones; -1 for none."""
         age = -1 if self._received_s is None else round(self._monotonic() - self._received_s)
         return {
             **{f"corrections.{name}": number for name, number in self._counts.items()},
-            "corrections.station": self._station,
             "corrections.age_s": age,
         }
 
     def _run(self) -> None:
         delay = FIRST_DELAY_S
         while not self._is_stopping.is_set():
-            before = self._counts["frames"]
+            before = self._counts["bytes"]
             try:
                 self._receive()
             except (OSError, NtripError) as error:
                 self._report(
                     f"no corrections from {self._settings.caster}: {getattr(error, 'strerror', None) or error}"
                 )
-            delay = FIRST_DELAY_S if self._counts["frames"] > before else min(2.0 * delay, LONGEST_DELAY_S)
+            delay = FIRST_DELAY_S if self._counts["bytes"] > before else min(2.0 * delay, LONGEST_DELAY_S)
             self._is_stopping.wait(delay)
 
     def _receive(self) -> None:
@@ -325,21 +242,20 @@ class CorrectionsClient:
                 if not data:
                     raise NtripError("the caster has closed the connection")
                 last_s = now
-                for frame in session.feed(data):
-                    self._add(frame.data, frame.station)
+                if corrections := session.feed(data):
+                    self._add(corrections)
 
-    def _add(self, data: bytes, station: int) -> None:
-        if not self._counts["frames"]:
+    def _add(self, data: bytes) -> None:
+        if not self._counts["bytes"]:
             log.info("%s: corrections from %s arrive", self._name, self._settings.caster)
         self._reported = ""
         self._received_s = self._monotonic()
-        self._station = station if station >= 0 else self._station
         with self._lock:
-            self._counts["frames"] += 1
-            if len(self._frames) == MAX_WAITING:
-                self._frames.popleft()
+            self._counts["bytes"] += len(data)
+            if len(self._waiting) == MAX_WAITING:
+                self._waiting.popleft()
                 self._counts["lost"] += 1
-            self._frames.append(data)
+            self._waiting.append(data)
 
     def _report(self, text: str) -> None:
         if text != self._reported:

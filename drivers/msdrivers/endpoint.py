@@ -26,6 +26,16 @@ class HostTime(NamedTuple):
     utime: int
 
 
+class TimeSource(Protocol):
+    """A clock, and a way to wait."""
+
+    def now(self) -> HostTime:
+        """Return the instant."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+
 class EndpointPhase(Enum):
     """Phase of the connection to the device."""
 
@@ -88,7 +98,10 @@ Output: TypeAlias = Send[U] | MeasuredSample | EndpointStatus | Reopen
 
 
 class Endpoint(Protocol[U]):
-    """One end of a line. Each event method updates the endpoint's state and returns the outputs in order."""
+    """One end of a line. Each event method updates the endpoint's state and returns the outputs in order.
+
+    One whose device may be silent for long has the attribute `max_silence`: seconds, inf where no data is expected.
+    """
 
     def on_open(self, now: HostTime) -> Sequence[Output[U]]:
         """Start from the beginning: the line was opened or reopened."""
@@ -119,15 +132,6 @@ class CommandableEndpoint(Protocol[U]):
 
     def reject_command(self, reason: str, text: str, now: HostTime) -> Sequence[Output[U]]:
         """Count and report a malformed command; `reason` is the counter's name."""
-
-
-@runtime_checkable
-class HasMaxSilence(Protocol):
-    """An endpoint that knows how long its device may be silent."""
-
-    @property
-    def max_silence(self) -> float:
-        """Longest normal silence in seconds; inf where no data is expected."""
 
 
 BUS_OFF = 0x40

@@ -6,13 +6,12 @@ A kind's modules are named in the table and imported on demand, so that a driver
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files import read_regular
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 class SerialSettings:
     """A serial port: its path, and symbols a second; 0: what the device has from its maker."""
 
-    description: ClassVar[str] = "a serial port"
     port: str
     baud: int = 0
 
@@ -47,7 +45,6 @@ class SerialSettings:
 class TcpSettings:
     """A device server: `HOST:PORT`."""
 
-    description: ClassVar[str] = "a server"
     address: str
 
     def __post_init__(self) -> None:
@@ -64,7 +61,6 @@ class CanSettings:
     bitrate 0: the interface is set up already, as socketcan's are by `ip link`.
     """
 
-    description: ClassVar[str] = "a CAN bus"
     can: str
     interface: str = "socketcan"
     bitrate: int = 0
@@ -85,7 +81,6 @@ class CanSettings:
 class ModbusSettings:
     """A Modbus/TCP server: `HOST:PORT`, the port customarily 502, and the number of the device behind it."""
 
-    description: ClassVar[str] = "a server"
     address: str
     unit_id: int = 1
 
@@ -180,20 +175,17 @@ def find_channel_problem(channel: str, interface: str) -> str:
 
 
 def split_group(channel: str) -> tuple[str, int]:
-    """Return group and port of `GROUP:PORT` or `GROUP`; IPv6 with a port is `[GROUP]:PORT`. Raises ValueError."""
-    found = _GROUP_PORT.fullmatch(channel)
-    group, port = (found[1] or found[2], int(found[3] or MULTICAST_PORT)) if found else (channel, MULTICAST_PORT)
+    """Return group (IPv4) and port of `GROUP:PORT` or `GROUP`. Raises ValueError."""
+    group, colon, number = channel.partition(":")
     try:
-        is_group = ip_address(group).is_multicast
+        port = int(number) if colon else MULTICAST_PORT
+        is_group = ip_address(group).is_multicast and 0 < port < 65536
     except ValueError:
         is_group = False
-    if not is_group or not 0 < port < 65536:
+    if not is_group:
         raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {quote(channel)}")
     return group, port
 
-
-_GROUP_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::([0-9]{1,5}))?")
-"""IPv6 in brackets, or a group without a colon; an IPv6 group alone has none of either."""
 
 CHANNELS: Mapping[type[Sample], str] = {
     GpsSample: "GPS",
@@ -350,7 +342,7 @@ _KINDS = (
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
         _BYTE_LINES,
-        _load("gx1.driver", "Gx1"),
+        _load("gx1", "Gx1"),
         _emulate("imu", lambda emulators, inputs: emulators.Gx1Emulator(inputs.samples)),
         38400,
         faults={**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"},

@@ -31,16 +31,15 @@ from msdrivers.endpoint import (
     CommandableEndpoint,
     Endpoint,
     EndpointStatus,
-    HasMaxSilence,
     HostTime,
     MeasuredSample,
     Output,
     Reopen,
     Send,
+    TimeSource,
     U,
 )
 from msdrivers.links import EndOfRecordingError, Link, LinkError
-from msdrivers.raw_log import TimeSource
 from msdrivers.registry import CHANNELS
 
 HEALTH_CHANNEL = "DRIVER_HEALTH"
@@ -67,18 +66,15 @@ log = logging.getLogger(__name__)
 MAX_CHANGES_PER_PERIOD = 10
 """Rate limit: changes that are logged and reported between two regular reports."""
 
-MAX_COUNTED_STATES = 100
-"""Different states of an unstable line whose repetitions are counted."""
+LOG_INTERVAL_NS = 60_000_000_000
+"""The same state is logged once in this time, unless it has lasted for `STABLE_NS`."""
 
-WARNING_LIFETIME_NS = 60_000_000_000
-"""How long a warning is shown as the likely cause of a silence."""
+MAX_LOGGED_STATES = 100
+"""Different states that are remembered for that."""
 
 
 class HealthReporter:
-    """Tracks the status of one driver and calls `send` when a report is due. Times in seconds.
-
-    While the line is unstable, the same state is logged only at its 1st, 10th, 100th repetition.
-    """
+    """Tracks the status of one driver and calls `send` when a report is due. Times in seconds."""
 
     def __init__(self, source: str, silence: float, period: float, now: HostTime, send: Callable[[HostTime], object]):
         self.samples = 0
@@ -93,12 +89,11 @@ class HealthReporter:
         self._send = send
         self._sample_ns: int | None = None
         self._counted_ns, self._counted = now.monotonic_ns, 0
-        self._phase, self._text, self._suffix, self._is_warning = DriverPhase.CLOSED, "not opened yet", "", False
-        self._last_warning, self._last_warning_ns = "", 0
+        self._phase, self._text, self._is_warning = DriverPhase.CLOSED, "not opened yet", False
+        self._last_warning = ""
         self._reported = self._logged = (DriverPhase.CLOSED, "")
-        self._changes = 0
-        self._is_stable = False
-        self._repetitions: Counter[tuple[DriverPhase, str, bool]] = Counter()
+        self._changes, self._changed_ns = 0, now.monotonic_ns
+        self._logged_ns: dict[tuple[DriverPhase, str], int] = {}
 
     @property
     def state(self) -> tuple[DriverPhase, str]:
@@ -108,7 +103,7 @@ class HealthReporter:
             phase, text = DriverPhase.SILENT, f"nothing received for {self._silence:g} s"
         if phase is DriverPhase.SILENT and self._last_warning not in text:
             text += f"; before that: {self._last_warning}"
-        return phase, text + self._suffix
+        return phase, text
 
     def sample_age(self, now: HostTime) -> float:
         """Return the seconds since the last sample; nan before the first."""
@@ -118,50 +113,37 @@ class HealthReporter:
         self.samples += 1
         self._sample_ns = now.monotonic_ns
 
-    def set_status(
-        self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False, suffix: str = ""
-    ) -> None:
+    def set_status(self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False) -> None:
         """Set phase and text and report a change.
 
-        A warning is repeated with a silence that follows it, until data arrives or the line is reopened; a change of
-        `suffix` alone is not reported as a change.
+        A warning is repeated with a silence that follows it, until data arrives or the line is reopened.
         """
         if is_warning:
-            self._last_warning, self._last_warning_ns = text, now.monotonic_ns
+            self._last_warning = text
         elif phase in (DriverPhase.WAITING, DriverPhase.STREAMING):
             self._last_warning = ""
-        self._phase, self._text, self._suffix, self._is_warning = phase, text, suffix, is_warning
+        self._phase, self._text, self._is_warning = phase, text, is_warning
         self.report_change(now)
-
-    def set_stable(self, is_stable: bool) -> None:
-        """Set whether the line has been open for some time."""
-        if is_stable is not self._is_stable:
-            self._is_stable = is_stable
-            self._repetitions.clear()
-            if is_stable and self.state != self._logged:
-                self._log()
 
     def report_change(self, now: HostTime) -> None:
         """Log and report a change, if there is one."""
         state = self.state
         if state == self._reported:
             return
-        self._reported = state
+        self._reported, self._changed_ns = state, now.monotonic_ns
         self._changes += 1
         if self._changes > MAX_CHANGES_PER_PERIOD and not self.is_ending:
             return
-        if self._is_stable or self.is_ending or self._is_logged_repetition():
-            self._log()
+        if self.is_ending or now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS:
+            self._log(now)
         self._send(now)
 
     def on_timer(self, now: HostTime) -> None:
         """Send the regular report if it is due."""
-        if now.monotonic_ns - self._last_warning_ns > WARNING_LIFETIME_NS:
-            self._last_warning = ""
         if now.monotonic_ns < self.next_report_ns:
             return
-        if self._changes > MAX_CHANGES_PER_PERIOD and self._is_stable and self.state != self._logged:
-            self._log()
+        if self.state != self._logged and now.monotonic_ns - self._changed_ns >= STABLE_NS:
+            self._log(now)
         self._changes = 0
         self.next_report_ns = now.monotonic_ns + self._period_ns
         since = (now.monotonic_ns - self._counted_ns) * 1e-9
@@ -169,16 +151,11 @@ class HealthReporter:
         self._counted_ns, self._counted = now.monotonic_ns, self.samples
         self._send(now)
 
-    def _is_logged_repetition(self) -> bool:
-        """Count the present state; return whether this is its 1st, 10th, 100th repetition."""
-        if len(self._repetitions) >= MAX_COUNTED_STATES:
-            self._repetitions.clear()
-        state = (self.state[0], self._text, bool(self._suffix))
-        self._repetitions[state] += 1
-        return str(self._repetitions[state]).strip("0") == "1"
-
-    def _log(self) -> None:
+    def _log(self, now: HostTime) -> None:
         self._logged = self.state
+        if len(self._logged_ns) >= MAX_LOGGED_STATES:
+            self._logged_ns.clear()
+        self._logged_ns[self._logged] = now.monotonic_ns
         phase, text = self._logged
         bad = phase is DriverPhase.SILENT or (phase is DriverPhase.CLOSED and not self.is_ending)
         level = logging.WARNING if bad or self._is_warning else logging.INFO
@@ -200,12 +177,9 @@ class ReconnectBackoff:
         self._wait = min_wait
         self._opened_ns: int | None = None
         self._failures = 0
-        self._failing_since_ns = 0
 
     def on_open(self, at_ns: int) -> None:
         self._opened_ns = at_ns
-        if not self._failures:
-            self._failing_since_ns = at_ns
 
     def is_stable(self, at_ns: int) -> bool:
         """Return whether the line is stable; if so, reset the backoff."""
@@ -232,12 +206,9 @@ class ReconnectBackoff:
         """Record that the line was closed to change the baud rate: neither failure nor success."""
         self._opened_ns = None
 
-    def describe_failures(self, at_ns: int) -> str:
-        """Return a status suffix for repeated failures; empty if there are few."""
-        if self._failures < MIN_FAILURES_REPORTED:
-            return ""
-        seconds = (at_ns - self._failing_since_ns) * 1e-9
-        return f"; opened and closed {self._failures} times in {seconds:.0f} s: does another program use it?"
+    @property
+    def is_failing(self) -> bool:
+        return self._failures >= MIN_FAILURES_REPORTED
 
 
 MAX_COUNTERS = 200
@@ -305,7 +276,7 @@ class Runner(Generic[U]):
         self._link = link
         self._publish, self._publish_health = publish, publish_health
         self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
-        max_silence = endpoint.max_silence if isinstance(endpoint, HasMaxSilence) else 0.0
+        max_silence = getattr(endpoint, "max_silence", 0.0)
         self._silence = max(settings.silence, max_silence)
         self._reopen_timeout = max(settings.reopen_timeout, 2.0 * max_silence)
         self._stamper = Stamper(DeviceClock())
@@ -372,7 +343,7 @@ class Runner(Generic[U]):
                 self._close_line()
                 self.stop()
             except LinkError as error:
-                self._on_link_error(error)
+                self._close(str(error))
         self._reporter.on_timer(self._time_source.now())
 
     def _open_when_due(self) -> None:
@@ -385,7 +356,7 @@ class Runner(Generic[U]):
             with self._guard_link("open"):
                 self._link.open(self._baud)
         except LinkError as error:
-            self._on_link_error(error)
+            self._close(str(error))
             return
         if self._was_open:
             self.reconnects += 1
@@ -401,10 +372,7 @@ class Runner(Generic[U]):
         try:
             self._execute(self._call_endpoint(what, call))
         except LinkError as error:
-            self._on_link_error(error)
-
-    def _on_link_error(self, error: LinkError) -> None:
-        self._close(str(error))
+            self._close(str(error))
 
     def _reopen(self, request: Reopen) -> None:
         changes_baud = request.baud is not None and request.baud != self._link.baud
@@ -419,9 +387,9 @@ class Runner(Generic[U]):
             self._backoff.on_rate_change()
         wait = 0.0 if changes_baud else self._backoff.on_lost(at_ns, is_orderly=is_orderly)
         self._open_ns = at_ns + round(wait * 1e9)
-        suffix = self._backoff.describe_failures(at_ns)
-        self._reporter.set_status(DriverPhase.CLOSED, reason, self._time_source.now(), suffix=suffix)
-        self._reporter.set_stable(False)
+        if self._backoff.is_failing:
+            reason += "; it is opened and closed again and again: does another program use it?"
+        self._set_status(DriverPhase.CLOSED, reason)
 
     def _close_line(self) -> None:
         with contextlib.suppress(LinkError), self._guard_link("close"):
@@ -497,7 +465,7 @@ class Runner(Generic[U]):
         self._reporter.count_sample(now)
 
     def _check_silence(self, now: HostTime) -> None:
-        self._reporter.set_stable(self._backoff.is_stable(now.monotonic_ns))
+        self._backoff.is_stable(now.monotonic_ns)
         quiet = (now.monotonic_ns - self._received_ns) * 1e-9
         if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True

@@ -5,7 +5,7 @@
 
 `device` is the kind. The other keys follow from the dataclasses of the kind's lines and settings, which alone define
 names, types and limits. `SectionReader` validates a section as `modelserver.config.reader` does a file, and collects
-every problem with its line and fix. Of the settings drivers, emulators, links and codecs are made (`make_driver`).
+every problem with its line and fix. Of the settings drivers, emulators and links are made (`make_driver`).
 """
 
 from __future__ import annotations
@@ -13,15 +13,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
-import struct
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from modelserver.config.reader import Path_, SettingsReader, get_adapter, get_value, list_known_keys
+from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
 from modelserver.errors import (
     ConfigError,
     Location,
@@ -34,9 +32,8 @@ from modelserver.errors import (
     suggest_name,
 )
 from msdrivers.emulate import InjectedFault
-from msdrivers.endpoint import CanFrame, Endpoint, ModbusUnit
+from msdrivers.endpoint import Endpoint
 from msdrivers.links import Link
-from msdrivers.raw_log import BYTES_CODEC, UnitCodec
 from msdrivers.registry import (
     KINDS,
     CanSettings,
@@ -50,42 +47,6 @@ from msdrivers.registry import (
     get_line_key,
     split_address,
 )
-
-_LIST_ERRORS = ("tuple_type", "list_type")
-_SECTION_ERRORS = ("dataclass_type", "dict_type")
-_CHOICE_ERRORS = ("literal_error", "enum")
-_EXPECTED = {
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "text",
-    **dict.fromkeys(_LIST_ERRORS, "a list"),
-    **dict.fromkeys(_SECTION_ERRORS, "a section"),
-}
-
-
-def _suggest_fix(kind: str, got: Any, keys: Sequence[str]) -> str:
-    value = got if isinstance(got, str) else format_value(got) if isinstance(got, int | float) else "..."
-    if kind in _LIST_ERRORS:
-        return f"write [{value}]"
-    if kind in _SECTION_ERRORS:
-        return f"write {{{keys[0] if keys else 'NAME'}: {value}}}"
-    if kind == "string_type":
-        return f'write "{value}"'
-    if kind in ("float_type", "int_type") and isinstance(got, str) and _NUMBER.fullmatch(got):
-        return f"write {got} without quotes"
-    return ""
-
-
-_NUMBER = re.compile(r"-?\d+(\.\d*)?")
-
-
-def format_value(value: str | float) -> str:
-    if isinstance(value, str):
-        return quote(value)
-    return str(value).lower() if isinstance(value, bool) else f"{value}"
 
 
 def list_keys(*kinds: type) -> list[str]:
@@ -139,7 +100,7 @@ class SectionReader(SettingsReader):
         wanted = " or ".join(firsts)
         if given:
             self.report(given[-1], f"both {' and '.join(given)} are given", f"keep one of {wanted}")
-        elif not any(key in self.section for key in _list_other_lines(kind)):
+        elif not any(key in self.section for key in map(get_line_key, get_args(LineSettings))):
             self.add_problem((), f"no line is named: {wanted} is missing", f"add a line: {next(iter(firsts))}: ...")
         self._has_line = False
         return next(iter(firsts.values()))
@@ -148,16 +109,11 @@ class SectionReader(SettingsReader):
         """Report keys that a driver of this kind on this line does not have."""
         known = [*list_keys(*((line,) if self._has_line else kind.lines)), *more]
         firsts = [get_line_key(each) for each in kind.lines]
-        on = f"device {kind.name} is on {' or '.join(firsts)}"
-        others = _list_other_lines(kind)
         for key in [each for each in self.section if each not in known]:
-            if key in others:
+            if key in list_keys(*get_args(LineSettings)):
                 fix = "take it out" if self._has_line else f"write {firsts[0]}: ... in its place"
-                self.report(key, f"{on}, not on {others[key]}", fix)
-            elif key in list_keys(*get_args(LineSettings)):
-                owner = next(get_line_key(each) for each in get_args(LineSettings) if key in list_keys(each))
-                there = f"and {on}" if owner not in firsts else f"and the line here is {get_line_key(line)}"
-                self.report(key, f"{key} goes with {owner}, {there}", "take it out")
+                here = get_line_key(line) if self._has_line else f"device {kind.name}"
+                self.report(key, f"{key} does not go with {here}: device {kind.name} is on {' or '.join(firsts)}", fix)
             else:
                 self._report_misspelled(key, known)
 
@@ -198,29 +154,6 @@ class SectionReader(SettingsReader):
         """Turn one of pydantic's errors into problems; a missing line is reported otherwise."""
         is_of_line = detail["loc"] and detail["loc"][-1] in list_keys(*get_args(LineSettings))
         return [] if detail["type"] == "missing" and is_of_line and not self._has_line else super().explain(detail)
-
-    def explain_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
-        """Return suggestion, fix and message for a single wrong value."""
-        kind, got = detail["type"], detail.get("input")
-        *path, last = detail["loc"]
-        name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
-        actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
-        if kind in _CHOICE_ERRORS:
-            expected = detail["ctx"]["expected"]
-            near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
-            return near, f"write {near[0]}" if near else "", f"{name} is {expected}{actual}"
-        if kind not in _EXPECTED:
-            message = str(detail["msg"])
-            return (), "", f"{name}: {message[:1].lower()}{message[1:]}{actual}"
-        keys = list_known_keys(self.schema, tuple(detail["loc"]))
-        return (), _suggest_fix(kind, got, keys), f"{name} is {_EXPECTED[kind]}{actual}"
-
-
-def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
-    """Return the first keys of the lines that a kind is not on, and what they are lines to."""
-    own = {get_line_key(each) for each in kind.lines}
-    every = {get_line_key(each): each.description for each in get_args(LineSettings)}
-    return {key: about for key, about in every.items() if key not in own}
 
 
 SOURCE_FIELD = "source"
@@ -352,52 +285,6 @@ NTRIP_FIELD = "ntrip"
 COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
 """Keys that every driver has."""
 
-_CAN_HEADER = struct.Struct(">IB")
-
-_EXTENDED_FLAG, _ERROR_FLAG = 1, 2
-
-
-def _pack_frame(frame: CanFrame) -> bytes:
-    flags = _EXTENDED_FLAG * frame.is_extended + _ERROR_FLAG * frame.is_error
-    return _CAN_HEADER.pack(frame.arbitration_id, flags) + frame.data
-
-
-def _unpack_frame(data: bytes) -> CanFrame:
-    if len(data) < _CAN_HEADER.size:
-        raise ValueError(f"{len(data)} bytes are no CAN frame")
-    identifier, flags = _CAN_HEADER.unpack_from(data)
-    return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
-
-
-def _pack_modbus(unit: ModbusUnit) -> bytes:
-    fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
-    return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
-
-
-def _unpack_modbus(data: bytes) -> ModbusUnit:
-    try:
-        name, fields = json.loads(data)
-        unit: ModbusUnit = get_adapter(_MODBUS_TYPES[name]).validate_python(fields)
-    except (TypeError, KeyError) as error:
-        raise ValueError(f"no Modbus unit: {error}") from None
-    return unit
-
-
-_MODBUS_TYPES: Mapping[str, Any] = {kind.__name__: kind for kind in get_args(ModbusUnit)}
-
-CAN_CODEC = UnitCodec("can", _pack_frame, _unpack_frame)
-"""The identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); the data."""
-
-MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
-"""JSON of the unit's kind and fields."""
-
-
-def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
-    """Return how the units of a driver's line are recorded."""
-    if isinstance(settings.line, CanSettings):
-        return CAN_CODEC
-    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
-
 
 def make_link(settings: DriverSettings) -> Link[Any]:
     """Return a driver's line, not opened yet."""
@@ -493,10 +380,8 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
         # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
         left = [frame for frame in frames if frame not in wheels]
         near = find_suggestion(name, left)
-        if near:
-            fix = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
-        else:
-            fix = f"known: {', '.join(list(frames)[:10])}"
+        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
+        fix = both if near else f"known: {', '.join(list(frames)[:10])}"
         yield driver.make_warning(what, fix, "wheels", name)
 
 

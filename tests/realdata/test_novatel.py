@@ -12,7 +12,7 @@ from support_pcap import streams
 
 from msdrivers.devices.gps.driver import FIX_TYPES, GpsMessage, GpsStream
 from msdrivers.devices.gps.nmea import NmeaEpoch
-from msdrivers.devices.gps.novatel import NovatelLog, Position, Prompt, TimeStatus, UtmPosition
+from msdrivers.devices.gps.novatel import NovatelLog, Position, Prompt, TimeStatus
 
 pytestmark = pytest.mark.realdata
 
@@ -103,12 +103,6 @@ def test_given_commands_answers_and_logs_when_read_then_each_is_there(data_dir: 
     assert names(messages) == {"BESTUTM": 2, "VERSION": 1}
     assert [each.port for each in messages if isinstance(each, Prompt)] == ["USB1"] * 3
     assert stream.counts["novatel.OK"] == 3
-    binary, text = (each.body for each in messages if isinstance(each, NovatelLog) and each.header.name == "BESTUTM")
-    assert isinstance(binary, UtmPosition)
-    assert isinstance(text, UtmPosition)
-    assert (binary.zone, binary.letter, binary.station) == (text.zone, text.letter, text.station) == (11, "U", "131")
-    assert binary.northing == pytest.approx(text.northing, abs=0.5)
-    assert binary.easting == pytest.approx(text.easting, abs=0.5)
 
 
 def test_given_the_same_line_a_thousand_times_when_read_then_each_is_a_log(data_dir: Path):

@@ -86,7 +86,7 @@ def test_given_emulated_devices_then_pose_and_viewer_are_there_and_all_end_with_
         assert set(running) == {"run", "driver gps", "driver imu", "emulate gps", "emulate imu"}
         os.kill(running["driver imu"], signal.SIGKILL)
         text_until(process, r" *up \| imu was killed by SIGKILL; it is restarted in 1 s")
-        text_until(process, r" *imu \| .*streams message")
+        text_until(process, r" *imu \| .*receiving message")
         process.send_signal(signal.SIGINT)
         rest, _ = process.communicate(timeout=TIMEOUT_S)
     finally:

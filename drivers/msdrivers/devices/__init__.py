@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
+from modelserver.transforms.so3 import Quaternion
+
 
 def check_ranges(settings: object, **ranges: tuple[float, float]) -> None:
     """Raise ValueError for the first attribute that is outside its range."""
@@ -25,6 +27,12 @@ class Strict:
 
     __slots__ = ()
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+
+def to_rotation(w: float, x: float, y: float, z: float) -> Quaternion | None:
+    """Return a unit's own orientation, normalized; None for numbers that are no rotation."""
+    norm = math.hypot(w, x, y, z)
+    return (w / norm, x / norm, y / norm, z / norm) if abs(norm - 1.0) < 0.01 else None
 
 
 def check_factor(value: float, key: str) -> None:

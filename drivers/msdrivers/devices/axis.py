@@ -7,19 +7,20 @@ Validation (`ReadingValidator`): an angle is plausible if an axis of at most `fa
 the last plausible one. An implausible one becomes the suspect; if the next is plausible from it, it was the earlier
 one that was wrong.
 
-Setup (`NodSetup`): read the commanded registers, write the settings, read them back; between two polls. The values
-found first are restored on close.
+Setup (`AxisDriver._run_setup`): read the commanded registers, write the settings, read them back; between two polls.
+The values found first are restored on close.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices import STRICT, check_ranges
+from msdrivers.devices import Strict, check_ranges
 from msdrivers.devices.stream import BoundedCounter
 from msdrivers.endpoint import (
     LAST_ADDRESS,
@@ -46,10 +47,8 @@ from msdrivers.endpoint import (
 
 
 @dataclass(frozen=True, slots=True)
-class RegisterMap:
+class RegisterMap(Strict):
     """A number in degrees or degrees a second: the registers' whole number times `scale_deg` plus `offset_deg`."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     address: int
     """Address of the protocol, from 0: what manuals call 40001 is 0."""
@@ -114,10 +113,8 @@ class RegisterMap:
 
 
 @dataclass(frozen=True, slots=True)
-class AxisRegisters:
+class AxisRegisters(Strict):
     """Registers of the axis. Angles and rates are the joint's, in its positive direction."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     angle: RegisterMap
     """Angle of the axis."""
@@ -170,10 +167,8 @@ MIN_POLL_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class NodSettings:
+class NodSettings(Strict):
     """Nodding motion. Degrees and degrees per second."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     lower_deg: float
     """Lower limit."""
@@ -188,10 +183,8 @@ class NodSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class AxisSettings:
+class AxisSettings(Strict):
     """Settings of an axis. Raises ValueError with the key for an invalid value."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     source: str
     """Source of the samples."""
@@ -213,10 +206,6 @@ class AxisSettings:
     """Highest nodding rate, degrees per second; faster readings are rejected."""
     poll_hz: float = 100.0
     """Poll rate."""
-    reply_timeout: float = 0.1
-    """Reply timeout, seconds."""
-    retry_delay: float = 0.5
-    """Delay before a retry after an exception, seconds."""
     silence: float = 1.0
     """Seconds without a usable reply after which the driver is SILENT and reopens the line."""
 
@@ -226,7 +215,7 @@ class AxisSettings:
         check_ranges(self, poll_hz=(MIN_POLL_HZ, 1000.0), step_deg=(0.0, 10.0))
         check_ranges(self, lowest_deg=(-3600.0, 3600.0), highest_deg=(-3600.0, 3600.0))
         check_ranges(self, slowest_deg=(0.0, 3600.0), fastest_deg=(0.01, 3600.0))
-        check_ranges(self, reply_timeout=(0.005, 10.0), retry_delay=(0.01, 60.0), silence=(0.05, 3600.0))
+        check_ranges(self, silence=(0.05, 3600.0))
         if not self.lowest_deg < self.highest_deg:
             raise ValueError(f"lowest_deg is below highest_deg, {self.highest_deg:g}, got {self.lowest_deg:g}")
         if not self.slowest_deg <= self.fastest_deg:
@@ -255,75 +244,6 @@ class AxisSettings:
 _Step: TypeAlias = tuple[str, ReadRegisters | WriteRegisters]
 """What is done, and its request."""
 _Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
-
-
-class NodSetup:
-    """The setup of a nodding motion: one step at a time, completed by `on_reply` or repeated."""
-
-    def __init__(self, settings: AxisSettings):
-        self._registers: Mapping[str, RegisterMap] = settings.registers.commanded
-        self._steps: _Steps | None = None
-        self._step: _Step | None = None
-        self.found: dict[str, tuple[int, ...]] = {}
-        """Original contents of the commanded registers, by name."""
-        self._current: dict[str, float] = {}
-        self._warning = ""
-
-    def start(self, nod: NodSettings) -> None:
-        self._steps = self._run(nod)
-        self._step = next(self._steps, None)
-
-    def cancel(self) -> None:
-        self._step = None
-
-    @property
-    def step_text(self) -> str:
-        """Description of the next step; empty when done."""
-        return "" if self._step is None else self._step[0]
-
-    def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
-        """Make the request of the next step; None when done."""
-        return None if self._step is None else replace(self._step[1], transaction=transaction)
-
-    def on_reply(self, reply: Registers | RegistersWritten) -> str:
-        """Complete a step; return a warning if the axis holds another value than was written, else empty."""
-        self._warning = ""
-        try:
-            self._step = self._steps.send(reply) if self._steps is not None else None
-        except StopIteration:
-            self._step = None
-        return self._warning
-
-    def make_restore_requests(self) -> list[WriteRegisters]:
-        if not self.found or self.found.keys() != self._registers.keys():
-            return []
-        degrees = {name: self._registers[name].to_degrees(words) for name, words in self.found.items()}
-        order = _order_writes(degrees["lower_limit"], self._current["upper_limit"])
-        return [WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
-
-    def _run(self, nod: NodSettings) -> _Steps:
-        for name, mapped in self._registers.items():
-            reply = yield self._read(name)
-            if isinstance(reply, Registers):
-                self._current[name] = mapped.to_degrees(reply.values)
-                self.found.setdefault(name, reply.values)
-        wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
-        order = _order_writes(nod.lower_deg, self._current["upper_limit"])
-        for name in order:
-            mapped = self._registers[name]
-            text = f"writing {wanted[name]:g} to {name} (register {mapped.address})"
-            yield text, WriteRegisters(mapped.address, mapped.from_degrees(wanted[name]))
-            self._current[name] = wanted[name]
-        for name in order:
-            mapped, reply = self._registers[name], (yield self._read(name))
-            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
-                self._current[name] = mapped.to_degrees(reply.values)
-                actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
-                self._warning = f"{actual}: the axis's own limit"
-
-    def _read(self, name: str) -> _Step:
-        mapped = self._registers[name]
-        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.registers)
 
 
 def _order_writes(lower: float, present_upper: float) -> tuple[str, ...]:
@@ -395,6 +315,12 @@ class ReadingValidator:
         return abs(after.degrees - before.degrees) <= reach
 
 
+REPLY_TIMEOUT_NS = 100_000_000
+"""A controller on the vehicle's network answers within milliseconds; a lost request must not cost many readings."""
+
+RETRY_DELAY_NS = 500_000_000
+"""Delay before a retry after an exception: a device that rejects is asked twice a second, and not at each poll."""
+
 BUSY_EXCEPTIONS = (5, 6)
 """Exception codes after which a retry makes sense: acknowledge, busy."""
 
@@ -422,11 +348,18 @@ class AxisDriver:
         self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
         self._readings = ReadingValidator(settings)
-        self._nod_setup = NodSetup(settings)
+        self._commanded: Mapping[str, RegisterMap] = registers.commanded
+        self._steps: _Steps | None = None
+        self._step: _Step | None = None
+        """The next step of the setup; None when done."""
+        self._found: dict[str, tuple[int, ...]] = {}
+        """Original contents of the commanded registers, by name."""
+        self._current: dict[str, float] = {}
+        self._warning = ""
         self._pending: _PendingRequest | None = None
         self._transaction = 0
         self._period_ns = round(1e9 / settings.poll_hz)
-        self._reply_ns, self._silence_ns = round(settings.reply_timeout * 1e9), round(settings.silence * 1e9)
+        self._silence_ns = round(settings.silence * 1e9)
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = 0
         self._silent_ns: int | None = None
         self._is_open = False
@@ -442,7 +375,8 @@ class AxisDriver:
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = now.monotonic_ns
         self._silent_ns = now.monotonic_ns + self._silence_ns
         if self.settings.nod is not None:
-            self._nod_setup.start(self.settings.nod)
+            self._steps = self._run_setup(self.settings.nod)
+            self._step = next(self._steps)
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
@@ -466,18 +400,21 @@ class AxisDriver:
             return self._publish_reading(unit, pending, now) + self._send_next(now)
         outputs: list[Output[ModbusUnit]] = []
         if isinstance(unit, Registers | RegistersWritten):
-            warning = self._nod_setup.on_reply(unit)
-            if warning:
+            assert self._steps is not None
+            self._step, self._warning = None, ""
+            with contextlib.suppress(StopIteration):
+                self._step = self._steps.send(unit)
+            if self._warning:
                 self.counts["readback"] += 1
-                outputs.append(EndpointStatus(self._phase, warning, is_warning=True))
-            elif not self._nod_setup.step_text:
+                outputs.append(EndpointStatus(self._phase, self._warning, is_warning=True))
+            elif self._step is None:
                 outputs.append(EndpointStatus(self._phase, "the nodding motion is set"))
         return outputs + self._send_next(now)
 
     def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Process timeouts; send the next request."""
         outputs: list[Output[ModbusUnit]] = []
-        if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + self._reply_ns:
+        if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + REPLY_TIMEOUT_NS:
             outputs += self._on_timeout(now)
         if self._silent_ns is not None and now.monotonic_ns >= self._silent_ns:
             self._silent_ns = None
@@ -493,18 +430,46 @@ class AxisDriver:
         if not self._is_open:
             return None
         if self._pending is not None:
-            next_ns = self._pending.sent_ns + self._reply_ns
+            next_ns = self._pending.sent_ns + REPLY_TIMEOUT_NS
         else:
-            next_ns = min(self._next_ns, self._step_ns) if self._nod_setup.step_text else self._next_ns
+            next_ns = min(self._next_ns, self._step_ns) if self._step is not None else self._next_ns
         return next_ns if self._silent_ns is None else min(next_ns, self._silent_ns)
 
     def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Write back what was found before this driver wrote."""
         self._is_open = False
+        if not self._found or self._found.keys() != self._commanded.keys():
+            return []
+        lower = self._commanded["lower_limit"].to_degrees(self._found["lower_limit"])
         return [
-            Send(replace(request, transaction=self._new_transaction()))
-            for request in self._nod_setup.make_restore_requests()
+            Send(WriteRegisters(self._commanded[name].address, self._found[name], self._new_transaction()))
+            for name in _order_writes(lower, self._current["upper_limit"])
         ]
+
+    def _run_setup(self, nod: NodSettings) -> _Steps:
+        """Read the commanded registers, write the motion and read it back."""
+        for name, mapped in self._commanded.items():
+            reply = yield self._read(name)
+            if isinstance(reply, Registers):
+                self._current[name] = mapped.to_degrees(reply.values)
+                self._found.setdefault(name, reply.values)
+        wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
+        order = _order_writes(nod.lower_deg, self._current["upper_limit"])
+        for name in order:
+            mapped = self._commanded[name]
+            text = f"writing {wanted[name]:g} to {name} (register {mapped.address})"
+            yield text, WriteRegisters(mapped.address, mapped.from_degrees(wanted[name]))
+            self._current[name] = wanted[name]
+        for name in order:
+            mapped, reply = self._commanded[name], (yield self._read(name))
+            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
+                self._current[name] = mapped.to_degrees(reply.values)
+                actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
+                self._warning = f"{actual}: the axis's own limit"
+
+    def _read(self, name: str) -> _Step:
+        mapped = self._commanded[name]
+        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.registers)
 
     def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
@@ -512,11 +477,13 @@ class AxisDriver:
         if self._pending is not None or not self._is_open:
             return []
         is_poll = at >= self._next_ns
-        if not is_poll and not (self._nod_setup.step_text and at >= self._step_ns):
+        if not is_poll and not (self._step is not None and at >= self._step_ns):
             return []
         transaction = self._new_transaction()
-        request = None if is_poll else self._nod_setup.make_request(transaction)
-        if request is None:
+        request: ReadRegisters | WriteRegisters
+        if self._step is not None and not is_poll:
+            request = replace(self._step[1], transaction=transaction)
+        else:
             request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
             self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
@@ -567,19 +534,19 @@ class AxisDriver:
         self.counts.add(f"rejected.exception_{failure.code}")
         self._pending = None
         self._received_ns = now.monotonic_ns
-        again_ns = now.monotonic_ns + round(self.settings.retry_delay * 1e9)
+        again_ns = now.monotonic_ns + RETRY_DELAY_NS
         if pending.is_poll:
             self._next_ns = again_ns
             if failure.code not in BUSY_EXCEPTIONS:
                 self._phase = EndpointPhase.SILENT
             text = f"the axis rejects {describe_request(pending.request)}: {explain_exception(failure.code)}"
-            retry = f"retried every {self.settings.retry_delay:g} s, nothing is published"
+            retry = f"retried every {RETRY_DELAY_NS * 1e-9:g} s, nothing is published"
             return self._warn_once("rejected", f"{text}; {retry}")
-        text = f"the axis rejects {self._nod_setup.step_text}: {explain_exception(failure.code)}"
+        text = f"the axis rejects {self._step[0] if self._step else ''}: {explain_exception(failure.code)}"
         if failure.code in BUSY_EXCEPTIONS:
             self._step_ns = again_ns
             return [*self._warn_once("nod", f"{text}; trying again"), *self._send_next(now)]
-        self._nod_setup.cancel()
+        self._step = None
         return [*self._warn_once("nod", f"{text}; its nodding motion is not changed"), *self._send_next(now)]
 
     def _on_line_error(self, why: str) -> list[Output[ModbusUnit]]:

@@ -17,21 +17,23 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from modelserver.messages import NAN, FixType, GpsSample
-from msdrivers.devices import check_ranges
 from msdrivers.devices.gps import course_from_track, to_covariance
 from msdrivers.devices.stream import (
     NO_FRAME,
     SECOND_NS,
+    ByteSettings,
     FrameScanner,
     ParsedFrame,
     RejectedFrame,
     StreamDriver,
-    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
 MAX_LINE: Final = 16_384
 """A longer line is noise: a SKY report has 200 bytes for each satellite."""
+
+HOLD_NS: Final = SECOND_NS // 50
+"""How long a fix waits for its GST report: gpsd writes both in one go."""
 
 WATCH: Final = b'?WATCH={"enable":true,"json":true}\n'
 
@@ -110,27 +112,17 @@ class GpsdStream(FrameScanner[GpsdReport]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GpsdSettings(StreamSettings):
+class GpsdSettings(ByteSettings):
     """Settings of gpsd. Raises ValueError with the key for an invalid value."""
 
     receiver: str = ""
     """Path of the receiver at gpsd's machine, e.g. /dev/ttyACM0, where gpsd has several; empty: all."""
-    hold: float = 0.02
-    """How long a fix waits for its GST report, seconds."""
     silence: float = 5.0
     """Timeout for fixes, seconds, after which gpsd is asked again."""
-    answer_timeout: float = 2.0
-    """Timeout for gpsd's answer, seconds."""
-    attempts: int = 2
-    """How often gpsd is asked."""
     delay: float = 0.0
     """Shortest time from a fix to its report, seconds; it cannot be distinguished from the offset of the clocks."""
     delay_sigma: float = 0.05
     """Its standard deviation, seconds."""
-
-    def __post_init__(self) -> None:
-        StreamSettings.__post_init__(self)
-        check_ranges(self, hold=(0.0, 2.0))
 
 
 class GpsdDriver(StreamDriver[GpsdReport]):
@@ -142,10 +134,12 @@ class GpsdDriver(StreamDriver[GpsdReport]):
     device = "gpsd"
     description = "gpsd"
     awaited = "TPV"
+    answer_timeout = 2.0
+    attempts = 2
 
     def __init__(self, settings: GpsdSettings) -> None:
         super().__init__(settings, GpsdStream())
-        self._receiver, self._hold_ns = settings.receiver, round(settings.hold * SECOND_NS)
+        self._receiver = settings.receiver
         self._pending: tuple[GpsdReport, int, int] | None = None
         self._gst: GpsdReport | None = None
         self._sky: GpsdReport | None = None
@@ -185,7 +179,7 @@ class GpsdDriver(StreamDriver[GpsdReport]):
                 self._counts["repeated"] += 1
                 return out
             self._last_utime = utime
-            self._pending = (message, self._find_arrival(message.start, now), now.monotonic_ns + self._hold_ns)
+            self._pending = (message, self._find_arrival(message.start, now), now.monotonic_ns + HOLD_NS)
             return out + (self._release(now) if self._gst is not None and self._gst.utime == utime else [])
         return []
 

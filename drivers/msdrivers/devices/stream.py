@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from binascii import crc_hqx
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -220,18 +219,8 @@ def _count_nmea(data: bytes) -> int:
 
 
 def _count_vectornav(data: bytes) -> int:
-    # binary output: FA, groups, then fields of a length that the groups give; CRC-16 over all after FA is 0
-    number, at = len(_VECTORNAV.findall(data)), 0
-    while (at := data.find(b"\xfa", at)) >= 0:
-        for size in range(8, min(200, len(data) - at)):
-            if size > 20 and data[at + size : at + size + 1] == b"\xfa" and crc_hqx(data[at + 1 : at + size], 0) == 0:
-                number += 1
-                at += size - 1
-                break
-        at += 1
-        if number >= MIN_FRAMES:
-            break
-    return number
+    # of a unit as it comes from its maker: binary output is switched on by a driver
+    return len(_VECTORNAV.findall(data))
 
 
 def _count_novatel(data: bytes) -> int:
@@ -434,6 +423,8 @@ class ByteSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds are above 0, got {self.bauds}")
 
     @property
     def bauds(self) -> tuple[int, ...]:
@@ -441,20 +432,10 @@ class ByteSettings:
         return ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreamSettings(ByteSettings):
-    """Settings of a device that is configured."""
-
-    answer_timeout: float = 0.5
-    """Timeout for an answer, seconds."""
-    attempts: int = 3
-    """How often an unanswered message is sent."""
-
-    def __post_init__(self) -> None:
-        ByteSettings.__post_init__(self)
-        check_ranges(self, answer_timeout=(0.05, 60.0), attempts=(1, 100))
-        if any(baud <= 0 for baud in self.bauds):
-            raise ValueError(f"bauds are above 0, got {self.bauds}")
+def check_silence(silence: float, rate_hz: float) -> None:
+    """Raise ValueError for a timeout that a device at this rate would exceed."""
+    if silence < 1.5 / rate_hz:
+        raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {silence:g}")
 
 
 class StreamDriver(ABC, Generic[M]):
@@ -466,6 +447,10 @@ class StreamDriver(ABC, Generic[M]):
     """What is looked for, e.g. "u-blox receiver"."""
     awaited: str
     """What it streams, e.g. "NAV-PVT"."""
+    answer_timeout = 0.5
+    """Timeout for an answer, seconds."""
+    attempts = 3
+    """How often an unanswered message is sent."""
 
     def __init__(self, settings: ByteSettings, stream: FrameScanner[M]) -> None:
         self._settings, self._stream = settings, stream
@@ -505,17 +490,6 @@ class StreamDriver(ABC, Generic[M]):
         """Do what the device's own deadline is for."""
         return []
 
-    def _describe_wait(self) -> str:
-        return f"waiting for an answer: {self.description}"
-
-    def _describe_input(self) -> str:
-        """Describe what was received since the last search, with what to do."""
-        return recognize_line(self._first_bytes, self.device)
-
-    def _explain_absence(self) -> str:
-        """Explain that no device was found, by what was tried."""
-        return f"no {self.description} answers on this line: {'; '.join(self._tried)}"
-
     # --- endpoint ---
 
     @property
@@ -532,7 +506,7 @@ class StreamDriver(ABC, Generic[M]):
         if (out := self._setup.reopen(now)) is not None:
             return out
         is_silent = self._phase is EndpointPhase.SILENT
-        status = [] if is_silent else self._set_status(EndpointPhase.WAITING, self._describe_wait())
+        status = [] if is_silent else self._set_status(EndpointPhase.WAITING, f"waiting for {self.description}")
         return [*status, *self._setup.start(self._run_setup(), now)]
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
@@ -646,25 +620,25 @@ class StreamDriver(ABC, Generic[M]):
         self._restart_silence_timer()
 
     def _make_request(self, frame: bytes) -> RequestStep:
-        assert isinstance(self._settings, StreamSettings)
-        return RequestStep(frame, self._settings.answer_timeout, self._settings.attempts)
+        return RequestStep(frame, self.answer_timeout, self.attempts)
 
     def _restart_silence_timer(self) -> None:
         self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)
 
     def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
-        text = f"no {self.awaited} for {self._settings.silence:g} s, setting the device up again"
+        text = f"no usable {self.awaited} for {self._settings.silence:g} s, setting the device up again"
         return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
     def _try_next_baud(self) -> Script:
-        bauds, found = self._settings.bauds, self._describe_input()
+        bauds, found = self._settings.bauds, recognize_line(self._first_bytes, self.device)
         baud = bauds[self._baud_index] if bauds else None
         self._tried.append(f"at {baud} baud {found}" if baud else found)
         if len(self._tried) >= max(1, len(bauds)):
             # the text differs with the noise: rate limit
             if self._phase is not EndpointPhase.SILENT or self._now.monotonic_ns >= self._next_warning_ns:
                 self._next_warning_ns = self._now.monotonic_ns + WARNING_INTERVAL_NS
-                yield from self._set_status(EndpointPhase.SILENT, self._explain_absence())
+                text = f"no {self.description} answers on this line: {'; '.join(self._tried)}"
+                yield from self._set_status(EndpointPhase.SILENT, text)
             self._tried = []
         if len(bauds) > 1:
             self._baud_index = (self._baud_index + 1) % len(bauds)

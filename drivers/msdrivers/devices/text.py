@@ -154,9 +154,6 @@ class TextDriver(StreamDriver[TextLine]):
     def _on_start(self) -> None:
         self._is_partial, self._last_line, self._first_bytes = True, b"", b""
 
-    def _describe_wait(self) -> str:
-        return "waiting for lines of text"
-
     def _run_setup(self) -> Script:
         """Only read."""
         self._restart_silence_timer()

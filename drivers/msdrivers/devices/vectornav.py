@@ -19,16 +19,15 @@ from operator import xor
 from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
+    ByteSettings,
     FrameScanner,
     ParsedFrame,
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -43,8 +42,7 @@ FIELD_BYTES: Final[Mapping[int, tuple[int, ...]]] = {
 """Bytes of the fields of each group, by bit. Groups 4, 6 and 7 (GNSS, INS) do not exist on a VN-100."""
 
 TIME, QUATERNION = (1, 0), (1, 4)
-MAGNETIC, ACCELERATION, RATE, TEMPERATURE, SATURATION = (3, 1), (3, 2), (3, 3), (3, 4), (3, 11)
-COMPENSATED_RATE, COMPENSATED_ACCELERATION = (1, 5), (1, 8)
+MAGNETIC, ACCELERATION, RATE, TEMPERATURE = (3, 1), (3, 2), (3, 3), (3, 4)
 
 WANTED: Final = (TIME, QUATERNION, MAGNETIC, ACCELERATION, RATE, TEMPERATURE)
 """Fields that are asked for: those of the sensors without the corrections of the unit's own filter, whose estimate of
@@ -174,11 +172,6 @@ def encode_binary(fields: Mapping[tuple[int, int], bytes]) -> bytes:
     return bytes((SYNC,)) + body + crc_hqx(body, 0).to_bytes(2, "big")
 
 
-def compute_size(keys: tuple[tuple[int, int], ...]) -> int:
-    """Return the bytes of a binary message with these fields."""
-    return 1 + 1 + 2 * len({group for group, _ in keys}) + sum(FIELD_BYTES[group][bit] for group, bit in keys) + 2
-
-
 def make_setup(rate_hz: float, port: int) -> tuple[SetupStep, ...]:
     """Return what sets a unit up, in its volatile memory: ASCII output off on both ports, then the binary output.
 
@@ -216,7 +209,7 @@ MAX_RATE, MAX_ACCELERATION = 40.0, 400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VectornavSettings(StreamSettings):
+class VectornavSettings(ByteSettings):
     """Settings of a VN-100. Raises ValueError with the key for an invalid value."""
 
     rate_hz: float = 100.0
@@ -227,11 +220,9 @@ class VectornavSettings(StreamSettings):
     """What the yaw of its orientation is measured against: `magnetic`, or `none` where its magnetometers are off."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    answer_timeout: float = 0.3
-    """Timeout for an answer, seconds."""
 
     def __post_init__(self) -> None:
-        StreamSettings.__post_init__(self)
+        ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
         if self.heading not in ("magnetic", "none"):
             raise ValueError(f"heading is magnetic or none, got '{self.heading}'")
@@ -240,12 +231,13 @@ class VectornavSettings(StreamSettings):
 class VectornavDriver(StreamDriver[VnMessage]):
     """An `Endpoint` of bytes at the host's end of the unit's line; see `VectornavSettings`.
 
-    Further counts: `lost` samples, by the unit's clock; `saturated` and `rejected.range` vectors.
+    Further counts: `lost` samples, by the unit's clock; `rejected.range` vectors.
     """
 
     device = "vectornav"
     description = "VectorNav unit"
     awaited = "binary output"
+    answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
         super().__init__(settings, VnStream())
@@ -275,8 +267,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
 
     def _on_binary(self, message: VnBinary, now: HostTime) -> list[Output[bytes]]:
         time_ns = message.time_ns
-        rate = message.get_floats(RATE) or message.get_floats(COMPENSATED_RATE)
-        force = message.get_floats(ACCELERATION) or message.get_floats(COMPENSATED_ACCELERATION)
+        rate, force = message.get_floats(RATE), message.get_floats(ACCELERATION)
         if rate is None and force is None:
             self._counts["without_rate"] += 1
             return []
@@ -288,7 +279,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             self._counts["lost"] += max(0, round(step) - 1) if step < 1000.0 else 0
         self._last_ns = time_ns
         magnetic, celsius = message.get_floats(MAGNETIC), message.get_floats(TEMPERATURE)
-        orientation = _to_quaternion(message.get_floats(QUATERNION))
+        x, y, z, w = message.get_floats(QUATERNION) or (math.nan,) * 4
+        orientation = to_rotation(w, x, y, z)
         sample = ImuSample(
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
@@ -302,15 +294,6 @@ class VectornavDriver(StreamDriver[VnMessage]):
             temperature_celsius=celsius[0] if celsius is not None and math.isfinite(celsius[0]) else NAN,
         )
         return self._publish(sample, now)
-
-
-def _to_quaternion(values: tuple[float, ...] | None) -> Quaternion | None:
-    """Return w, x, y, z of a quaternion x, y, z, w; None for one that is no rotation."""
-    if values is None:
-        return None
-    x, y, z, w = values
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return (w / norm, x / norm, y / norm, z / norm) if abs(norm - 1.0) < 0.01 else None
 
 
 def _describe_error(words: tuple[str, ...]) -> str:

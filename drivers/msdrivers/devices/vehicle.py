@@ -17,13 +17,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
 from modelserver.messages import NAN, SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices import STRICT, Strict, check_ranges
+from msdrivers.devices import Strict, check_ranges
 from msdrivers.devices.can import (
     BoundSignal,
+    BusSettings,
     CanDatabase,
     CanDriver,
     CanFrameSet,
@@ -233,10 +234,8 @@ def _round_trip(signal: BoundSignal, physical: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class CommandLimits:
+class CommandLimits(Strict):
     """Limits of commands; 0 forbids the motion."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     forward_speed: float = 2.0
     """Highest speed forward, m/s."""
@@ -253,16 +252,10 @@ class CommandLimits:
             raise ValueError(f"over_limit is clamp or reject, got {self.over_limit!r}")
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleSettings(BusSettings):
     """Settings of the vehicle controller. Raises ValueError with the key for an invalid value."""
 
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
-
-    source: str
-    """Source of the samples."""
-    dbc: str
-    """Path of the DBC file, relative to the file that holds these settings."""
     status: StatusMap | None = None
     """Signals of the status; None: nothing is published."""
     command: CommandMap | None = None
@@ -279,23 +272,13 @@ class VehicleSettings:
     """Period of the frames of a command, or of the stop after it, seconds."""
     clock_slack: float = 0.2
     """Seconds by which the clock of a command's source may be ahead of ours."""
-    window: float = 0.02
-    """Seconds to wait for the other frames of a status; shorter than the time between two."""
-    silence: float = 1.0
-    """Timeout for usable frames, seconds."""
-    delay: float = 0.0
-    """Seconds from the measurement to the frame's arrival, as far as known."""
-    delay_sigma: float = 0.0
-    """Standard deviation of `delay`, seconds."""
 
     def __post_init__(self) -> None:
-        if not self.dbc:
-            raise ValueError("dbc is the path of a DBC file, got nothing")
+        BusSettings.__post_init__(self)
         if self.status is None and self.command is None:
             raise ValueError("status or command is needed: without both there is nothing to do")
         check_ranges(self, dead_man=(0.05, 5.0), max_validity=(0.05, 60.0))
         check_ranges(self, command_period=(0.005, 1.0), clock_slack=(0.0, 5.0))
-        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
         if self.max_validity < self.dead_man:
             raise ValueError(
                 f"max_validity is at least dead_man, {self.dead_man:g}, got {self.max_validity:g}: a command would end "
@@ -528,14 +511,13 @@ class VehicleDriver(CanDriver):
             if faults is None or rejected is None:
                 # these have no number for "missing"
                 self.counts["rejected.incomplete"] += 1
-                self._note_useless("without fault_bits or commands_rejected")
                 continue
             rejected += self._rejected
             numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
             mode = status.get_mode(instant)
             is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
             if not is_known and not self._has_status_words:
-                self._note_empty()
+                self.counts["rejected.empty"] += 1
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
             # the highest of the 32 bits is the sign on the wire

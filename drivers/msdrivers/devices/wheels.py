@@ -16,13 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 from modelserver.errors import quote
 from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
-from msdrivers.devices import STRICT, Strict, check_factor, check_ranges
+from msdrivers.devices import Strict, check_factor, check_ranges
 from msdrivers.devices.can import (
     BoundSignal,
+    BusSettings,
     CanDatabase,
     CanDriver,
     CanFrameSet,
@@ -331,16 +331,10 @@ def _check_ambiguity(binder: SignalBinder, name: str, odometer: Odometer) -> Non
 MAX_WHEELS = 64
 
 
-@dataclass(frozen=True, slots=True)
-class WheelsSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelsSettings(BusSettings):
     """Settings of the wheels. Raises ValueError with the key for an invalid value."""
 
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
-
-    source: str
-    """Source of the samples."""
-    dbc: str
-    """Path of the DBC file, relative to the file that holds these settings."""
     wheels: Mapping[str, WheelMap]
     """Signals of each wheel, by its name in `sensors.wheels.frames`."""
     max_speed: float = 15.0
@@ -349,23 +343,15 @@ class WheelsSettings:
     """Largest delay of a frame on the bus, seconds; tolerated in the plausibility check of counts."""
     window: float = 0.004
     """Seconds to wait for the other frames of an instant; shorter than the time between two instants."""
-    silence: float = 1.0
-    """Timeout for usable frames, seconds."""
-    delay: float = 0.0
-    """Seconds from the measurement to the frame's arrival, as far as known."""
-    delay_sigma: float = 0.0
-    """Standard deviation of `delay`, seconds."""
 
     def __post_init__(self) -> None:
-        if not self.dbc:
-            raise ValueError("dbc is the path of a DBC file, got nothing")
+        BusSettings.__post_init__(self)
         if not 1 <= len(self.wheels) <= MAX_WHEELS:
             raise ValueError(f"wheels has 1 to {MAX_WHEELS} wheels, got {len(self.wheels)}")
         for name in self.wheels:
             if not (0 < len(name) <= 64 and name.isprintable()):
                 raise ValueError(f"wheels names wheels with 1 to 64 printable characters, got {quote(name)}")
         check_ranges(self, max_speed=(0.1, 200.0), frame_delay=(0.0, 10.0))
-        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
 
 
 class WheelsDriver(CanDriver):
@@ -404,7 +390,7 @@ class WheelsDriver(CanDriver):
             wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
             self.counts["incomplete"] += not instant.is_complete
             if all(_is_empty(wheel) for wheel in wheels):
-                self._note_empty()
+                self.counts["rejected.empty"] += 1
                 outputs += warnings
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
@@ -442,7 +428,6 @@ class WheelsDriver(CanDriver):
     def _warn(self, name: str, reason: str, warnings: list[Output[CanFrame]]) -> None:
         key = reason if reason == "resumed" else f"rejected.{reason}"
         self.counts[key] += 1
-        self._reasons[reason] = None
         if f"{name} {reason}" in self._warned:
             return
         self._warned.add(f"{name} {reason}")

@@ -10,22 +10,21 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from modelserver.transforms.so3 import Quaternion
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
+    ByteSettings,
     FrameScanner,
     ParsedFrame,
     RejectedFrame,
     SetupStep,
     StreamDriver,
-    StreamSettings,
 )
 from msdrivers.endpoint import HostTime, Output
 
@@ -48,7 +47,7 @@ class MessageId(IntEnum):
 
 
 class ItemId(IntEnum):
-    """Identifiers of items of MTData2, without format and frame."""
+    """Identifiers of items of MTData2, in float32 and against ENU, as they are asked for."""
 
     TEMPERATURE = 0x0810
     PACKET_COUNTER = 0x1020
@@ -59,8 +58,6 @@ class ItemId(IntEnum):
     MAGNETIC_FIELD = 0xC020
     STATUS_WORD = 0xE020
 
-
-FRAME_ENU, FRAME_NED = 0x0, 0x4
 
 TICK: Final = 1e-4
 """Seconds of SampleTimeFine."""
@@ -150,29 +147,10 @@ class MtData:
         data = self.items.get(item)
         return None if data is None else int.from_bytes(data, "big")
 
-    def get_numbers(self, item: ItemId, count: int, frame: int = 0) -> tuple[float, ...] | None:
-        """Return `count` numbers in any of the formats; None if they are missing, or of another size."""
-        for form, size in enumerate(_SIZES):
-            data = self.items.get(item | frame | form)
-            if data is not None and len(data) == size * count:
-                return tuple(_READERS[form](data[n * size : (n + 1) * size]) for n in range(count))
-        return None
-
-    @property
-    def is_clipped(self) -> bool:
-        """Whether a measurement was beyond its range."""
-        return bool((self.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
-
-
-_SIZES: Final = (4, 4, 6, 8)
-_READERS: Final[tuple[Callable[[bytes], float], ...]] = (
-    lambda data: float(struct.unpack(">f", data)[0]),
-    lambda data: int.from_bytes(data, "big", signed=True) / (1 << 20),
-    # the fraction first, then the whole part
-    lambda data: int.from_bytes(data[4:], "big", signed=True) + int.from_bytes(data[:4], "big") / (1 << 32),
-    lambda data: float(struct.unpack(">d", data)[0]),
-)
-"""By number format: float32, fixed point 12.20, fixed point 16.32, float64."""
+    def get_numbers(self, item: int, count: int) -> tuple[float, ...] | None:
+        """Return `count` numbers of float32, as they are asked for; None if they are missing, or of another size."""
+        data = self.items.get(item)
+        return struct.unpack(f">{count}f", data) if data is not None and len(data) == 4 * count else None
 
 
 def encode_items(items: Iterable[tuple[int, bytes]]) -> bytes:
@@ -223,7 +201,7 @@ MAX_ACCELERATION: Final = 400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class XsensSettings(StreamSettings):
+class XsensSettings(ByteSettings):
     """Settings of an MTi. Raises ValueError with the key for an invalid value."""
 
     rate_hz: int = 100
@@ -234,11 +212,9 @@ class XsensSettings(StreamSettings):
     """What the yaw of its orientation is measured against: `magnetic`, `none` (VRU), or `true` (with declination)."""
     bauds: tuple[int, ...] = (115200, 921600, 460800, 230400, 2000000)
     """Baud rates to try; the line is opened at the first. Empty: the line has none."""
-    attempts: int = 5
-    """How often an unanswered message is sent: some units do not answer after power-up."""
 
     def __post_init__(self) -> None:
-        StreamSettings.__post_init__(self)
+        ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1, 400), field_strength=(0.0, 1e-3))
         if self.heading not in _YAW_SOURCES:
             raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
@@ -275,6 +251,8 @@ class XsensDriver(StreamDriver[XbusMessage]):
     device = "xsens"
     description = "Xsens MTi"
     awaited = "MTData2"
+    attempts = 5
+    """Some units do not answer after power-up."""
 
     def __init__(self, settings: XsensSettings) -> None:
         super().__init__(settings, XbusStream())
@@ -322,11 +300,11 @@ class XsensDriver(StreamDriver[XbusMessage]):
             # such as the packets of a receiver
             self._counts["without_rate"] += 1
             return []
-        self._counts["clipped"] += data.is_clipped
+        self._counts["clipped"] += bool((data.get_integer(ItemId.STATUS_WORD) or 0) & _CLIPPED)
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)
-        orientation, reference = _find_orientation(data)
+        orientation = to_rotation(*(data.get_numbers(ItemId.QUATERNION, 4) or (math.nan,) * 4))
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
             angular_velocity=self._read_vector(rate, MAX_RATE),
@@ -335,20 +313,8 @@ class XsensDriver(StreamDriver[XbusMessage]):
             if self._own.field_strength
             else None,
             orientation=orientation,
-            orientation_reference=reference,
+            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.ENU,
             yaw_source=YawSource.NONE if orientation is None else _YAW_SOURCES[self._own.heading],
             temperature_celsius=self._celsius,
         )
         return self._publish(sample, now, TICK)
-
-
-def _find_orientation(data: MtData) -> tuple[Quaternion | None, OrientationReference]:
-    """Return the unit's own orientation (w, x, y, z) and its reference; None if it has none, or in another frame."""
-    for frame, reference in ((FRAME_ENU, OrientationReference.ENU), (FRAME_NED, OrientationReference.NED)):
-        values = data.get_numbers(ItemId.QUATERNION, 4, frame)
-        if values is not None:
-            norm = math.sqrt(sum(each * each for each in values))
-            if abs(norm - 1.0) < 0.01:
-                w, x, y, z = (each / norm for each in values)
-                return (w, x, y, z), reference
-    return None, OrientationReference.NONE

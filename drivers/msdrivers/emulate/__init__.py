@@ -9,10 +9,10 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from modelserver.errors import find_nearest_names, quote
-from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
+from modelserver.messages import GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
 from msdrivers.endpoint import (
     CanFrame,
     Endpoint,
@@ -26,7 +26,7 @@ from msdrivers.endpoint import (
     make_bus_off_frame,
 )
 
-S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample)
+S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample, JointsSample)
 
 
 class InjectedFault(NamedTuple):
@@ -70,24 +70,13 @@ def parse_fault(text: str, known: Mapping[str, str] = FAULT_AMOUNTS) -> Injected
     return fault
 
 
-@runtime_checkable
-class HasOwnFaults(Protocol):
-    """An emulator that applies some faults itself."""
-
-    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
-        """Apply a fault, if it is one of the device's own; return whether it is."""
-
-    def corrupt(self, unit: Any) -> Any:
-        """Return a damaged unit, as the line would."""
-
-
 class FaultInjector(Generic[U]):
     """An `Endpoint` that wraps another and applies faults in the order of their times.
 
     drop: `amount` units are lost. corrupt: `amount` units are damaged. stall, restart, bus_off: nothing passes for
     `amount` seconds, then a restarted device is replaced by a new one; after bus_off the interface reports it. jump:
-    the device's clock is shifted. What a device applies itself (`HasOwnFaults`) is left to it. `make` returns the
-    device as after power-on.
+    the device's clock is shifted. A device may have a method `apply_fault(fault, now)`, which returns whether the fault
+    is one that it applies itself. `make` returns the device as after power-on.
     """
 
     def __init__(self, make: Callable[[], Endpoint[U]], faults: Iterable[InjectedFault]):
@@ -157,7 +146,7 @@ class FaultInjector(Generic[U]):
             if fault.kind in ("stall", "restart", "bus_off"):
                 self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
             self._pending[fault.kind] += round(fault.amount)
-            if isinstance(self._inner, HasOwnFaults) and self._inner.apply_fault(fault, now):
+            if getattr(self._inner, "apply_fault", lambda *_: False)(fault, now):
                 continue
             self._is_restarting = self._is_restarting or fault.kind == "restart"
             if fault.kind == "jump":
@@ -178,85 +167,29 @@ class FaultInjector(Generic[U]):
             elif self._pending["corrupt"] > 0:
                 self._pending["corrupt"] -= 1
                 self._counts["fault.corrupted"] += 1
-                damage = self._inner.corrupt if isinstance(self._inner, HasOwnFaults) else corrupt_unit
-                passed.append(Send(damage(output.unit)))
+                passed.append(Send(corrupt_unit(output.unit)))
             else:
                 passed.append(output)
         return passed
 
 
 def corrupt_unit(unit: Any) -> Any:
-    """Return a unit with one bit flipped in its middle; one without anything in it as it is."""
+    """Return bytes with one bit flipped in their middle, a CAN frame or registers without the last one.
+
+    What is empty stays.
+    """
     if isinstance(unit, bytes):
         middle = len(unit) // 2
         return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
     if isinstance(unit, CanFrame):
-        return replace(unit, data=corrupt_unit(unit.data))
-    if isinstance(unit, Registers) and unit.values:
-        return replace(unit, values=(unit.values[0] ^ 0x10, *unit.values[1:]))
+        return replace(unit, data=unit.data[:-1])
+    if isinstance(unit, Registers):
+        return replace(unit, values=unit.values[:-1])
     return unit
 
 
-class CanEmulator(ABC, Generic[S]):
-    """Base of an emulator on a CAN bus that sends samples at their stamps.
-
-    If the first stamp is in the past when the line is first opened, all are shifted equally. A corrupt frame lacks its
-    last byte.
-    """
-
-    def __init__(self, text: str, samples: Iterable[S]):
-        """`text` is the status when the line is opened."""
-        self._text = text
-        self._samples: Iterator[S] = iter(samples)
-        self._next: S | None = next(self._samples, None)
-        self._started: tuple[int, int] | None = None
-        self.counts: Counter[str] = Counter()
-
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start at the first opening; later the device has continued."""
-        if self._started is None:
-            first = now.utime if self._next is None else self._next.header.utime
-            self._started = (now.monotonic_ns, min(now.utime, first))
-        return [EndpointStatus(EndpointPhase.STREAMING, self._text), *self.on_timer(now)]
-
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        return []
-
-    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send the frames that are due."""
-        outputs: list[Output[CanFrame]] = []
-        while (due := self.get_deadline()) is not None and due <= now.monotonic_ns:
-            sample = None
-            if self._get_sample_ns() == due:
-                sample, self._next = self._next, next(self._samples, None)
-            outputs += [Send(each) for each in self._make_frames(sample, due)]
-        return outputs
-
-    def get_deadline(self) -> int | None:
-        return self._get_sample_ns()
-
-    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        return []
-
-    def corrupt(self, unit: CanFrame) -> CanFrame:
-        return replace(unit, data=unit.data[:-1])
-
-    def _get_sample_ns(self) -> int | None:
-        if self._next is None or self._started is None:
-            return None
-        return self._started[0] + (self._next.header.utime - self._started[1]) * 1000
-
-    @abstractmethod
-    def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
-        """Apply a fault, if it is one of the device's own; return whether it is."""
-
-    @abstractmethod
-    def _make_frames(self, sample: S | None, at_ns: int) -> Iterable[CanFrame]:
-        """Make the frames of an instant; `sample` is the one that is due, if any."""
-
-
-class SampleEmulator(ABC, Generic[S]):
-    """An `Endpoint` of bytes at the device's end of a line. `samples` are in the order of their stamps.
+class SampleEmulator(ABC, Generic[S, U]):
+    """An `Endpoint` at the device's end of a line. `samples` are in the order of their stamps.
 
     `latency` is the time from the instant of a sample to its first byte, seconds.
     """
@@ -271,29 +204,28 @@ class SampleEmulator(ABC, Generic[S]):
         """What was sent and received, by kind."""
 
     @abstractmethod
-    def _encode(self, sample: S) -> bytes:
-        """Return what the device sends for a sample; empty for nothing."""
+    def _encode(self, sample: S) -> Iterable[U]:
+        """Return the units that the device sends for a sample; empty ones are not sent."""
 
-    def _answer(self, unit: bytes) -> Iterable[bytes]:
-        """Yield the answers to received bytes."""
+    def _answer(self, unit: U) -> Iterable[U]:
+        """Yield the answers to a received unit."""
         return ()
 
-    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[U]]:
         """The host's end of the line is open; a device does not notice."""
         self._now = now
         return []
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
         self._now = now
         return [Send(each) for each in self._answer(unit) if each]
 
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
         """Send the samples up to now."""
         self._now = now
-        out: list[Output[bytes]] = []
+        out: list[Output[U]] = []
         while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:
-            if data := self._encode(self._next):
-                out.append(Send(data))
+            out += [Send(each) for each in self._encode(self._next) if each]
             self._next = next(self._samples, None)
         return out
 
@@ -302,5 +234,5 @@ class SampleEmulator(ABC, Generic[S]):
             return None
         return self._now.monotonic_ns + (self._next.header.utime + self._latency_us - self._now.utime) * 1000
 
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+    def on_close(self, now: HostTime) -> Sequence[Output[U]]:
         return []

@@ -12,7 +12,6 @@ import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -49,12 +48,12 @@ _FIXES = {
     FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
     FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
-"""Position type, quality in GGA, mode in RMC and VTG."""
+"""Position type, quality in GGA, mode in RMC."""
 
 
 def is_known(name: str) -> bool:
     """Return whether a log or sentence is written here, e.g. "bestposb" or "gpgga"."""
-    return name in NMEA or (name[:-1] in NOVATEL and name[-1] in "ab")
+    return name in NMEA or (name[:-1] in NOVATEL and name[-1] == "b")
 
 
 def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes:
@@ -62,8 +61,7 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_of(utime)
-    status, binary = TimeStatus.FINESTEERING, name[-1] == "b"
-    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, status, port, 0, 0, binary)
+    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, TimeStatus.FINESTEERING, port, 0, 0, True)
     return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
@@ -130,8 +128,6 @@ def _make_heading(sample: GpsSample) -> HeadingLog:
 
 NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
     "bestpos": _make_position,
-    "psrpos": _make_position,
-    "rtkpos": _make_position,
     "bestvel": _make_velocity,
     "heading": _make_heading,
     "heading2": _make_heading,
@@ -163,13 +159,6 @@ def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     return nmea.encode("GP", "RMC", fields)
 
 
-def _format_vtg(sample: GpsSample, utime: int) -> bytes:
-    speed, course, _ = _get_motion(sample)
-    track = nmea.format_number(_track_from_course(course), 4)
-    speeds = (nmea.format_number(speed / nmea.KNOT, 4), "N", nmea.format_number(speed / nmea.KMH, 4), "K")
-    return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _FIXES[sample.fix_type][2]))
-
-
 def _format_gsa(sample: GpsSample, utime: int) -> bytes:
     dimension = {FixType.NONE: "1", FixType.FIX_2D: "2"}.get(sample.fix_type, "3")
     dilution = (nmea.format_number(each, 2) for each in (sample.pdop, sample.hdop, sample.vdop))
@@ -182,10 +171,6 @@ def _format_gst(sample: GpsSample, utime: int) -> bytes:
     return nmea.encode("GP", "GST", (_format_clock(utime), *[""] * 4, *fields))
 
 
-def _format_hdt(sample: GpsSample, utime: int) -> bytes:
-    return nmea.encode("GP", "HDT", (nmea.format_number(_track_from_course(sample.baseline_yaw), 4), "T"))
-
-
 def _format_zda(sample: GpsSample, utime: int) -> bytes:
     day = datetime.fromtimestamp(utime // SECOND, UTC)
     return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
@@ -194,10 +179,8 @@ def _format_zda(sample: GpsSample, utime: int) -> bytes:
 NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
     "gpgga": _format_gga,
     "gprmc": _format_rmc,
-    "gpvtg": _format_vtg,
     "gpgsa": _format_gsa,
     "gpgst": _format_gst,
-    "gphdt": _format_hdt,
     "gpzda": _format_zda,
 }
 """Sentence -> its bytes."""
@@ -222,14 +205,6 @@ class GpsUnit:
     is_answering: bool = True
 
 
-@dataclass(slots=True)
-class _LogRequest:
-    """A log that was asked for: its period in microseconds, 0 for each sample, and when it was last written."""
-
-    period: int
-    last: int | None = None
-
-
 def make_gps_emulator(settings: GpsSettings, samples: Iterable[GpsSample]) -> GpsEmulator:
     """Return the receiver that a driver with these settings expects: NovAtel, or one that only sends NMEA."""
     if settings.protocol != "nmea":
@@ -239,17 +214,19 @@ def make_gps_emulator(settings: GpsSettings, samples: Iterable[GpsSample]) -> Gp
     return GpsEmulator(samples, GpsUnit(saved=saved, is_answering=False))
 
 
-class GpsEmulator(SampleEmulator[GpsSample]):
+class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
         super().__init__(samples, self._unit.latency)
-        self._logs: dict[str, _LogRequest] = {}
+        self._logs: dict[str, int] = {}
+        """Periods of the logs that are on, microseconds."""
+        self._written: dict[str, int] = {}
+        """When each log was written last."""
         self._line = bytearray()
         for line in self._unit.saved:
-            if error := self._execute(line):
-                raise ValueError(f"saved configuration, '{line}': {error}")
+            self._execute(line)
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -280,49 +257,33 @@ class GpsEmulator(SampleEmulator[GpsSample]):
                 answer = f"<ERROR:{error}" if error else "<OK"
                 yield f"\r\n{answer}\r\n".encode("ascii") + _PROMPT
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         utime = sample.header.utime
         logs = b""
-        for name, wanted in self._logs.items():
+        for name, period in self._logs.items():
             # half a millisecond of grace: stamps are rounded
-            if wanted.last is not None and utime - wanted.last < wanted.period - 500:
+            if utime - self._written.get(name, 0) < period - 500:
                 continue
-            wanted.last = utime
+            self._written[name] = utime
             logs += encode_sample(name, sample, utime, _PORT)
             self.counts[name] += 1
-        return logs
+        return (logs,)
 
     def _execute(self, line: str) -> str:
         """Carry a command out. Return what is wrong with it; empty if nothing is."""
-        words = line.lower().split()
-        command, fields = words[0], words[1:]
-        if fields and command in ("log", "unlog", "unlogall") and fields[0] in ("thisport", _PORT.lower()):
-            fields = fields[1:]
-        if command == "unlogall":
-            self._logs.clear()
-            return ""
-        if command in _NO_EFFECT_COMMANDS:
-            return ""
-        if command not in ("log", "unlog"):
-            return f"Invalid Message. Field = {command}"
-        if not fields or not is_known(fields[0]):
-            return f"Invalid Message. Field = {fields[0] if fields else ''}"
-        if command == "unlog":
-            self._logs.pop(fields[0], None)
-            return ""
-        return self._execute_log(fields)
-
-    def _execute_log(self, fields: Sequence[str]) -> str:
-        trigger = fields[1] if len(fields) > 1 else "onchanged"
-        period = 0.0
-        if trigger == "ontime" and len(fields) > 2:
-            with suppress(ValueError):
-                period = float(fields[2])
-            if not 0.05 <= period <= 86_400.0:
-                return "Invalid period"
-        elif trigger not in ("onnew", "onchanged"):
-            return "Invalid trigger"
-        self._logs[fields[0]] = _LogRequest(round(period * 1e6))
+        command, *fields = line.lower().split()
+        try:
+            if command == "unlogall":
+                self._logs.clear()
+            elif command == "unlog":
+                self._logs.pop(fields[1], None)
+            elif command == "log" and is_known(fields[1]):
+                # log PORT NAME ontime SECONDS
+                self._logs[fields[1]] = round(float(fields[3]) * 1e6)
+            elif command not in _NO_EFFECT_COMMANDS:
+                return f"Invalid Message. Field = {command}"
+        except (IndexError, ValueError):
+            return f"Invalid Message. Field = {line}"
         return ""
 
 
@@ -334,7 +295,7 @@ LATENCY = 0.03
 _STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
 
 
-class GpsdEmulator(SampleEmulator[GpsSample]):
+class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as gpsd does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], *, has_gst: bool = True) -> None:
@@ -362,15 +323,15 @@ class GpsdEmulator(SampleEmulator[GpsSample]):
         known = {key: value for key, value in fields.items() if not (isinstance(value, float) and math.isnan(value))}
         return json.dumps(known, separators=(",", ":")).encode() + b"\r\n"
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         if not self._is_watched:
-            return b""
+            return ()
         when = datetime.fromtimestamp(sample.header.utime // 1000 / 1e3, UTC)
         head = {"device": RECEIVER, "time": when.isoformat(timespec="milliseconds").replace("+00:00", "Z")}
         dilution = {"hdop": sample.hdop, "vdop": sample.vdop, "pdop": sample.pdop}
         out = self._report(**{"class": "SKY"}, **head, **dilution, uSat=sample.satellites)
         if sample.fix_type is FixType.NONE:
-            return out + self._report(**{"class": "TPV"}, **head, mode=1)
+            return (out + self._report(**{"class": "TPV"}, **head, mode=1),)
         east, north, up = sample.velocity or (math.nan,) * 3
         mode = 2 if sample.fix_type is FixType.FIX_2D else 3
         status = {"status": _STATUS[sample.fix_type]} if sample.fix_type in _STATUS else {}
@@ -382,7 +343,7 @@ class GpsdEmulator(SampleEmulator[GpsSample]):
         if self._has_gst and sample.position_covariance is not None:
             longitude, latitude, height = (math.sqrt(each) for each in sample.position_covariance[::4])
             out += self._report(**{"class": "GST"}, **head, lat=latitude, lon=longitude, alt=height)
-        return out
+        return (out,)
 
 
 UBX_PORT: Final = "UART1"
@@ -423,7 +384,7 @@ class _CommandFormat(UbxFormat):
         return found
 
 
-class UbloxEmulator(SampleEmulator[GpsSample]):
+class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: UbloxUnit | None = None) -> None:
@@ -491,14 +452,14 @@ class UbloxEmulator(SampleEmulator[GpsSample]):
         payload += b"".join(text.encode().ljust(30, b"\0") for text in texts)
         return _encode_ubx("MON-VER", payload=payload)
 
-    def _encode(self, sample: GpsSample) -> bytes:
+    def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         milliseconds = sample.header.utime // 1000
         if self._last_ms is not None and milliseconds - self._last_ms < self._period_ms - 1:
-            return b""
+            return ()
         self._last_ms = milliseconds
         names = [name for name in ORDER if name in self._messages]
         self.counts.update(names)
-        return b"".join(encode_ubx(name, sample) for name in names)
+        return (b"".join(encode_ubx(name, sample) for name in names),)
 
 
 def encode_ubx(name: str, sample: GpsSample) -> bytes:

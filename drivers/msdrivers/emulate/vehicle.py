@@ -1,8 +1,8 @@
 """Emulators of what moves on a vehicle: wheel encoders and the drive-by-wire controller (CAN), a nodding axis, joints.
 
-The controller takes commands with a dead-man timer and sends its status; speed and steering approach the command, each
-at a limited rate. The axis is a register map on Modbus/TCP: it turns at the commanded rate, reverses at the limits, and
-measures its angle in whole steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
+The controller takes commands with a dead-man timer and sends its status; the vehicle follows them at once. The axis is
+a register map on Modbus/TCP: it turns at the commanded rate, reverses at the limits, and measures its angle in whole
+steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
 """
 
 from __future__ import annotations
@@ -10,16 +10,25 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import count
 from typing import Final
 
-from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from modelserver.messages import (
+    Direction,
+    JointsSample,
+    SensorHeader,
+    VehicleMode,
+    VehicleStatusSample,
+    WheelSample,
+    WheelsSample,
+)
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
-from msdrivers.emulate import CanEmulator, InjectedFault
+from msdrivers.emulate import InjectedFault, SampleEmulator
 from msdrivers.endpoint import (
     MAX_READ,
     MAX_WRITE,
@@ -41,7 +50,7 @@ from msdrivers.endpoint import (
 )
 
 
-class WheelsEmulator(CanEmulator[WheelsSample]):
+class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
     """An `Endpoint` of CAN frames. Missing values of a sample keep the last one; signals that are not mapped are 0."""
 
     def __init__(
@@ -52,7 +61,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         first_count: int = 0,
     ):
         """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
-        super().__init__(f"{len(wheels)} wheels emulated", samples)
+        super().__init__(samples)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
@@ -71,9 +80,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
                 self._offset[name] = -self._counted[name]
         return fault.kind in ("jump", "restart")
 
-    def _make_frames(self, sample: WheelsSample | None, at_ns: int) -> list[CanFrame]:
-        if sample is None:
-            return []
+    def _encode(self, sample: WheelsSample) -> list[CanFrame]:
         wheels = {wheel.name: wheel for wheel in sample.wheels}
         for wheel in self._wheels:
             if wheel.name in wheels:
@@ -117,7 +124,7 @@ MAX_REJECTED_COUNT = 255
 
 @dataclass(frozen=True, slots=True)
 class VehicleUnit:
-    """The controller and its vehicle: seconds, m/s, m/s2, radians."""
+    """The controller and its vehicle: seconds, m/s, radians."""
 
     mode: VehicleMode = VehicleMode.AUTONOMOUS
     status_period: float = 0.05
@@ -126,15 +133,12 @@ class VehicleUnit:
     max_speed: float = 5.0
     """Faster commands are rejected."""
     max_steering: float = 0.6
-    acceleration: float = 1.5
-    braking: float = 3.0
-    steering_rate: float = 0.6
     supply_voltage: float = 13.8
     engine_speed: float = 150.0
     fault_bits: int = 0
 
 
-class VehicleEmulator(CanEmulator[VehicleStatusSample]):
+class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
     """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones."""
 
     def __init__(
@@ -146,7 +150,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         samples: Iterable[VehicleStatusSample] = (),
     ):
         """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
-        super().__init__("vehicle controller emulated", samples)
+        super().__init__(samples)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
         """Driving mode; set it to press the emergency stop."""
@@ -161,33 +165,37 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         self._target = (0.0, 0.0)
         self._commanded_ns: int | None = None
         self._alive: float | None = None
-        self._updated_ns = 0
         self._status_ns = 0
 
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[CanFrame]]:
         """Start at the first opening; later the vehicle has continued."""
-        if self._started is None:
-            self._updated_ns = self._status_ns = now.monotonic_ns
-        return super().on_open(now)
+        if self._now is None:
+            self._status_ns = now.monotonic_ns
+        super().on_open(now)
+        return self.on_timer(now)
 
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+    def on_receive(self, unit: CanFrame, now: HostTime) -> Sequence[Output[CanFrame]]:
         outputs = self.on_timer(now)
         command = self._command
-        is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
-        if command is None or not is_command:
-            return outputs
-        try:
-            self._on_command(command, self._database.decode(unit), now.monotonic_ns)
-        except FrameError as error:
-            self.counts[f"rejected.{error.reason}"] += 1
+        if command is not None and not unit.is_error and unit.key == command.forward_speed.key:
+            try:
+                self._on_command(command, self._database.decode(unit), now.monotonic_ns)
+            except FrameError as error:
+                self.counts[f"rejected.{error.reason}"] += 1
+        return outputs
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[CanFrame]]:
+        """Send each status that is due."""
+        super().on_timer(now)
+        outputs: list[Output[CanFrame]] = []
+        while self._status_ns <= now.monotonic_ns:
+            outputs += [Send(each) for each in self._make_status(self._status_ns)]
+            self._status_ns += round(self.unit.status_period * 1e9)
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when the next status, sample or fault is due, monotonic nanoseconds."""
-        if self._started is None:
-            return None
         other = super().get_deadline()
-        return self._status_ns if other is None else min(self._status_ns, other)
+        return None if self._now is None else min(self._status_ns, self._status_ns if other is None else other)
 
     def apply_fault(self, fault: InjectedFault, now: HostTime) -> bool:
         if fault.kind == "restart":
@@ -196,7 +204,6 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
-        self._advance(at_ns)
         if command.alive is not None:
             if raw[command.alive.name] == self._alive:
                 self.counts["rejected.repeated"] += 1
@@ -219,34 +226,23 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         self._target = (requested[0] if enabled else 0.0, requested[1])
         self._commanded_ns = at_ns
 
-    def _advance(self, at_ns: int) -> None:
-        """Simulate up to an instant: follow the command until the dead-man timer expires, then stop."""
-        ends = self._updated_ns if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
-        held = min(max(ends, self._updated_ns), at_ns)
-        drives = self.mode is VehicleMode.AUTONOMOUS
-        self._drive((held - self._updated_ns) * 1e-9, self._target[0] if drives else 0.0, self._target[1])
-        self._drive((at_ns - held) * 1e-9, 0.0, self.steering)
-        self._updated_ns = at_ns
-
-    def _drive(self, seconds: float, speed: float, steering: float) -> None:
+    def _drive(self, at_ns: int) -> None:
+        """Follow the command at once, until the dead-man timer expires."""
         if self._follows_samples:
             return
-        unit = self.unit
-        slows = abs(speed) < abs(self.speed) or speed * self.speed < 0.0
-        step = (unit.braking if slows else unit.acceleration) * seconds
-        self.speed += min(max(speed - self.speed, -step), step)
-        step = unit.steering_rate * seconds
-        self.steering += min(max(steering - self.steering, -step), step)
+        ends = 0 if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
+        is_driving = self.mode is VehicleMode.AUTONOMOUS and at_ns < ends
+        self.speed, self.steering = self._target if is_driving else (0.0, self.steering)
 
-    def _make_frames(self, sample: VehicleStatusSample | None, at_ns: int) -> list[CanFrame]:
-        if sample is not None:
-            self.mode = sample.mode
-            self.speed = sample.forward_speed if math.isfinite(sample.forward_speed) else self.speed
-            self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
-        if self._status_ns > at_ns:
-            return []
-        self._advance(at_ns)
-        self._status_ns += round(self.unit.status_period * 1e9)
+    def _encode(self, sample: VehicleStatusSample) -> tuple[CanFrame, ...]:
+        """Take its state from a sample; it is sent with the next status."""
+        self.mode = sample.mode
+        self.speed = sample.forward_speed if math.isfinite(sample.forward_speed) else self.speed
+        self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
+        return ()
+
+    def _make_status(self, at_ns: int) -> list[CanFrame]:
+        self._drive(at_ns)
         status = self._status
         if status is None:
             return []
@@ -294,8 +290,8 @@ class AxisUnit:
 class AxisEmulator:
     """An `Endpoint` of `ModbusUnit` that answers requests.
 
-    Faults of its own: a corrupt reply lacks a register. restart: it restarts with its first limits and rate. jump: its
-    angle jumps by `amount` degrees. exception: the next request gets exception code `amount`.
+    Faults of its own: restart: it restarts with its first limits and rate. jump: its angle jumps by `amount` degrees.
+    exception: the next request gets exception code `amount`.
     """
 
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
@@ -348,9 +344,6 @@ class AxisEmulator:
         elif fault.kind == "restart":
             self._switch_on(now.monotonic_ns + round(fault.amount * 1e9))
         return fault.kind in ("exception", "jump", "restart")
-
-    def corrupt(self, unit: ModbusUnit) -> ModbusUnit:
-        return replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
 
     def _advance(self, at_ns: int) -> None:
         """Turn on to an instant, and measure at the last instant of its own before."""
@@ -440,38 +433,22 @@ SWEEP_S: Final = 8.0
 """Period of the first joint, seconds; that of each further one is a third shorter."""
 
 
-class TextJointsEmulator:
-    """An `Endpoint` of bytes that sends a line every `PERIOD_US`."""
+class TextJointsEmulator(SampleEmulator[JointsSample, bytes]):
+    """An `Endpoint` of bytes that sends a line every `PERIOD_US` from its first opening on."""
 
     def __init__(self, settings: TextSettings) -> None:
+        super().__init__(())
         self._settings = settings
-        self._first: HostTime | None = None
-        self._sent = 0
-        self.counts: Counter[str] = Counter()
-        """Lines sent."""
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
-        self._first = self._first or now
-        return []
+        if self._now is None:
+            self._first_utime = now.utime
+            self._samples = (JointsSample(SensorHeader(utime), ()) for utime in count(now.utime, PERIOD_US))
+            self._next = next(self._samples)
+        return super().on_open(now)
 
-    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        return []
-
-    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Send the lines that are due, the newest only after a pause."""
-        assert self._first is not None
-        due = (now.monotonic_ns - self._first.monotonic_ns) // (1000 * PERIOD_US)
-        if due < self._sent:
-            return []
-        self._sent = due + 1
-        self.counts["lines"] += 1
-        return [Send(encode_line(self._settings, self.get_values(due * PERIOD_US * 1e-6)))]
-
-    def get_deadline(self) -> int | None:
-        return None if self._first is None else self._first.monotonic_ns + self._sent * PERIOD_US * 1000
-
-    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        return []
+    def _encode(self, sample: JointsSample) -> tuple[bytes]:
+        return (encode_line(self._settings, self.get_values((sample.header.utime - self._first_utime) * 1e-6)),)
 
     def get_values(self, seconds: float) -> dict[str, float]:
         """Return the fields of a line, `seconds` after the first."""

@@ -209,9 +209,6 @@ class TcpServerLink(DescriptorLink):
             if error.errno == errno.EADDRINUSE:
                 what = f"port {port} is in use"
                 raise LinkError(what, "another program listens on it", "end it, or take another port") from None
-            if error.errno == errno.EACCES:
-                what = f"port {port} may not be used"
-                raise LinkError(what, "ports below 1024 are the system's", "take another port") from None
             raise make_lost_error(self.description, error) from None
         self._address = (host, self._server.getsockname()[1])
         self.description = f"tcp {host}:{self._address[1]}"

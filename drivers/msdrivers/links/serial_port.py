@@ -14,7 +14,6 @@ import os
 import termios
 import time
 import tty
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,16 +49,13 @@ def _describe_port(port: object) -> str:
 
 
 def suggest_ports(path: str) -> tuple[str, ...]:
-    """Return the ports that a missing one may have been meant for: of the same name but its number, or by their id.
+    """Return the ports that a missing one may have been meant for: of the same letters (/dev/ttyUBS0), or by their id.
 
-    A name of the same letters counts as the same: /dev/ttyUBS0. Others are no help: /dev/ttyS0 is always there.
+    Others are no help: /dev/ttyS0 is always there.
     """
-    known = [port.path for port in find_ports() if _name_letters(port.path) == _name_letters(path)]
+    letters = sorted(path.rstrip("0123456789"))
+    known = [port.path for port in find_ports() if sorted(port.path.rstrip("0123456789")) == letters]
     return (*find_nearest_names(path, known), *sorted(glob.glob("/dev/serial/by-id/*")))
-
-
-def _name_letters(path: str) -> list[str]:
-    return sorted(path.rstrip("0123456789"))
 
 
 def find_access_problem(path: str) -> str:
@@ -102,38 +98,17 @@ def _get_user() -> str:
 
 
 def find_users(path: str) -> list[str]:
-    """Return the processes that have a port open, as far as this user may see.
-
-    Of a pseudo-terminal that is who has it as a port; the emulator at its other end only where there is nobody else.
-    """
+    """Return the processes that have a port open, as far as this user may see."""
     real = os.path.realpath(path)
-    found = list(_find_processes(real))
-    return [_describe_process(each) for each in [each for each in found if not _has_emulator_end(each, real)] or found]
-
-
-def find_emulators(path: str) -> list[str]:
-    """Return the emulators that speak on a pseudo-terminal: they have both its ends open, which no terminal does."""
-    return [_describe_process(each) for each in _find_processes(path) if _has_emulator_end(each, path)]
-
-
-def _find_processes(real: str) -> Iterator[Path]:
-    """Yield the processes that have a file open, as their folders below /proc."""
+    found = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if any(os.readlink(each) == real for each in (process / "fd").iterdir()):
-                yield process
+                found.append(_describe_process(process))
         except OSError:
             # gone meanwhile, or another user's
             continue
-
-
-def _has_emulator_end(process: Path, path: str) -> bool:
-    """Return whether a process has the other end of the pseudo-terminal `path` too."""
-    line = f"tty-index:\t{path.rpartition('/')[2]}\n"
-    try:
-        return any(line in each.read_text() for each in (process / "fdinfo").iterdir())
-    except OSError:
-        return False
+    return found
 
 
 def _describe_process(process: Path) -> str:
@@ -218,27 +193,20 @@ class SerialLink(DescriptorLink):
         return LinkError(path, os.strerror(number) if number else str(error), "is it a serial port?")
 
 
-WRONG_BAUD_TABLE = bytes(byte ^ 0x5A for byte in range(256))
-"""Translation of bytes between different baud rates."""
-
-
 class PtyLink(DescriptorLink):
-    """A pseudo-terminal. `description` is the path that a driver opens.
+    """A pseudo-terminal, of any baud rate. `description` is the path that a driver opens."""
 
-    With another rate than `baud` set by the driver, data is garbled in both directions as on a real line; 0: any rate.
-    """
+    baud = 0
 
-    def __init__(self, baud: int = 0, link: Path | None = None):
+    def __init__(self, link: Path | None = None):
         """Make one at `open`; with `link` a symbolic link of that name shows the way, whatever the path is."""
-        self.baud = baud
         self.description = str(link) if link else "pty"
         self._link = link
         self._path = ""
         self._emulator_fd = self._driver_fd = -1
 
     def open(self, baud: int | None = None) -> None:
-        """Make the pair, or speak at another rate on the one there is. Raises LinkError."""
-        self.baud = baud or self.baud
+        """Make the pair, unless there is one. Raises LinkError."""
         if self._emulator_fd >= 0:
             return
         try:
@@ -277,21 +245,10 @@ class PtyLink(DescriptorLink):
             raise LinkError(self.description, "the line is not open")
         return self._emulator_fd
 
-    def poll(self, timeout: float) -> Sequence[bytes]:
-        return tuple(self._apply_baud(data) for data in super().poll(timeout))
-
     def send(self, unit: bytes) -> None:
         """Send bytes; they are lost when the terminal's buffer is full, as on a real line."""
         with contextlib.suppress(BlockingIOError):
-            os.write(self.fileno(), self._apply_baud(unit))
-
-    def _apply_baud(self, data: bytes) -> bytes:
-        return data if not self.baud or self._get_driver_baud() in (self.baud, 0) else data.translate(WRONG_BAUD_TABLE)
-
-    def _get_driver_baud(self) -> int:
-        """Return the rate that the driver has set, 0 if unknown."""
-        speed = termios.tcgetattr(self._driver_fd)[5]
-        return next((rate for rate in BAUDS if getattr(termios, f"B{rate}", None) == speed), 0)
+            os.write(self.fileno(), unit)
 
 
 def remove_stale_link(link: Path) -> None:
@@ -303,16 +260,9 @@ def remove_stale_link(link: Path) -> None:
     except OSError:
         raise LinkError(f"{link}", "there is a file of that name, and it stays", "give another path") from None
     if link.exists():
-        if not target.startswith(PTY_FOLDER):
+        if not target.startswith("/dev/pts/"):
             why = f"it is a link to {target} that no emulator made, and it stays"
             raise LinkError(f"{link}", why, "give another path")
-        users = find_emulators(target)
-        if users:
-            raise LinkError(f"{link} is in use", f"by the emulator {', '.join(users)}", "end it, or give another path")
+        if users := find_users(target):
+            raise LinkError(f"{link} is in use", f"by {', '.join(users)}", "end it, or give another path")
     link.unlink()
-
-
-PTY_FOLDER = "/dev/pts/"
-
-BAUDS = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
-"""Those that a terminal has a name for."""

@@ -60,13 +60,12 @@ def alone(*data: bytes, **settings) -> Line:
     return one
 
 
-@pytest.mark.parametrize("log_format", ["binary", "ascii"])
 @pytest.mark.parametrize("rate", [4.0, 10.0, 20.0])
-def test_given_a_receiver_when_set_up_then_every_fix_comes_with_its_velocity(rate: float, log_format: str):
-    one = line(GpsSettings("gps", rate_hz=rate, log_format=log_format)).run(5.0)
+def test_given_a_receiver_when_set_up_then_every_fix_comes_with_its_velocity(rate: float):
+    one = line(GpsSettings("gps", rate_hz=rate)).run(5.0)
     assert one.phases == [EndpointPhase.WAITING, EndpointPhase.CONFIGURING, EndpointPhase.STREAMING], one.status_text
     assert abs(len(one.samples) - 5.0 * rate) <= 2
-    assert one.device.logs == tuple(f"best{what}{log_format[0]}" for what in ("pos", "vel"))
+    assert one.device.logs == ("bestposb", "bestvelb")
     truth = {each.header.utime: each for each in drive(30.0)}
     for each in one.samples:
         true = truth[each.header.device_utime]
@@ -159,14 +158,14 @@ def test_given_a_wrong_device_when_all_rates_are_tried_then_received_data_and_at
     assert "at 9600 baud received" in silent[0]
     assert "at 115200 baud received" in silent[0]
     assert "LMS200" in silent[0]
-    assert "another device" in silent[0]
+    assert "check port and baud rate" in silent[0]
     assert not one.samples
     assert [each.baud for each in one.reopens[:3]] == [115200, 9600, 115200]
 
 
 def test_given_a_dead_line_when_nothing_is_received_then_power_and_cable_are_named():
     one = line(is_broken=True).run(5.0)
-    assert "received nothing; check the receiver's power, the cable" in one.status_text
+    assert "received nothing: check power, cable and port" in one.status_text
     assert len(one.statuses) < 6, one.status_text
 
 
@@ -267,31 +266,19 @@ def test_given_a_rolled_over_week_when_it_comes_then_the_time_is_of_these_days()
     assert abs(right.header.device_utime - START) < 10 * SECOND
 
 
-@pytest.mark.parametrize("binary", [True, False])
-def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_primary_are_used(binary: bool):
+def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_primary_are_used():
     body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
     sent = []
     for n in range(6):
         # the secondary antenna is logged in between, a meter away
         at = 252_818_000 + n * 500
-        header = LogHeader("BESTPOS", 2288, at, TimeStatus.FINESTEERING, "COM1", 0, 0, binary, n % 2)
+        header = LogHeader("BESTPOS", 2288, at, TimeStatus.FINESTEERING, "COM1", 0, 0, True, n % 2)
         sent.append(encode(NovatelLog(header, body._replace(latitude=50.0 + (n % 2) * 1e-5))))
     driven = alone(*sent)
     assert {each.latitude_deg for each in driven.samples} == {50.0}
     assert len(driven.samples) == 3
     assert driven.driver.counts["rejected.secondary_antenna"] == 3
     assert sum("secondary antenna" in each for each in driven.status_text.splitlines()) == 1
-
-
-def test_given_a_leap_second_when_it_comes_then_the_fix_is_published_without_a_device_time():
-    # week 1930, 18 s is 2017-01-01 00:00:00 UTC
-    body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
-    headers = (
-        LogHeader("BESTPOS", 1930, ms, TimeStatus.FINESTEERING, "COM1", 0, 0, True) for ms in (16_500, 17_500, 18_500)
-    )
-    before, within, after = alone(*(encode(NovatelLog(header, body)) for header in headers)).samples
-    assert after.header.device_utime - before.header.device_utime == SECOND
-    assert within.header.device_utime == 0
 
 
 @pytest.mark.parametrize("date", ["141123", "300304"])
@@ -344,8 +331,6 @@ def test_given_a_driver_that_leaves_when_it_has_set_up_then_its_logs_are_stopped
     one = line().run(3.0)
     one.from_driver(one.driver.on_close(one.now))
     assert one.device.logs == ()
-    driver = GpsDriver(GpsSettings("gps", restore_on_exit=False))
-    assert list(driver.on_close(now_at(START))) == []
 
 
 def test_given_samples_and_counts_when_compared_then_they_agree():
@@ -358,12 +343,11 @@ def test_given_samples_and_counts_when_compared_then_they_agree():
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [
-        ({"protocol": "garmin"}, "protocol: must be one of novatel, nmea, got 'garmin'"),
-        ({"rate_hz": 50.0}, "rate_hz: must be 0.1 to 20 Hz"),
-        ({"rate_hz": 0.2}, "silence: 2 s is less than one and a half periods"),
+        ({"protocol": "garmin"}, "protocol is one of novatel, nmea, got 'garmin'"),
+        ({"rate_hz": 50.0}, "rate_hz is between 0.1 and 20, got 50"),
+        ({"rate_hz": 0.2}, "silence is at least 1.5 periods, 7.5 s, got 2"),
         ({"commands": ("log\x00",)}, "is no line of text"),
-        ({"bauds": (0,)}, "bauds: must be above 0"),
-        ({"answer_timeout": math.nan}, "answer_timeout: must be"),
+        ({"bauds": (0,)}, "bauds are above 0"),
     ],
 )
 def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[str, object], expected: str):
@@ -373,7 +357,7 @@ def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[s
 
 def test_given_outputs_when_opened_then_the_first_word_is_waiting():
     outputs = GpsDriver(GpsSettings("gps", bauds=(9600,))).on_open(now_at(START))
-    assert outputs[0] == EndpointStatus(EndpointPhase.WAITING, "waiting for a receiver at 9600 baud")
+    assert outputs[0] == EndpointStatus(EndpointPhase.WAITING, "waiting for NovAtel receiver")
     assert outputs[1] == Send(b"\r\nunlogall thisport\r\n")
     assert not any(isinstance(each, MeasuredSample) for each in outputs)
 
@@ -400,10 +384,10 @@ STOPPED = make_sentence("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20
 @pytest.mark.parametrize(
     ("data", "expected"),
     [
-        (GSV, ("received GPGSV, GPTXT, which are not used since", "switch GGA or RMC on")),
-        (BARE, ("received GPGGA without checksum since", "switch its checksums on")),
-        (WRONG, ("received GPGGA with a right checksum and a field that cannot be", "compare its sentences")),
-        (STOPPED, ("GPGGA arrive, but their time does not advance", "no new fix for 2 s")),
+        (GSV, ("nmea.unsupported", "are GGA or RMC on")),
+        (BARE, ("rejected.nmea_incomplete", "with checksums")),
+        (WRONG, ("rejected.nmea_field",)),
+        (STOPPED, ("nmea.GPGGA", "does their time advance", "no new fix for 2 s")),
     ],
     ids=["others", "bare", "wrong", "still"],
 )

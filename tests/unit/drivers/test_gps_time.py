@@ -16,7 +16,6 @@ from msdrivers.devices.gps import (
     WEEK,
     count_leap_seconds,
     gps_of,
-    is_in_leap_second,
     resolve_rollover,
     utime_of,
 )
@@ -68,21 +67,6 @@ def test_given_a_time_that_is_ahead_when_unrolled_then_it_stays():
     assert resolve_rollover(NOW + ROLLOVER, NOW) == NOW + ROLLOVER
     assert resolve_rollover(NOW - ROLLOVER, NOW) == NOW
     assert resolve_rollover(NOW - ROLLOVER // 2, NOW) == NOW - ROLLOVER // 2
-
-
-def test_given_the_leap_second_of_2016_when_converted_then_it_is_known_as_ambiguous():
-    after = utc(2017, 1, 1)
-    pivot = utc(2018, 1, 1)
-    week, microseconds = gps_of(after)
-    assert utime_of(week, microseconds, pivot) == after
-    within = microseconds - SECOND // 2
-    assert is_in_leap_second(week, within, pivot)
-    assert utime_of(week, within, pivot) == after + SECOND // 2
-    before = microseconds - SECOND - 1
-    assert not is_in_leap_second(week, before, pivot)
-    assert utime_of(week, before, pivot) == after - 1
-    assert not is_in_leap_second(week, microseconds, pivot)
-    assert not is_in_leap_second(*gps_of(NOW), NOW)
 
 
 @given(st.integers(GPS_EPOCH, NOW + 100 * WEEK))

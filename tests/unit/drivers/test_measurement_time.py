@@ -12,7 +12,7 @@ from support_gx1 import START_UTIME, rotating_samples
 
 from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader
 from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
-from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.emulate.imu import Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import Endpoint, Output, Send

@@ -16,7 +16,7 @@ from modelserver.messages import DriverPhase, VehicleCommand
 from msdrivers.devices.axis import AxisDriver
 from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
 from msdrivers.devices.wheels import WheelsDriver
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HasMaxSilence, HostTime, Output, Reopen, Send
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Reopen, Send
 from msdrivers.links import LinkError
 
 
@@ -73,7 +73,7 @@ def test_given_the_stations_of_devices_then_those_that_may_be_quiet_report_for_h
     rare = GpsDriver(GpsSettings("gps", rate_hz=0.1, silence=20.0))
     axis = AxisDriver(axis_settings(silence=30.0))
     wheels = WheelsDriver(wheels_settings(silence=60.0), raptor_dbc())
-    assert [station.max_silence for station in (rare, axis, wheels) if isinstance(station, HasMaxSilence)] == [
+    assert [station.max_silence for station in (rare, axis, wheels)] == [
         20.0,
         30.0,
         60.0,
@@ -172,11 +172,9 @@ def test_given_a_line_that_is_repeatedly_lost_then_that_is_reported_and_the_log_
     assert bench.runner.reconnects > 60
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) < 20
-    (third, tenth_after, *_) = [each for each in messages if "does another program use it?" in each]
-    assert "; opened and closed 3 times in " in third
-    assert "; opened and closed 12 times in " in tenth_after
+    assert any("it is opened and closed again and again: does another program use it?" in each for each in messages)
     closed = [each.text for each in bench.reports if each.phase is DriverPhase.CLOSED]
-    assert any("opened and closed 50 times" in text for text in closed)
+    assert closed[-1].endswith("does another program use it?")
 
 
 def test_given_a_line_that_is_steady_again_then_its_states_are_logged_again(
@@ -187,9 +185,9 @@ def test_given_a_line_that_is_steady_again_then_its_states_are_logged_again(
     flapping(bench, 0.25)
     bench.until(10.0)
     bench.link.open = opened  # type: ignore[method-assign]
-    assert collect_log(caplog, lambda: bench.until(20.0)) == [("INFO", "imu: streaming: comes")]
+    assert collect_log(caplog, lambda: bench.until(80.0)) == [("INFO", "imu: streaming: comes")]
     bench.link.outages = [(bench.now, bench.now + 0.1)]
-    messages = [text for _, text in collect_log(caplog, lambda: bench.until(30.0))]
+    messages = [text for _, text in collect_log(caplog, lambda: bench.until(90.0))]
     assert len(messages) == 4
     assert messages[0] == "imu: closed: fake: it is away; waiting for its return"
 

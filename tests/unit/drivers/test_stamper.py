@@ -9,8 +9,8 @@ from support_gx1 import Line, stationary_samples
 
 from modelserver.messages import ImuSample, SensorHeader
 from msdrivers.device_clock import DeviceClock, Stamper
-from msdrivers.devices.gx1.driver import Gx1Driver, Gx1Settings
-from msdrivers.emulate.imu import Eeprom, Gx1Emulator
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
+from msdrivers.emulate.imu import TICK_100_HZ, TICK_DEFAULT, Gx1Emulator, make_eeprom
 from msdrivers.endpoint import HostTime, MeasuredSample
 
 UTIME = 1_700_000_000_000_000
@@ -35,7 +35,7 @@ def test_given_a_time_in_steps_then_sigma_has_their_mean_square(tick: float) -> 
 def test_given_an_inertial_unit_then_its_samples_have_its_tick(hundred_hertz: bool, tick: float) -> None:
     line = Line(
         Gx1Driver(Gx1Settings("imu")),
-        Gx1Emulator(stationary_samples(), Eeprom.make_factory(hundred_hertz=hundred_hertz)),
+        Gx1Emulator(stationary_samples(), make_eeprom(timer=TICK_100_HZ if hundred_hertz else TICK_DEFAULT)),
     )
     line.run(2.0)
     assert len(line.samples) > 100

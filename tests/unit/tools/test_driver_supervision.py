@@ -8,7 +8,7 @@ from typing import Any, cast
 from modelserver.messages import DriverPhase
 from modelserver.server.supervision import STALL_TIMEOUT_S, Notifier
 from msdrivers.runner import Runner
-from mstools.commands.driver import DriverSupervision
+from mstools.commands.driver import supervise
 
 
 class Runs:
@@ -22,8 +22,7 @@ class Runs:
         self.datagrams: list[str] = []
         notifier = Notifier(lambda datagram: self.datagrams.append(datagram.decode()), 10**9, lambda: self.now_ns)
         self.attended = 0
-        supervision = DriverSupervision(cast(Runner[Any], self), notifier, lambda: self.now_ns)
-        self.attend = supervision.wrap_callback(self._count)
+        self.attend = supervise(cast(Runner[Any], self), notifier, self._count, lambda: self.now_ns)
 
     def _count(self) -> None:
         self.attended += 1
@@ -69,4 +68,4 @@ def test_given_nobody_to_report_then_only_what_was_to_be_done_is_done() -> None:
     def attend() -> None:
         """Do it."""
 
-    assert DriverSupervision(cast(Runner[Any], None), Notifier(None)).wrap_callback(attend) is attend
+    assert supervise(cast(Runner[Any], None), Notifier(None), attend) is attend

@@ -7,9 +7,9 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
-from itertools import chain, dropwhile
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +19,7 @@ from modelserver.errors import (
     ConfigError,
     ModelServerError,
     Problem,
-    RecordingError,
     find_nearest_names,
-    has_error,
     quote,
 )
 from modelserver.server.log import set_up_logging
@@ -29,15 +27,14 @@ from modelserver.server.supervision import Notifier
 from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
 from mstools.terminal.completion import complete_driver
 from mstools.terminal.options import UrlOption, argument, choose_name, option
-from mstools.terminal.output import escape, print_problems
+from mstools.terminal.output import escape
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.messages import Sample
     from modelserver.transforms.so3 import Vector3
+    from msdrivers.endpoint import TimeSource
     from msdrivers.links import Link
-    from msdrivers.raw_log import TimeSource
-    from msdrivers.registry import DeviceKind
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
 
@@ -53,38 +50,27 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
-    from msdrivers.settings import SourceMap, find_shared_lines, find_unbuildable_drivers, read_drivers
+    from msdrivers.settings import (
+        SourceMap,
+        find_backward_counters,
+        find_shared_lines,
+        find_unbuildable_drivers,
+        find_unknown_joint,
+        find_unknown_wheels,
+        read_drivers,
+    )
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
-    drivers = found.values()
-    unbuildable = find_unbuildable_drivers(drivers, Path(file).parent)
-    return (*problems, *unbuildable, *find_shared_lines(drivers), *find_misnamed(vehicle, drivers, constraints))
-
-
-def find_misnamed(
-    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
-) -> Iterator[Problem]:
-    """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.settings import find_backward_counters, find_unknown_joint, find_unknown_wheels
-
-    wheels = vehicle.sensors.wheels
+    drivers, wheels = found.values(), vehicle.sensors.wheels
+    misnamed: list[Problem] = []
     for driver in drivers:
-        yield from find_backward_counters(driver)
+        misnamed += find_backward_counters(driver)
         # the server does not receive a driver on another channel
         if wheels is not None and driver.channel in ("", wheels.channel):
-            yield from find_unknown_wheels(driver, wheels.frames)
+            misnamed += find_unknown_wheels(driver, wheels.frames)
         if constraints is not None:
-            yield from find_unknown_joint(driver, constraints)
-
-
-def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...] | None:
-    """Return the constraints of a vehicle file's geometry; None if it cannot be read."""
-    from modelserver.formats import examine_file
-
-    try:
-        return examine_file(vehicle.geometry, vehicle.variables).constraints
-    except OSError:
-        return None
+            misnamed += find_unknown_joint(driver, constraints)
+    return (*problems, *find_unbuildable_drivers(drivers, Path(file).parent), *find_shared_lines(drivers), *misnamed)
 
 
 COMMAND_POLL_S = 0.02
@@ -96,11 +82,8 @@ def command(
         str, argument("[NAME]", "Name of the driver in the vehicle file.", autocompletion=complete_driver)
     ] = "",
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
-    list_ports: Annotated[
-        bool, option("--list", "List the ports and the drivers of the vehicle file, then exit.")
-    ] = False,
+    list_ports: Annotated[bool, option("--list", "List the ports, then exit.")] = False,
     record_raw: Annotated[Path | None, option("--record-raw FILE", "Record the bytes of the connection.")] = None,
-    record_limit: Annotated[float, option("--record-limit MB", "Largest size of the recording.", min=0.001)] = 1000.0,
     play_raw: Annotated[Path | None, option("--play-raw FILE", "Read a recording instead of the device.")] = None,
     url: UrlOption = "",
     log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
@@ -122,8 +105,6 @@ def command(
     check_log_options(log_level, log_format)
     if list_ports:
         show_ports()
-        if config is not None:
-            show_drivers(config)
         return
     if config is None:
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
@@ -133,9 +114,8 @@ def command(
     with start.wait_on_error():
         vehicle, settings = load_driver(name, config)
     set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
-    warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
-        link = _make_link(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
+        link = _make_link(stack, settings, record_raw, play_raw)
         run(vehicle, settings, link, config.parent, url, start)
 
 
@@ -168,17 +148,6 @@ def show_plugins() -> None:
         typer.echo(escape(f"{name:<16} measurement of an installed package, not usable: {why}"), err=True)
 
 
-def show_drivers(config: Path) -> None:
-    """Print the drivers of a vehicle file, and their problems as `modelserver check` does."""
-    vehicle, drivers = load_drivers(config)
-    for name, driver in drivers.items():
-        typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
-    problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
-    print_problems(problems)
-    if has_error(problems):
-        raise typer.Exit(1)
-
-
 def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]]:
     """Return a vehicle file and its valid drivers. Raises ConfigError, OSError."""
     from modelserver.config.vehicle_file import load_config, read_config_lines
@@ -189,21 +158,18 @@ def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]
     return vehicle, drivers
 
 
-def load_driver(
-    name: str, config: Path, kinds: Mapping[str, DeviceKind] | None = None
-) -> tuple[VehicleConfig, DriverSettings]:
-    """Return a vehicle file and the settings of one of its drivers; `kinds` default to all device kinds.
+def load_driver(name: str, config: Path) -> tuple[VehicleConfig, DriverSettings]:
+    """Return a vehicle file and the settings of one of its drivers.
 
     Raises ConfigError, OSError, ModelServerError.
     """
     from modelserver.config.vehicle_file import load_config, read_config_lines
-    from msdrivers.registry import KINDS
     from msdrivers.settings import SourceMap, find_empty_sections, read_driver
 
     vehicle = load_config(config)
     place = SourceMap(str(config), read_config_lines(config))
     if name in vehicle.drivers:
-        return vehicle, read_driver(name, vehicle.drivers[name], place, kinds or KINDS)
+        return vehicle, read_driver(name, vehicle.drivers[name], place)
     if problem := find_empty_sections(vehicle.drivers, place).get(name):
         raise ConfigError([problem])
     if not vehicle.drivers:
@@ -214,14 +180,6 @@ def load_driver(
     near = find_nearest_names(name, vehicle.drivers)
     hint = f"did you mean {near[0]}? " if near else ""
     raise typer.BadParameter(f"{quote(name, 40)} is an unknown driver; {hint}{known}", param_hint="NAME")
-
-
-def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
-    """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
-    has_joints = any(hasattr(settings.device_settings, name) for name in ("joint", "joints"))
-    constraints = constraints_of(vehicle) if has_joints else None
-    for problem in find_misnamed(vehicle, [settings], constraints):
-        logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 
 
 def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
@@ -241,27 +199,23 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
 
 
 def _make_link(
-    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
+    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, play: Path | None
 ) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
+    from msdrivers.registry import SerialSettings, TcpSettings
     from msdrivers.runner import SystemTimeSource
-    from msdrivers.settings import make_codec, make_link
+    from msdrivers.settings import make_link
 
-    codec = make_codec(settings)
+    names = settings.name, settings.kind.name
     if play is not None:
-        reader = open_for_reading(play)
-        stack.callback(reader.stream.close)
-        if (reader.kind, reader.device) != (codec.name, settings.kind.name):
-            found = f"{reader.kind} of a {reader.device} (driver {reader.source})"
-            raise RecordingError(f"{play}: recording of {found}, but driver {settings.name} is a {settings.kind.name}")
-        return ReplayLink(reader, codec.unpack, SystemTimeSource())
+        return ReplayLink(stack.enter_context(open_for_reading(play, *names)), str(play), SystemTimeSource())
     link = make_link(settings)
     if record is None:
         return link
-    writer = stack.enter_context(open_for_writing(record, limit))
-    writer.begin(codec.name, settings.name, settings.kind.name)
-    return RecordingLink(link, codec, writer, SystemTimeSource())
+    if not isinstance(settings.line, SerialSettings | TcpSettings):
+        raise typer.BadParameter("only bytes are recorded; a bus by candump or tcpdump", param_hint="--record-raw")
+    return RecordingLink(link, stack.enter_context(open_for_writing(record)), *names, SystemTimeSource())
 
 
 def run(
@@ -283,13 +237,17 @@ def run(
     if kind.command_channel:
         options = replace(options, poll_timeout=COMMAND_POLL_S)
     time_source = SystemTimeSource()
-    publish: Callable[[Sample], object] = publisher.publish_sample
     corrections = None
     if settings.ntrip is not None:
         from msdrivers.corrections import CorrectionsClient
 
         corrections = CorrectionsClient(settings.ntrip, settings.name)
-        publish = corrections.wrap_publish(publish)
+
+    def publish(sample: Sample) -> None:
+        if corrections is not None:
+            corrections.note_place(sample)
+        publisher.publish_sample(sample)
+
     runner = Runner(station, link, options, time_source, publish, publisher.publish_health)
     attend: Callable[[], object] = lambda: None  # noqa: E731
     if kind.command_channel:
@@ -300,7 +258,7 @@ def run(
     stop_on_signal(runner)
     notifier = Notifier.from_environment()
     try:
-        runner.run(DriverSupervision(runner, notifier).wrap_callback(attend))
+        runner.run(supervise(runner, notifier, attend))
     finally:
         notifier.notify_stopping()
         if corrections is not None:
@@ -368,46 +326,39 @@ READY_PASSES = 2
 """A driver is ready after one complete pass: it has tried its connection and published its health."""
 
 
-class DriverSupervision:
-    """Notify systemd of one runner.
+def supervise(
+    runner: Runner[Any],
+    notifier: Notifier,
+    attend: Callable[[], object],
+    monotonic_ns: Callable[[], int] = time.monotonic_ns,
+) -> Callable[[], object]:
+    """Return the callback before each pass of a runner: `attend`, then the due notifications of systemd.
 
     A missing device does not stop readiness or watchdog: the driver waits for it and reports that. A pass that hangs
     and a driver with nothing but errors do.
     """
+    if not notifier.is_active:
+        return attend
+    from modelserver.server.supervision import StallDetector
 
-    def __init__(self, runner: Runner[Any], notifier: Notifier, monotonic_ns: Callable[[], int] = time.monotonic_ns):
-        from modelserver.server.supervision import StallDetector
+    progress, passes = StallDetector(), count(1)
 
-        self._runner, self._notifier, self._monotonic_ns = runner, notifier, monotonic_ns
-        self._progress = StallDetector()
-        self._passes = 0
-
-    def wrap_callback(self, attend: Callable[[], object]) -> Callable[[], object]:
-        """Return the callback before each pass: `attend`, then the due notifications."""
-        if not self._notifier.is_active:
-            return attend
-
-        def on_pass() -> None:
-            attend()
-            self._notify()
-
-        return on_pass
-
-    def _notify(self) -> None:
-        self._passes += 1
-        if not self._notifier.is_ready:
-            if self._passes >= READY_PASSES:
-                self._notifier.notify_ready(self._format_status())
-            return
-        self._notifier.update_status(self._format_status)
-        runner = self._runner
-        failures = sum(count for name, count in runner.counts.items() if name.startswith("errors."))
-        if self._progress.is_progressing(runner.samples, failures, self._monotonic_ns()):
-            self._notifier.ping_watchdog()
-
-    def _format_status(self) -> str:
-        phase, text = self._runner.state
+    def format_status() -> str:
+        phase, text = runner.state
         return f"{phase.name.lower()}: {text}" if text else phase.name.lower()
+
+    def on_pass() -> None:
+        attend()
+        if not notifier.is_ready:
+            if next(passes) >= READY_PASSES:
+                notifier.notify_ready(format_status())
+            return
+        notifier.update_status(format_status)
+        failures = sum(number for name, number in runner.counts.items() if name.startswith("errors."))
+        if progress.is_progressing(runner.samples, failures, monotonic_ns()):
+            notifier.ping_watchdog()
+
+    return on_pass
 
 
 log = logging.getLogger(__name__)
@@ -424,12 +375,11 @@ GPS_HZ = 4.0
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """What to measure: an LCM log, or without one a simulated drive of `seconds`.
+    """The simulated drive of `seconds` that a device measures.
 
     start: its start, microseconds of UTC; None: now. own_field: hard iron, tesla along the sensor's axes.
     """
 
-    log: Path | None
     start: int | None
     seconds: float
     scenario: str
@@ -437,85 +387,27 @@ class DriveOptions:
     own_field: Vector3
 
 
-def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
+def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
     """Return the samples that the emulator of a driver's device measures; their end is logged.
 
-    Raises ModelServerError if there are none: a log without the channel, a drive that is already over.
-    """
-    kind, now = settings.kind, time.time_ns() // 1000
-    start = now + START_DELAY_US if wanted.start is None else wanted.start
-    if wanted.log is not None:
-        samples, what = read_logged(wanted.log, vehicle, settings, start), str(wanted.log)
-    elif not kind.follows_samples or (wanted.start is None and kind.command_channel):
-        # without a drive it follows its commands
-        return iter(())
-    else:
-        if start + round(wanted.seconds * 1e6) < now:
-            ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
-            raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
-        samples, what = simulate(vehicle, settings, start, wanted), "the simulated drive"
-    if wanted.start is not None or wanted.log is None:
-        # samples before now are skipped, also those of the time that making the drive took
-        now = time.time_ns() // 1000
-        samples = dropwhile(lambda sample: sample.header.utime < now, samples)
-    if wanted.log is not None:
-        # an error now, not after the driver has connected
-        first = next(samples, None)
-        if first is None:
-            raise ModelServerError(f"--start {wanted.start} is so long ago that {what} is over: no samples are left")
-        samples = chain((first,), samples)
-    return log_end(samples, settings.name, what)
-
-
-def log_end(samples: Iterator[Sample], name: str, what: str) -> Iterator[Sample]:
-    """Yield samples, and log a warning at their end: the emulator continues without measurements."""
-    yield from samples
-    log.warning("%s: %s is over, there are no more measurements", name, what)
-
-
-def read_logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[Sample]:
-    """Yield the samples of a driver's channel in a log, with stamps shifted so that the first is at `start_utime`.
-
-    Raises ModelServerError if there are none.
-    """
-    from modelserver.wire.channels import BY_NAME
-    from modelserver.wire.codec import decode
-    from modelserver.wire.eventlog import LogFile
-    from msdrivers.registry import CHANNELS
-
-    kind = settings.kind.sample
-    channel = f"{vehicle.lcm.channel_prefix}{channels_of(vehicle, settings).get(kind) or CHANNELS[kind]}"
-    shift = None
-    with LogFile(file) as events:
-        for event in events:
-            if event.channel == channel:
-                sample: Sample = decode(BY_NAME[CHANNELS[kind]].type_name, event.data)
-                header = sample.header
-                shift = start_utime - header.utime if shift is None else shift
-                host = header.host_utime + shift if header.host_utime else 0
-                yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
-    if shift is None:
-        raise ModelServerError(f"{file} has no messages on {channel}; expected the driver's channel")
-
-
-def simulate(
-    vehicle: VehicleConfig, settings: DriverSettings, start_utime: int, wanted: DriveOptions
-) -> Iterator[Sample]:
-    """Return the samples of a driver's sensor on a simulated drive from `start_utime` on.
-
     A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
-    wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a sensor without a
-    section in the vehicle file.
+    wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a drive that is already
+    over, and a sensor without a section in the vehicle file.
     """
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
     from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
     from mstools.launch.drive import WHEELS_HZ, make_simulation
 
+    now = time.time_ns() // 1000
+    start = now + START_DELAY_US if wanted.start is None else wanted.start
     sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
     sensors, kind = vehicle.sensors, settings.kind.sample
-    if kind not in sections:
-        # it follows its commands
-        return iter(())
+    follows_commands = not settings.kind.follows_samples or (wanted.start is None and settings.kind.command_channel)
+    if follows_commands or kind not in sections:
+        return
+    if start + round(wanted.seconds * 1e6) < now:
+        ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
+        raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
     if getattr(sensors, sections[kind]) is None:
         raise ModelServerError(
             f"the vehicle file has no section sensors.{sections[kind]}, which has the sensor's frame"
@@ -525,7 +417,7 @@ def simulate(
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
     run = make_simulation(
         vehicle,
-        start_utime,
+        start,
         wanted.seconds,
         wanted.scenario,
         wanted.seed,
@@ -534,7 +426,12 @@ def simulate(
         imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=wanted.own_field)),
         wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
-    return (sample for sample in run.events(wanted.seconds) if isinstance(sample, kind))
+    # samples before now are skipped, also those of the time that making the drive took
+    now = time.time_ns() // 1000
+    for sample in run.events(wanted.seconds):
+        if isinstance(sample, kind) and sample.header.utime >= now:
+            yield sample
+    log.warning("%s: the simulated drive is over, there are no more measurements", settings.name)
 
 
 SCENARIOS = ("eight", "circle", "stand", "straight", "city")
@@ -547,7 +444,6 @@ def emulate(
     link: Annotated[Path | None, option("--link PATH", "With --pty: create a symbolic link to it here.")] = None,
     tcp: Annotated[int | None, option("--tcp PORT", "Listen on loopback; 0: any port.", min=0, max=65535)] = None,
     can: Annotated[str, option("--can CHANNEL", "Connect to a CAN bus.")] = "",
-    log: Annotated[Path | None, option("--from LOG", "Replay the samples of an LCM log.")] = None,
     scenario: Annotated[str, option("--scenario NAME", f"The simulated drive: {', '.join(SCENARIOS)}.")] = SCENARIOS[0],
     faults: Annotated[
         list[str] | None,
@@ -566,7 +462,7 @@ def emulate(
         ),
     ] = None,
 ) -> None:
-    """Emulate a device: answer its driver, and measure a simulated drive or replay a log.
+    """Emulate a device: answer its driver, and measure a simulated drive.
 
     Prints the line to put into the vehicle file, and speaks until SIGTERM, Ctrl-C or --seconds.
 
@@ -574,7 +470,7 @@ def emulate(
     Examples:
       modelserver emulate gps -c config/raptor/vehicle.yaml --pty --link /tmp/gps
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
-      modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
+      modelserver emulate wheels -c vehicle.yaml --can vcan0 --scenario city
     """
     from msdrivers.emulate import parse_fault
 
@@ -588,14 +484,10 @@ def emulate(
         wanted = tuple(parse_fault(text, settings.kind.faults) for text in faults or ())
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--fault") from None
-    if log is not None and not settings.kind.follows_samples:
-        raise typer.BadParameter(
-            f"device {settings.kind.name} follows its commands and cannot replay a log", param_hint="--from"
-        )
     own_field = _parse_field(iron)
     line = _make_device_link(settings, link, tcp, can)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
+    samples = simulate(vehicle, settings, DriveOptions(start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_emulator

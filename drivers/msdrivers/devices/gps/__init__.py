@@ -40,17 +40,10 @@ def utime_of(week: int, microseconds: int, pivot: int) -> int:
     """Return the utime of a GPS week (rolled over or not) and microseconds into it.
 
     pivot: the host's date as utime, see `resolve_rollover`. Within an inserted leap second, which utime cannot
-    distinguish from the second after it, the result is that of the second after it; see `is_in_leap_second`.
+    distinguish from the second after it, the result is that of the second after it.
     """
-    gps = _to_gps(week, microseconds, pivot)
+    gps = resolve_rollover(week * WEEK + microseconds, pivot - GPS_EPOCH)
     return gps + GPS_EPOCH - bisect_right(_LEAP_GPS, gps) * SECOND
-
-
-def is_in_leap_second(week: int, microseconds: int, pivot: int) -> bool:
-    """Return whether the instant lies in an inserted second, 23:59:60, whose utime is ambiguous."""
-    gps = _to_gps(week, microseconds, pivot)
-    following = bisect_right(_LEAP_GPS, gps)
-    return following < len(_LEAP_GPS) and gps >= _LEAP_GPS[following] - SECOND
 
 
 def gps_of(utime: int) -> tuple[int, int]:
@@ -67,10 +60,6 @@ def resolve_rollover(utime: int, pivot: int) -> int:
     if utime >= pivot - ROLLOVER // 2:
         return utime
     return utime + -(-(pivot - ROLLOVER // 2 - utime) // ROLLOVER) * ROLLOVER
-
-
-def _to_gps(week: int, microseconds: int, pivot: int) -> int:
-    return resolve_rollover(week * WEEK + microseconds, pivot - GPS_EPOCH)
 
 
 def course_from_track(track: float) -> float:

@@ -1,7 +1,7 @@
 """Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
 
 Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
-(`FixAssembler`); NMEA epochs are used only while the position log is missing. Missing values stay nan.
+(`FixAssembler`), or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
 
 A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
@@ -11,7 +11,6 @@ read.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,16 +19,16 @@ from typing import Any, TypeAlias
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
 from modelserver.transforms.so3 import Vector3
+from msdrivers.devices import check_ranges
 from msdrivers.devices.gps import (
     DAY,
     WEEK,
     course_from_track,
-    is_in_leap_second,
     resolve_rollover,
     to_covariance,
     utime_of,
 )
-from msdrivers.devices.gps.nmea import POSITION_KINDS, EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
+from msdrivers.devices.gps.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
 from msdrivers.devices.gps.novatel import (
     AsciiFormat,
     BinaryFormat,
@@ -47,112 +46,74 @@ from msdrivers.devices.gps.novatel import (
     Velocity,
 )
 from msdrivers.devices.stream import (
-    EXAMINED_BYTES,
     SECOND_NS,
+    ByteSettings,
     FrameScanner,
     Script,
     SetupStep,
     StreamDriver,
-    StreamSettings,
-    recognize,
+    check_silence,
 )
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 PROTOCOLS = ("novatel", "nmea")
-FORMATS = ("binary", "ascii")
-POSITION_LOGS = ("BESTPOS", "RTKPOS", "PSRPOS")
 HEADING_LOGS = ("", "HEADING", "HEADING2")
+POSITION_LOG = "BESTPOS"
+
+HOLD_NS = SECOND_NS // 10
+"""How long a position waits for the velocity of its instant: logs of one instant follow each other at once, and
+BESTVEL takes 0.1 s at 9600 baud."""
+
+GAP_NS = SECOND_NS // 25
+"""Pause of the line after which the sentences of an instant are complete: receivers send those of one instant without
+pauses, and USB adapters hold bytes up to 16 ms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GpsSettings(StreamSettings):
-    """Settings of the receiver. Seconds; raises ValueError with the key for an invalid value.
-
-    protocol: "novatel" configures the receiver by commands; "nmea" only sends `commands` and reads.
-    rate_hz: of the logs that a NovAtel receiver is asked for, 0.1 to 20. log_format: "binary" or "ascii".
-    position_log: source of the position; NMEA positions are used only while it is missing.
-    heading_log: of a dual-antenna receiver, empty for none. device_port: the receiver's port, as its commands name it.
-    commands: lines sent before the logs are asked for, e.g. "fix none"; with "nmea" they are not acknowledged.
-    bauds: the rates to try; the line is opened at the first. Empty: the line has none, or one that is right.
-    silence: timeout for fixes, after which the setup is repeated.
-    answer_timeout: for the response to a command, which is sent `attempts` times.
-    hold: how long a position waits for the velocity of its instant. gap: pause of the line after which the sentences of
-    an instant are complete.
-    delay: shortest time from a fix to the first byte of its log, mostly the receiver's processing; it cannot be
-    distinguished from the offset of the clocks. delay_sigma: its standard deviation.
-    restore_on_exit: stop the logs that were asked for when the driver leaves.
-    """
+class GpsSettings(ByteSettings):
+    """Settings of the receiver. Raises ValueError with the key for an invalid value."""
 
     protocol: str = "novatel"
+    """`novatel` configures the receiver by commands; `nmea` only sends `commands` and reads."""
     rate_hz: float = 4.0
-    log_format: str = "binary"
-    position_log: str = "BESTPOS"
+    """Of the logs that a NovAtel receiver is asked for, 0.1 to 20."""
     heading_log: str = ""
-    device_port: str = "thisport"
+    """`HEADING` or `HEADING2` of a dual-antenna receiver, empty for none."""
     commands: tuple[str, ...] = ()
+    """Lines sent before the logs are asked for, e.g. "fix none"; with `nmea` they are not acknowledged."""
     bauds: tuple[int, ...] = ()
+    """The rates to try; the line is opened at the first. Empty: the line has none, or one that is right."""
     silence: float = 2.0
-    answer_timeout: float = 1.0
-    hold: float = 0.1
-    gap: float = 0.04
-    restore_on_exit: bool = True
-    delay: float = 0.0
+    """Timeout for fixes, seconds, after which the setup is repeated."""
     delay_sigma: float = 0.02
+    """Standard deviation of `delay`, seconds."""
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("protocol", self.protocol, PROTOCOLS),
-            ("log_format", self.log_format, FORMATS),
-            ("position_log", self.position_log, POSITION_LOGS),
-            ("heading_log", self.heading_log, HEADING_LOGS),
-        ):
-            if value not in known:
-                raise ValueError(f"{name}: must be one of {', '.join(filter(None, known))}, got '{value}'")
-        if not 0.1 <= self.rate_hz <= 20.0:
-            raise ValueError(f"rate_hz: must be 0.1 to 20 Hz, got {self.rate_hz:g}")
-        if any(baud <= 0 for baud in self.bauds):
-            raise ValueError(f"bauds: must be above 0, got {self.bauds}")
-        if self.attempts < 1:
-            raise ValueError(f"attempts: must be at least 1, got {self.attempts}")
+        ByteSettings.__post_init__(self)
+        for name, known in (("protocol", PROTOCOLS), ("heading_log", HEADING_LOGS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} is one of {', '.join(filter(None, known))}, got '{getattr(self, name)}'")
+        check_ranges(self, rate_hz=(0.1, 20.0))
         for command in self.commands:
             if not command.strip() or not command.isprintable() or not command.isascii():
                 raise ValueError(f"commands: {command!r} is no line of text")
-        for name, seconds, least in (
-            ("silence", self.silence, 0.1),
-            ("answer_timeout", self.answer_timeout, 0.05),
-            ("hold", self.hold, 0.0),
-            ("gap", self.gap, 0.001),
-            ("delay", self.delay, 0.0),
-            ("delay_sigma", self.delay_sigma, 0.0),
-        ):
-            if not least <= seconds <= 3600.0:
-                raise ValueError(f"{name}: must be {least:g} to 3600 s, got {seconds:g}")
-        if self.silence < 1.5 / self.rate_hz:
-            raise ValueError(
-                f"silence: {self.silence:g} s is less than one and a half periods at {self.rate_hz:g} Hz; make it "
-                f"{2.0 / self.rate_hz:g} s or more"
-            )
+        check_silence(self.silence, self.rate_hz)
 
     @property
     def logs(self) -> tuple[str, ...]:
         """The names of the logs that a NovAtel receiver is asked for."""
-        if self.protocol != "novatel":
-            return ()
-        return (self.position_log, "BESTVEL", *((self.heading_log,) if self.heading_log else ()))
+        return (POSITION_LOG, "BESTVEL", *filter(None, [self.heading_log])) if self.protocol == "novatel" else ()
 
     def make_setup_commands(self) -> tuple[str, ...]:
         """Return the commands that set the receiver up, in order."""
         if self.protocol != "novatel":
             return self.commands
-        wanted = (f"log {self.device_port} {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._list_log_names())
-        return (f"unlogall {self.device_port}", *self.commands, *wanted)
+        wanted = (f"log thisport {log.lower()}b ontime {1.0 / self.rate_hz:.6g}" for log in self.logs)
+        return ("unlogall thisport", *self.commands, *wanted)
 
     def make_undo_commands(self) -> tuple[str, ...]:
         """Return the commands that stop the logs again."""
-        return tuple(f"unlog {self.device_port} {log}" for log in self._list_log_names())
-
-    def _list_log_names(self) -> tuple[str, ...]:
-        return tuple(log.lower() + ("b" if self.log_format == "binary" else "a") for log in self.logs)
+        return tuple(f"unlog thisport {log.lower()}b" for log in self.logs)
 
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
@@ -276,11 +237,10 @@ WGS84_DATUM = 61
 @dataclass(frozen=True, slots=True)
 class GpsFix:
     """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
-    than that. origin: name of the log, or NMEA."""
+    than that."""
 
     host_utime: int
     device_utime: int
-    origin: str
     solution: NmeaEpoch | Position
     velocity: Velocity | None = None
     heading: HeadingLog | None = None
@@ -298,18 +258,15 @@ class FixAssembler:
     logs: the names of the position log and of what belongs to it; empty for NMEA only.
     """
 
-    def __init__(self, logs: Sequence[str], hold_ns: int, silence_ns: int) -> None:
-        self._logs, self._hold_ns, self._silence_ns = tuple(logs), hold_ns, silence_ns
+    def __init__(self, logs: Sequence[str]) -> None:
+        self._logs = tuple(logs)
         self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
         self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
         self._last_log: tuple[int, int] | None = None
-        self._last_log_ns: int | None = None
         self._last_epoch: tuple[int, int | None] | None = None
         self._last_solution = -1
-        self._problems: list[str] = []
-        self._reported: set[str] = set()
         self.counts: Counter[str] = Counter()
-        """`repeated`: duplicate instants. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
+        """`repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
         positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
         `unknown_type`: fixes published as none for their type."""
 
@@ -317,16 +274,6 @@ class FixAssembler:
         """Discard pending data: the line was closed, or the receiver has restarted."""
         self._parts.clear()
         self._waiting = None
-        self._last_log_ns = None
-
-    def pop_problems(self) -> list[str]:
-        found, self._problems = self._problems, []
-        return found
-
-    def _add_problem(self, text: str) -> None:
-        if text not in self._reported:
-            self._reported.add(text)
-            self._problems.append(text)
 
     def get_deadline(self) -> int | None:
         return self._waiting[2] if self._waiting else None
@@ -337,7 +284,7 @@ class FixAssembler:
 
     def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
         """Process an NMEA epoch whose first byte was received at `host_utime`."""
-        if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
+        if self._logs:
             self.counts["superseded"] += 1
             return []
         instant = (epoch.utime, epoch.time_of_day)
@@ -345,7 +292,7 @@ class FixAssembler:
             self.counts["repeated"] += 1
             return []
         self._last_epoch = instant
-        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), "NMEA", epoch)]
+        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), epoch)]
 
     def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
         """Process a log whose first byte was received at `host_utime`."""
@@ -353,9 +300,6 @@ class FixAssembler:
             return []
         if log.header.is_secondary:
             self.counts["rejected.secondary_antenna"] += 1
-            self._add_problem(
-                f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
-            )
             return []
         instant = (log.header.week, log.header.milliseconds)
         if not isinstance(log.body, Position):
@@ -369,18 +313,14 @@ class FixAssembler:
         self._last_solution = solution
         if log.body.datum != WGS84_DATUM:
             self.counts["rejected.datum"] += 1
-            self._add_problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
             return []
         if log.body.type not in PositionType.__members__.values():
             self.counts["unknown_type"] += 1
-            self._add_problem(
-                "the receiver names a position type that is not known here: its fixes are published as none"
-            )
         fixes = self._release()
-        self._last_log, self._last_log_ns = instant, now.monotonic_ns
+        self._last_log = instant
         device = get_log_utime(log.header, now.utime)
-        fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
-        self._waiting = (fix, instant, now.monotonic_ns + self._hold_ns)
+        fix = GpsFix(host_utime, device, log.body, delay=max(0.0, log.body.solution_age))
+        self._waiting = (fix, instant, now.monotonic_ns + HOLD_NS)
         return fixes + self._release_if_complete(instant)
 
     def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
@@ -402,15 +342,12 @@ class FixAssembler:
 
 
 def get_log_utime(header: LogHeader, pivot: int) -> int:
-    """Return the utime of a log; 0 if the receiver's time is not usable or within a leap second."""
-    microseconds = header.milliseconds * 1000
-    if header.time_status not in USABLE_TIME or is_in_leap_second(header.week, microseconds, pivot):
-        return 0
-    return utime_of(header.week, microseconds, pivot)
+    """Return the utime of a log; 0 if the receiver's time is not usable."""
+    return utime_of(header.week, header.milliseconds * 1000, pivot) if header.time_status in USABLE_TIME else 0
 
 
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
-    if epoch.time_of_day is None or epoch.is_leap_second:
+    if epoch.time_of_day is None:
         return 0
     if epoch.utime:
         return resolve_rollover(epoch.utime, pivot)
@@ -419,91 +356,15 @@ def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
     return max(0, days * DAY + epoch.time_of_day)
 
 
-QUOTED_BYTES = 24
-"""Quoted bytes of the beginning."""
-
-MAX_NAMES = 6
-MIN_FLAWED_SENTENCES = 2
-"""Fewer flawed sentences may be chance."""
-_ADDRESS = re.compile(rb"\$([A-Z]{2}[A-Z]{3}|P[A-Z]{3,5}),")
-_FLAWS = {
-    "rejected.nmea_incomplete": "without checksum",
-    "rejected.nmea_field": "with a right checksum and a field that cannot be",
+_PROBLEMS = {
+    "rejected.secondary_antenna": "logs of the secondary antenna, such as BESTPOSB_1, are not used",
+    "rejected.datum": 'positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`',
+    "unknown_type": "the receiver names a position type that is not known here: its fixes are published as none",
 }
-_REMEDIES = {
-    _FLAWS["rejected.nmea_incomplete"]: "switch its checksums on",
-    _FLAWS["rejected.nmea_field"]: "compare its sentences with NMEA 0183, it writes them otherwise",
-}
+"""What is reported once, by the counter of the fixes."""
 
-
-class LineMonitor:
-    """Records the first bytes, the amount of data and the sentence names since the last `reset`."""
-
-    def __init__(self) -> None:
-        self.reset({})
-
-    def reset(self, counts: Mapping[str, int]) -> None:
-        """Start over; `counts` are the parser's present counters."""
-        self._bytes_received, self._first_bytes = 0, b""
-        self._names: set[str] = set()
-        self._counts_at_reset = dict(counts)
-
-    def add(self, data: bytes) -> None:
-        self._bytes_received += len(data)
-        if len(self._first_bytes) < EXAMINED_BYTES:
-            self._first_bytes = (self._first_bytes + data)[:EXAMINED_BYTES]
-        if len(self._names) < MAX_NAMES:
-            self._names.update(each.decode("ascii") for each in _ADDRESS.findall(data)[:MAX_NAMES])
-
-    def list_valid_kinds(self, counts: Mapping[str, int]) -> list[str]:
-        """Return the kinds of valid frames since the reset, e.g. "nmea.GPRMC"."""
-        return [
-            kind
-            for kind, number in counts.items()
-            if kind.startswith(("nmea.", "novatel.")) and number > self._counts_at_reset.get(kind, 0)
-        ]
-
-    def find_flaw(self, counts: Mapping[str, int]) -> str:
-        """Describe a flaw common to complete sentences (the baud rate is right then); empty if there is none."""
-        if not self._names or self.list_valid_kinds(counts):
-            return ""
-        for reason, words in _FLAWS.items():
-            if counts.get(reason, 0) - self._counts_at_reset.get(reason, 0) >= MIN_FLAWED_SENTENCES:
-                return words
-        return ""
-
-    def explain_missing_fix(self, counts: Mapping[str, int], seconds: float) -> str:
-        """Explain a missing fix on a line with NMEA sentences, with a remedy."""
-        placed = [kind for kind in self.list_valid_kinds(counts) if kind[-3:] in POSITION_KINDS]
-        if placed:
-            kinds = ", ".join(kind.partition(".")[2] for kind in placed)
-            return f"{kinds} arrive, but their time does not advance: no new fix for {seconds:g} s; check the receiver"
-        text = f"no GGA or RMC for {seconds:g} s, received {self.describe(counts)} since"
-        if self.list_valid_kinds(counts):
-            return f"{text}; switch GGA or RMC on in the receiver"
-        flaw = self.find_flaw(counts)
-        return f"{text}; {_REMEDIES[flaw]}" if flaw else text
-
-    def describe(self, counts: Mapping[str, int]) -> str:
-        if not self._bytes_received:
-            return "nothing"
-        kinds, names = self.list_valid_kinds(counts), ", ".join(sorted(self._names))
-        if kinds == ["nmea.unsupported"] and names:
-            return f"{names}, which are not used"
-        if flaw := self.find_flaw(counts):
-            return f"{names} {flaw}"
-        if kinds:
-            return f"{', '.join(kind.partition('.')[2] for kind in kinds[:6])}{' and more' if len(kinds) > 6 else ''}"
-        rejected = sum(
-            number - self._counts_at_reset.get(kind, 0)
-            for kind, number in counts.items()
-            if kind.startswith("rejected.")
-        )
-        if (protocol := recognize(self._first_bytes)) is not None:
-            return f"{protocol.name}: write device: {protocol.device}"
-        broken = f" ({rejected} damaged ones)" if rejected else ""
-        text = f"{self._bytes_received} bytes that are neither NovAtel logs nor NMEA sentences"
-        return f"{text}{broken}, beginning {self._first_bytes[:QUOTED_BYTES]!r}"
+_EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_field")
+"""Counters by which the baud rate is right."""
 
 
 class GpsDriver(StreamDriver[GpsMessage]):
@@ -512,6 +373,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
     Further counts: what was left out and why, `restarts`.
     """
 
+    answer_timeout = 1.0
     _settings: GpsSettings
     _stream: GpsStream
 
@@ -520,9 +382,11 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self._is_novatel = settings.protocol == "novatel"
         self.device = settings.protocol
         self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
-        self.awaited = settings.position_log
-        self._fixes = FixAssembler(settings.logs, round(settings.hold * SECOND_NS), round(settings.silence * SECOND_NS))
-        self._monitor = LineMonitor()
+        self.awaited = POSITION_LOG if self._is_novatel else "NMEA"
+        self._fixes = FixAssembler(settings.logs)
+        self._counts_before: Mapping[str, int] = {}
+        """Those of the stream at the last fix or search."""
+        self._seen_problems: set[str] = set()
         self._last_byte_ns: int | None = None
         self._answered_ns: int | None = None
 
@@ -537,22 +401,16 @@ class GpsDriver(StreamDriver[GpsMessage]):
     def _on_start(self) -> None:
         self._fixes.clear()
         self._last_byte_ns = None
-        self._monitor.reset(self._stream.counts)
-
-    def _describe_wait(self) -> str:
-        bauds = self._settings.bauds
-        return "waiting for a receiver" + (f" at {bauds[self._baud_index]} baud" if bauds else "")
+        self._counts_before = self._stream.counts
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        self._monitor.add(unit)
         self._last_byte_ns = now.monotonic_ns
         return super().on_receive(unit, now)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Stop the requested logs if the settings demand it."""
+        """Stop the requested logs."""
         self._setup.stop()
-        commands = self._settings.make_undo_commands() if self._settings.restore_on_exit else ()
-        return [Send(_encode_command(each)) for each in commands]
+        return [Send(_encode_command(each)) for each in self._settings.make_undo_commands()]
 
     def _get_extra_deadline(self) -> int | None:
         return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)
@@ -567,7 +425,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
 
     @property
     def _gap_ns(self) -> int | None:
-        return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * SECOND_NS)
+        return None if self._last_byte_ns is None else self._last_byte_ns + GAP_NS
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
@@ -582,14 +440,12 @@ class GpsDriver(StreamDriver[GpsMessage]):
     def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         for fix in fixes:
-            self._monitor.reset(self._stream.counts)
-            if self._phase is EndpointPhase.STREAMING and fix.origin != self.awaited:
-                out += self._set_status(EndpointPhase.STREAMING, f"receiving {fix.origin}")
-            self.awaited = fix.origin
+            self._counts_before = self._stream.counts
             header = self._make_header(fix.host_utime, fix.device_utime)
             out += self._publish(fix.to_sample(header), now, delay=fix.delay)
-        for problem in self._fixes.pop_problems():
-            out += self._set_status(self._phase, problem)
+        for name in [each for each in _PROBLEMS if self._fixes.counts[each] and each not in self._seen_problems]:
+            self._seen_problems.add(name)
+            out += self._set_status(self._phase, _PROBLEMS[name])
         return out
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
@@ -598,12 +454,12 @@ class GpsDriver(StreamDriver[GpsMessage]):
             commands = self._settings.make_setup_commands()[1:]
             steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
             return self._on_identity("a NovAtel receiver", steps, now)
-        fix = "check the settings `commands`, `device_port` and the logs"
+        fix = "check the settings `commands` and the logs"
         return self._on_acknowledgement(now, f"{answer.error}; {fix}" if answer.error else "")
 
     def _on_prompt(self, prompt: Prompt, now: HostTime) -> list[Output[bytes]]:
         """Set up again after a restart: a prompt that belongs to no response."""
-        answered_ns, timeout_ns = self._answered_ns, round(self._settings.answer_timeout * SECOND_NS)
+        answered_ns, timeout_ns = self._answered_ns, round(self.answer_timeout * SECOND_NS)
         is_expected = answered_ns is not None and now.monotonic_ns - answered_ns < timeout_ns
         if not self._is_novatel or self._setup.is_running or is_expected:
             return []
@@ -617,47 +473,31 @@ class GpsDriver(StreamDriver[GpsMessage]):
         if self._is_novatel:
             yield from super()._run_setup()
             return
+        self._first_bytes = b""
         for command in self._settings.commands:
             yield Send(_encode_command(command))
         self._restart_silence_timer()
 
     def _on_silence(self, now: HostTime) -> list[Output[bytes]]:
         """Repeat the setup if data arrives (a restart loses the logs), else try the next baud rate."""
-        counts, monitor, seconds = self._stream.counts, self._monitor, self._settings.silence
-        is_streaming = self._phase is EndpointPhase.STREAMING
-        if not (is_streaming or monitor.list_valid_kinds(counts) or monitor.find_flaw(counts)):
+        before, self._counts_before = self._counts_before, self._stream.counts
+        # a single flawed sentence may be chance
+        seen = [
+            f"{number} {name}"
+            for name, count in self._counts_before.items()
+            if name.startswith(_EVIDENCE) and (number := count - before.get(name, 0)) > name.startswith("rejected")
+        ]
+        if self._phase is not EndpointPhase.STREAMING and not seen:
             return self._setup.start(self._run_search(), now)
+        what, fix = "new fix", "are GGA or RMC on, with checksums, and does their time advance?"
         if self._is_novatel:
-            received = f"received {monitor.describe(counts)} since"
-            text = f"no {self._settings.position_log} for {seconds:g} s, {received}, setting the receiver up again"
-        else:
-            text = monitor.explain_missing_fix(counts, seconds)
-        monitor.reset(counts)
+            what, fix = POSITION_LOG, "setting the receiver up again"
+        text = f"no {what} for {self._settings.silence:g} s, received {', '.join(seen) or 'nothing'}; {fix}"
         return [*self._set_status(EndpointPhase.SILENT, text), *self._setup.start(self._run_setup(), now)]
 
     def _run_search(self) -> Script:
         yield from self._try_next_baud()
         yield from self._run_setup()
-
-    def _describe_input(self) -> str:
-        received = self._monitor.describe(self._stream.counts)
-        self._monitor.reset(self._stream.counts)
-        return f"received {received}"
-
-    def _explain_absence(self) -> str:
-        tried = self._tried
-        if all("received nothing" in each for each in tried):
-            advice = "check the receiver's power, the cable, and that the port is the right one"
-        elif any("write device: " in each for each in tried):
-            advice = "another device is on this port"
-        elif all("bytes that are neither" in each or "received nothing" in each for each in tried):
-            advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
-        else:
-            advice = (
-                "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
-                "(else set protocol: nmea), and `device_port`"
-            )
-        return f"no {self.description} on this line: {'; '.join(tried)}; {advice}"
 
 
 def _encode_command(command: str) -> bytes:

@@ -3,7 +3,7 @@
 Contents have the names of the manuals. Numbers that are not in these tables, of newer receivers, stay plain numbers.
 
 Bodies are little-endian and packed in binary; ASCII has comma-separated fields, names for enumerations and quoted
-strings: one table of columns for both, read and written.
+strings: one table of columns for both. Logs are asked for in binary; ASCII is only read.
 
 Frames of logs end with CRC-32: the reflected polynomial 0xEDB88320, starting from 0, without final inversion. Responses
 and prompts have no checksum.
@@ -43,22 +43,10 @@ class TimeStatus(IntEnum):
 
 
 class SolutionStatus(IntEnum):
-    """Whether a solution was computed, or why not."""
+    """Whether a solution was computed. The other reasons why not are plain numbers."""
 
     SOL_COMPUTED = 0
     INSUFFICIENT_OBS = 1
-    NO_CONVERGENCE = 2
-    SINGULARITY = 3
-    COV_TRACE = 4
-    TEST_DIST = 5
-    COLD_START = 6
-    V_H_LIMIT = 7
-    VARIANCE = 8
-    RESIDUALS = 9
-    INTEGRITY_WARNING = 13
-    PENDING = 18
-    INVALID_FIX = 19
-    UNAUTHORIZED = 20
 
 
 class PositionType(IntEnum):
@@ -167,28 +155,6 @@ class Velocity(NamedTuple):
     vertical: float
 
 
-class UtmPosition(NamedTuple):
-    """Body of BESTUTM. Meters; zone by number and letter; otherwise as `Position`."""
-
-    status: int
-    type: int
-    zone: int
-    letter: str
-    northing: float
-    easting: float
-    height: float
-    undulation: float
-    datum: int
-    sigma_northing: float
-    sigma_easting: float
-    sigma_height: float
-    station: str
-    differential_age: float
-    solution_age: float
-    tracked: int
-    used: int
-
-
 class HeadingLog(NamedTuple):
     """Body of HEADING and HEADING2: from the antenna whose position is given to the other one.
 
@@ -207,7 +173,7 @@ class HeadingLog(NamedTuple):
     used: int
 
 
-Body: TypeAlias = Position | Velocity | UtmPosition | HeadingLog
+Body: TypeAlias = Position | Velocity | HeadingLog
 
 
 class NovatelLog(NamedTuple):
@@ -267,17 +233,15 @@ UNKNOWN_VALUE = 255
 
 
 class _Column(NamedTuple):
-    """A value of a body: its struct code, its ASCII field, and its conversion from and to the number or bytes packed.
+    """A value of a body: its struct code, how its ASCII field is parsed, and its conversion from and to what is packed.
 
-    Without `parse` it is reserved: `text` is written in ASCII, and binary has padding.
+    Without `parse` it is reserved.
     """
 
     code: str
     parse: Callable[[str], object] | None = None
-    format: Callable[[Any], str] = str
     unpack: Callable[[Any], object] | None = None
     pack: Callable[[Any], object] | None = None
-    text: str = ""
 
 
 def parse_integer(text: str, most: int, base: int = 10) -> int:
@@ -288,23 +252,12 @@ def parse_integer(text: str, most: int, base: int = 10) -> int:
     return value
 
 
-def _real(code: str, digits: int) -> _Column:
-    return _Column(code, float, f"{{:.{digits}f}}".format)
+_FLOAT, _DOUBLE = _Column("f", float), _Column("d", float)
 
 
 def _enumeration(kind: type[IntEnum]) -> _Column:
     members = kind.__members__
-    return _Column(
-        "I",
-        lambda word: int(members[word]) if word in members else UNKNOWN_VALUE,
-        lambda number: kind(number).name if number != UNKNOWN_VALUE else "UNKNOWN",
-    )
-
-
-def _decode_letter(number: int) -> str:
-    if not 65 <= number <= 90:
-        raise ValueError(f"{number} is no letter of a zone")
-    return chr(number)
+    return _Column("I", lambda word: int(members[word]) if word in members else UNKNOWN_VALUE)
 
 
 _SOLUTION = (_enumeration(SolutionStatus), _enumeration(PositionType))
@@ -312,22 +265,14 @@ _COUNTS = (_Column("B", partial(parse_integer, most=0xFF)),) * 2
 _STATION = _Column(
     "4s",
     str,
-    '"{}"'.format,
     lambda raw: raw.partition(b"\0")[0].decode("ascii", "replace"),
     lambda text: text.encode("ascii"),
 )
-_DATUM = _Column(
-    "I",
-    lambda word: DATUMS.get(word, 0),
-    lambda number: next((name for name, each in DATUMS.items() if each == number), "USER"),
-)
-_ZONE = (_Column("I", partial(parse_integer, most=0xFFFF_FFFF)), _Column("I", str, str, _decode_letter, ord))
-_RESERVED = _Column("4x", text="0.0")
-_TAIL = (_Column("x", text="0"),) * 3 + (_Column("x", text="00"),) * 3
+_DATUM = _Column("I", lambda word: DATUMS.get(word, 0))
+_RESERVED = _Column("4x")
+_TAIL = (_Column("x"),) * 6
 """Counts of observations and masks that end several logs."""
-_FIX = (_DATUM, *(_real("f", 4),) * 3, _STATION, *(_real("f", 3),) * 2, *_COUNTS, *_TAIL)
-"""What BESTPOS and BESTUTM have after the place: datum, sigmas, station, ages, satellites."""
-_BASELINE = (*_SOLUTION, _real("f", 4), *(_real("f", 6),) * 2, _RESERVED, *(_real("f", 4),) * 2, _STATION)
+_BASELINE = (*_SOLUTION, *(_FLOAT,) * 3, _RESERVED, *(_FLOAT,) * 2, _STATION)
 
 
 class BodyLayout:
@@ -360,10 +305,6 @@ class BodyLayout:
         columns = zip(self._columns, fields, strict=True)
         return self._check([each.parse(text) for each, text in columns if each.parse is not None])
 
-    def format(self, body: Body) -> list[str]:
-        values = iter(body)
-        return [each.text if each.parse is None else each.format(next(values)) for each in self._columns]
-
     def _check(self, values: Sequence[object]) -> Body:
         body = self._make._make(values)
         # an infinity makes the sum infinite, a nan makes it nan
@@ -376,10 +317,14 @@ _POSITION = BodyLayout(
     Position,
     lambda body: abs(body.latitude) <= 90.0 and -180.0 <= body.longitude <= 360.0,
     *_SOLUTION,
-    *(_real("d", 11),) * 2,
-    _real("d", 4),
-    _real("f", 4),
-    *_FIX,
+    *(_DOUBLE,) * 3,
+    _FLOAT,
+    _DATUM,
+    *(_FLOAT,) * 3,
+    _STATION,
+    *(_FLOAT,) * 2,
+    *_COUNTS,
+    *_TAIL,
 )
 
 BODIES = {
@@ -387,24 +332,11 @@ BODIES = {
     "PSRPOS": _POSITION,
     "RTKPOS": _POSITION,
     "BESTVEL": BodyLayout(
-        Velocity,
-        lambda body: body.horizontal >= 0.0,
-        *_SOLUTION,
-        *(_real("f", 3),) * 2,
-        _real("d", 4),
-        _real("d", 6),
-        _real("d", 4),
-        _RESERVED,
+        Velocity, lambda body: body.horizontal >= 0.0, *_SOLUTION, *(_FLOAT,) * 2, *(_DOUBLE,) * 3, _RESERVED
     ),
-    "BESTUTM": BodyLayout(UtmPosition, lambda _: True, *_SOLUTION, *_ZONE, *(_real("d", 4),) * 3, _real("f", 4), *_FIX),
     "HEADING": BodyLayout(HeadingLog, lambda body: 0.0 <= body.heading <= 360.0, *_BASELINE, *_COUNTS, *_TAIL),
     "HEADING2": BodyLayout(
-        HeadingLog,
-        lambda body: 0.0 <= body.heading <= 360.0,
-        *_BASELINE,
-        _Column("4x", text='""'),
-        *_COUNTS,
-        *_TAIL,
+        HeadingLog, lambda body: 0.0 <= body.heading <= 360.0, *_BASELINE, _RESERVED, *_COUNTS, *_TAIL
     ),
 }
 """Name of a log -> the layout of its body. PSRPOS and RTKPOS are written as BESTPOS; HEADING2 names two stations."""
@@ -433,35 +365,23 @@ def crc32(data: bytes | bytearray) -> int:
 
 
 def encode(log: NovatelLog) -> bytes:
-    """Encode a log with a long header, binary or ASCII by `log.header.is_binary`, as the receiver does.
-
-    Raises:
-        ValueError: a log without body, or one whose name has no number.
-    """
+    """Encode a log with a body in binary, with a long header, as the receiver does."""
     header, body = log.header, log.body
-    if body is None or header.name not in _IDS:
-        raise ValueError(f"{header.name} cannot be written")
+    assert body is not None
     layout = BODIES[header.name]
-    if header.is_binary:
-        head = _LONG_HEADER.pack(
-            _IDS[header.name],
-            header.antenna,
-            _PORTS.get(header.port) or (int(header.port) if header.port.isdecimal() else 0),
-            layout.size,
-            header.sequence,
-            header.time_status,
-            header.week,
-            header.milliseconds,
-            header.receiver_status,
-        )
-        frame = b"\xaa\x44\x12\x1c" + head + layout.pack(body)
-        return frame + crc32(frame).to_bytes(4, "little")
-    text = (
-        f"{header.label},{header.port or 'COM1'},{header.sequence},0.0,{TimeStatus(header.time_status).name},"
-        f"{header.week},{header.milliseconds / 1000.0:.3f},{header.receiver_status:08x},0000,0;"
-        f"{','.join(layout.format(body))}"
+    head = _LONG_HEADER.pack(
+        _IDS[header.name],
+        header.antenna,
+        _PORTS.get(header.port, 0),
+        layout.size,
+        header.sequence,
+        header.time_status,
+        header.week,
+        header.milliseconds,
+        header.receiver_status,
     )
-    return f"#{text}*{crc32(text.encode('ascii')):08x}\r\n".encode("ascii")
+    frame = b"\xaa\x44\x12\x1c" + head + layout.pack(body)
+    return frame + crc32(frame).to_bytes(4, "little")
 
 
 class BinaryFormat:
