@@ -108,10 +108,10 @@ _J1939_NAMES = {0xFF: "not available", 0xFE: "error"}
 
 
 class FrameError(ModelServerError, ValueError):
-    """A frame that does not match the DBC; `reason` is the counter's name."""
+    """A frame that does not match the DBC; `reason` is the counter's name, `summary` what is wrong in a few words."""
 
-    def __init__(self, reason: str, message: str):
-        self.reason = reason
+    def __init__(self, reason: str, message: str, summary: str = ""):
+        self.reason, self.summary = reason, summary
         super().__init__(message)
 
 
@@ -209,6 +209,7 @@ class CanDatabase:
                 f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
                 f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
                 f"identifier",
+                f"with {len(frame.data)} bytes instead of {message.length}",
             )
         from cantools.database.errors import Error
 
@@ -217,9 +218,13 @@ class CanDatabase:
                 frame.data, decode_choices=False, scaling=False, allow_truncated=False, allow_excess=False
             )
         except Error as error:
-            raise FrameError("multiplexer", f"frame {frame.key} ({message.name}): {error}") from None
+            raise FrameError(
+                "multiplexer", f"frame {frame.key} ({message.name}): {error}", "with an unknown multiplexer"
+            ) from None
         except (ValueError, KeyError, OverflowError) as error:
-            raise FrameError("bits", f"frame {frame.key} ({message.name}): {error}") from None
+            raise FrameError(
+                "bits", f"frame {frame.key} ({message.name}): {error}", "with bits that are no number"
+            ) from None
         return {name: value for name, value in values.items() if isinstance(value, int | float)}
 
     def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:
@@ -518,7 +523,7 @@ def _describe(error: _RejectedError, statement: _Statement, name: str) -> Proble
 
 
 MAX_SEEN = 8
-"""Identifiers that are remembered for the status text."""
+"""Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
 
 
 def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
@@ -540,8 +545,8 @@ class CanDriver(ABC):
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
         self.counts: Counter[str] = Counter()
-        """Frames, samples, incomplete instants, silences, commands, and rejections by reason. `rejected.reserved`:
-        values that stand for no measurement; `rejected.empty`: instants without a usable value."""
+        """Frames, samples, incomplete instants, silences, commands, and rejections by reason. `outside_range`: values
+        outside the range of the DBC, which are used; `rejected.reserved`: those that stand for no measurement."""
         self.problems = database.warnings
         """What is wrong with parts of the DBC file that are not used, which `modelserver check` reports."""
         self._database, self._needed, self._silence_s = database, needed, silence
@@ -549,8 +554,11 @@ class CanDriver(ABC):
         self._seq = 0
         self._silence_deadline_ns: int | None = None
         self._received = 0
-        self._others: dict[FrameKey, None] = {}
-        """Since the last usable data: frames, and the kinds of those that are not needed."""
+        self._others: Counter[FrameKey] = Counter()
+        self._useless: Counter[str] = Counter()
+        """Since the last usable data: frames, those that are not needed, and what is wrong with the others."""
+        self._reasons: dict[str, None] = {}
+        """Why values of the last instant cannot be used."""
         self._reported: set[object] = set()
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
@@ -568,8 +576,8 @@ class CanDriver(ABC):
         self._received += 1
         if unit.key not in self._needed:
             self.counts["other_frames"] += 1
-            if len(self._others) < MAX_SEEN:
-                self._others[unit.key] = None
+            if unit.key in self._others or len(self._others) < MAX_SEEN:
+                self._others[unit.key] += 1
             return []
         try:
             values = self._database.decode(unit)
@@ -610,23 +618,46 @@ class CanDriver(ABC):
     def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
         """Count a malformed frame; reported once per kind."""
         self.counts[f"rejected.{error.reason}"] += 1
+        self._note_useless(f"{self._needed[frame.key]} ({frame.key}) {error.summary}")
         if frame.key in self._reported:
             return []
         self._reported.add(frame.key)
         return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
 
+    def _note_useless(self, what: str) -> None:
+        """Note what is wrong with a frame, or with the frames of an instant."""
+        if what in self._useless or len(self._useless) < MAX_SEEN:
+            self._useless[what] += 1
+
+    def _note_empty(self) -> None:
+        """Count an instant without any value."""
+        self.counts["rejected.empty"] += 1
+        self._note_useless(f"no value that can be used ({', '.join(self._reasons) or 'no number'})")
+
     def _check_values(self, signals: Iterable[BoundSignal | None], instant: CanFrameSet) -> list[Output[CanFrame]]:
-        """Count the values that stand for no measurement; each is reported once."""
+        """Count values outside the DBC's range, and those that stand for no measurement; each is reported once."""
         outputs: list[Output[CanFrame]] = []
+        self._reasons.clear()
         for signal in signals:
             raw = instant.raw(signal)
-            name = signal.find_reserved(raw) if signal is not None and raw is not None else ""
-            if signal is None or not name:
+            if signal is None or raw is None or raw != raw:
                 continue
-            self.counts["rejected.reserved"] += 1
+            if name := signal.find_reserved(raw):
+                self.counts["rejected.reserved"] += 1
+                self._reasons[name] = None
+                text = f"{signal.path} is {raw:.0f}, {quote(name, 60)}: that is no measurement, and it is not used"
+            elif signal.is_outside(raw):
+                self.counts["outside_range"] += 1
+                name = "range"
+                value, limits = raw * signal.scale + signal.offset, f"[{signal.minimum:g}|{signal.maximum:g}]"
+                text = (
+                    f"{signal.path} is {value:g} {signal.unit}".rstrip() + f", outside its range {limits} in "
+                    f"{self._database.name}: it is used, for such ranges are often wrong"
+                )
+            else:
+                continue
             if (signal.path, name) not in self._reported:
                 self._reported.add((signal.path, name))
-                text = f"{signal.path} is {raw:.0f}, {quote(name, 60)}: that is no measurement, and it is not used"
                 outputs.append(EndpointStatus(self.phase, text, is_warning=True))
         return outputs
 
@@ -648,16 +679,18 @@ class CanDriver(ABC):
         self._silence_deadline_ns = now.monotonic_ns + round(self._silence_s * 1e9) if self._needed else None
         self._received = 0
         self._others.clear()
+        self._useless.clear()
 
     def _explain_silence(self) -> str:
         head = f"no usable {self._format_needed()} for {self._silence_s:g} s"
         if not self._received:
             return f"{head}, and nothing on the bus: check power, wiring, the interface's name and the bit rate"
-        wrong = [f"{name} {number}" for name, number in self.counts.items() if name.startswith("rejected.")]
+        wrong = [f"{number} x {what}" for what, number in self._useless.most_common()]
         if self._others:
-            wrong.append(f"others: {', '.join(map(str, self._others))}")
-        fix = "is the controller on, and is this its DBC and its bus?"
-        return f"{head}; received {self._received} frames: {', '.join(wrong) or 'not all of an instant'}; {fix}"
+            keys = ", ".join(map(str, self._others)) + (", ..." if len(self._others) == MAX_SEEN else "")
+            wrong.append(f"others: {keys}")
+        fix = "" if self._useless else "; is the controller on, and is this its DBC and its bus?"
+        return f"{head}; received {self._received} frames: {'; '.join(wrong) or 'not all of an instant'}{fix}"
 
     def _format_needed(self) -> str:
         return ", ".join(f"{name} ({key})" for key, name in sorted(self._needed.items()))

@@ -511,13 +511,14 @@ class VehicleDriver(CanDriver):
             if faults is None or rejected is None:
                 # these have no number for "missing"
                 self.counts["rejected.incomplete"] += 1
+                self._note_useless("without fault_bits or commands_rejected")
                 continue
             rejected += self._rejected
             numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
             mode = status.get_mode(instant)
             is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
             if not is_known and not self._has_status_words:
-                self.counts["rejected.empty"] += 1
+                self._note_empty()
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
             # the highest of the 32 bits is the sign on the wire

@@ -390,7 +390,7 @@ class WheelsDriver(CanDriver):
             wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
             self.counts["incomplete"] += not instant.is_complete
             if all(_is_empty(wheel) for wheel in wheels):
-                self.counts["rejected.empty"] += 1
+                self._note_empty()
                 outputs += warnings
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
@@ -428,6 +428,7 @@ class WheelsDriver(CanDriver):
     def _warn(self, name: str, reason: str, warnings: list[Output[CanFrame]]) -> None:
         key = reason if reason == "resumed" else f"rejected.{reason}"
         self.counts[key] += 1
+        self._reasons[reason] = None
         if f"{name} {reason}" in self._warned:
             return
         self._warned.add(f"{name} {reason}")

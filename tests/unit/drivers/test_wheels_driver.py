@@ -189,7 +189,7 @@ def test_given_frames_of_a_wrong_length_then_they_are_reported_once_and_counted(
     assert wire.status_text().count("has 9 bytes, raptor.dbc expects 8") == 1
     assert wire.host.counts["rejected.length"] > 500
     assert not [t for t, _ in wire.samples if t > 2.01]
-    assert re.search(r"received \d+ frames: rejected.length \d+", wire.status_text())
+    assert re.search(r"received \d+ frames: \d+ x WheelCounts \(0x100\) with 9 bytes instead of 8", wire.status_text())
 
 
 def speeds_of(dbc: str, raw: bytes, number: int = 535) -> tuple[WheelsDriver, list[object]]:
@@ -208,21 +208,26 @@ def make_dbc(signal: str, number: int = 535, more: str = "") -> str:
 
 
 @pytest.mark.parametrize(
-    ("signal", "raw", "speed"),
+    ("signal", "raw", "speed", "limits"),
     [
-        ('+ (0.0087,0) [0|1] "m/s"', 230, 2.001),
-        ('- (0.0625,0) [0|255] "m/s"', -16, -1.0),
-        ('+ (0.01,-327.68) [0|65535] "m/s"', 32668, -1.0),
-        ('+ (0.01,0) [5|-5] "m/s"', 100, 1.0),
+        ('+ (0.0087,0) [0|1] "m/s"', 230, 2.001, "[0|1]"),
+        ('- (0.0625,0) [0|255] "m/s"', -16, -1.0, "[0|255]"),
+        ('+ (0.01,-327.68) [0|65535] "m/s"', 32668, -1.0, "[0|65535]"),
+        ('+ (0.01,0) [5|-5] "m/s"', 100, 1.0, "[5|-5]"),
     ],
 )
-def test_given_a_value_outside_the_range_of_the_file_then_it_is_used(signal: str, raw: int, speed: float) -> None:
+def test_given_a_value_outside_the_range_of_the_file_then_it_is_used_and_warned_of_once(
+    signal: str, raw: int, speed: float, limits: str
+) -> None:
     data = (raw % 65536).to_bytes(2, "little") * 2 + bytes(4)
     driver, found = speeds_of(make_dbc(signal), data)
     samples = [each.sample for each in found if isinstance(each, MeasuredSample)]
     assert len(samples) == 100
     assert all(wheel.speed == pytest.approx(speed) for sample in samples for wheel in sample.wheels)
-    assert not driver.counts["rejected.reserved"]
+    warnings = [each.text for each in found if isinstance(each, EndpointStatus) and each.is_warning]
+    assert len(warnings) == 2
+    assert warnings[0].startswith(f"Wheels.V_L is {speed:g} m/s, outside its range {limits} in d.dbc")
+    assert driver.counts["outside_range"] == 200
 
 
 EXTENDED = 0x80000000 + 0x18FE0217
@@ -250,7 +255,8 @@ def test_given_a_value_that_stands_for_none_then_it_is_missing_and_the_silence_i
     assert not [each for each in found if isinstance(each, MeasuredSample)]
     texts = [each.text for each in found if isinstance(each, EndpointStatus)]
     assert sum(name in text and "that is no measurement" in text for text in texts) in (1, 2)
-    assert "received 100 frames: rejected.reserved 200, rejected.empty 100" in texts[-1]
+    assert "received 100 frames: 100 x no value that can be used" in texts[-1]
+    assert name in texts[-1]
     assert "check power" not in texts[-1]
     assert driver.counts["rejected.reserved"] == 200
 
