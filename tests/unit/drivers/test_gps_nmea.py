@@ -137,6 +137,16 @@ def test_given_instants_when_they_change_then_each_is_an_epoch_of_its_own():
     assert [each.utime for each in found] == [utime(2026, 11, 21, 12) + n * 200_000 for n in range(3)]
 
 
+def test_given_cycles_that_were_alike_for_a_second_when_the_last_sentence_comes_then_nobody_waits():
+    stream = GpsStream()
+    for n in range(8):
+        clock = f"12000{n // 4}.{n % 4 * 25:02d}"
+        got = stream.feed(make_sentences(gga(clock), rmc(clock)))
+    # the epoch is complete with its own RMC
+    assert [each.time_of_day for each in got if isinstance(each, NmeaEpoch)][-1] == 43_201_750_000
+    assert stream.flush() == []
+
+
 def test_given_a_sentence_that_comes_once_a_second_when_between_fast_ones_then_it_is_not_lost():
     found = []
     for n in range(40):
@@ -312,6 +322,12 @@ def test_given_sentences_without_a_time_when_they_lead_or_follow_then_no_epoch_h
         # the first cycle may have begun before the line was opened, and two must have shown the order
         for second, speed, _ in found[3:]:
             assert speed == pytest.approx(second)
+
+
+@pytest.mark.parametrize("order", ORDERS[:2])
+def test_given_the_order_learned_from_silence_when_the_line_is_full_then_motion_is_published(order: list[str]):
+    for second, speed, _ in cycles(order, (0, 1))[2:-1]:
+        assert speed == pytest.approx(second)
 
 
 def test_given_a_pause_amid_a_cycle_when_it_contradicts_the_others_then_motion_is_left_out_rather_than_wrong():

@@ -4,9 +4,11 @@ Fields: an empty one is missing: nan or None, never zero. ValueError, with the f
 write. pynmea2 computes the checksum and names the fields; its own conversions are not used: they give 0 for a missing
 hemisphere, cut microseconds, reject 23:59:60 and return the text where they fail.
 
-Epochs: one is complete when a sentence of another instant arrives, or when the caller reports silence (`flush`).
-Sentences without a time (VTG, GSA, HDT) belong to the epoch that they follow or precede without a pause. Motion between
-two instants without a pause is left out, because it could be that of either.
+Epochs: one is complete when a sentence of another instant arrives, when the caller reports silence (`flush`), or, once
+the cycles of sentences were equal for a second, when the sentence that ended the last cycle arrives again; so the last
+fix does not wait for the next instant. Sentences without a time (VTG, GSA, HDT) belong to the epoch that they follow or
+precede; the order is learned from the pauses of the line. Motion of unknown order is left out, because it could be
+that of the next instant.
 
 The fix type of an epoch is NONE if any sentence flags the fix invalid, else that of the most detailed sentence with a
 position. Receivers with several satellite systems send some sentences once for each: a GNS of one system, which has
@@ -16,7 +18,7 @@ counts only, flags nothing, and the GSA with the best fix counts.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -390,10 +392,14 @@ POSITION_KINDS = ("GGA", "GNS", "RMC", "GLL")
 """Sentences with a position, the most detailed first."""
 _MOTION = frozenset({"VTG", "HDT"})
 """Sentences with the receiver's motion but without a time: of another instant their content is wrong."""
+_MIN_LESSONS = 2
+"""Number of cycles that determine the order of sentences."""
 _TIMED = frozenset({*POSITION_KINDS, "GST"})
 """Sentences whose time is that of the fix. ZDA's is the clock's, which in some receivers is seconds ahead."""
 _MAX_SENTENCES = 64
 """Largest number of sentences in an epoch."""
+_MIN_STABLE_US = SECOND
+"""How long cycles must be equal; sentences that are not sent each instant are mostly sent once a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,58 +426,116 @@ class EpochAssembler:
         self._sentences: list[NmeaSentence] = []
         self._reference: int | None = None
         self._last_instant: int | None = None
+        self._cycle: Counter[str] = Counter()
+        self._stable_since: int | None = None
+        self._first = self._last = ""
+        self._is_closed_by_end = False
+        self._is_regular = True
         self._is_line_silent = self._starts_after_silence = False
+        self._order_counts: Counter[tuple[str, bool]] = Counter()
+        """How often a pause showed that a kind of sentence comes first, or not."""
         self.late = 0
         """Unused sentences: received after their epoch was complete, or too many."""
 
     def add(self, sentence: NmeaSentence) -> list[NmeaEpoch]:
-        """Return the epoch that the sentence completes, the one before it."""
+        """Return the epochs that the sentence completes: at most the one before it, and its own."""
         closed = []
         timed = sentence.kind in _TIMED
-        if timed and self._starts_epoch(sentence):
-            closed = self._close(is_silent=False)
-        is_known = sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
-        is_late = timed and is_known and not any(each.kind in _TIMED for each in self._sentences)
-        if is_late or len(self._sentences) >= _MAX_SENTENCES:
+        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._get_instant()[0]:
+            closed += self._close(by_end=False)
+        if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
             self.late += 1
             return closed
         if sentence.day is not None and sentence.time_of_day is not None:
             self._reference = sentence.day * DAY + sentence.time_of_day
         if not self._sentences:
             self._starts_after_silence, self._is_line_silent = self._is_line_silent, False
+        elif timed and self._starts_after_silence and not self._get_instant()[0]:
+            self._learn_order(self._sentences, leads=True)
         self._sentences.append(sentence)
+        if self._is_end(sentence):
+            closed += self._close(by_end=True)
         return closed
 
     def flush(self) -> list[NmeaEpoch]:
         """Return the epoch under way, if any: the line has been silent, so no more of it will come."""
         self._is_line_silent = True
-        return self._close(is_silent=True)
+        started = next((n for n, each in enumerate(self._sentences) if each.kind in _TIMED), len(self._sentences))
+        self._learn_order(self._sentences[started:], leads=False)
+        return self._close(by_end=False, is_silent=True)
 
     def clear(self) -> None:
-        """Forget the epoch under way: another receiver may speak."""
+        """Forget the epoch under way, and the order of sentences: another receiver may speak."""
         self._sentences, self._is_line_silent = [], False
+        self._order_counts.clear()
+
+    def _learn_order(self, sentences: list[NmeaSentence], leads: bool) -> None:
+        self._order_counts.update((each.kind, leads) for each in sentences if each.kind in _MOTION)
+
+    def _is_leading(self, kind: str) -> bool | None:
+        """Whether a kind of motion sentence precedes those with a time; None if unknown."""
+        for leads in (True, False):
+            # a pause within a cycle shows the wrong order
+            if self._order_counts[kind, leads] >= max(_MIN_LESSONS, 4 * self._order_counts[kind, not leads]):
+                return leads
+        return None
+
+    def _select_sentences(self, sentences: list[NmeaSentence], is_silent: bool) -> list[NmeaSentence]:
+        """Return the sentences without those of motion that belong, or may belong, to another instant."""
+        started = next(n for n, each in enumerate(sentences) if each.kind in _TIMED)
+
+        def is_selected(n: int, kind: str) -> bool:
+            leads = self._is_leading(kind)
+            return n > started and is_silent if leads is None else (n < started) is leads
+
+        return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or is_selected(n, each.kind)]
+
+    def _get_instant(self) -> tuple[bool, int | None]:
+        """Return whether the pending epoch has a timed sentence, and its time."""
+        return next(((True, each.time_of_day) for each in self._sentences if each.kind in _TIMED), (False, None))
 
     def _starts_epoch(self, sentence: NmeaSentence) -> bool:
-        """Return whether a sentence with a time is of another instant than the pending epoch."""
-        first = next((each for each in self._sentences if each.kind in _TIMED), None)
-        if first is None or sentence.time_of_day != first.time_of_day:
-            return first is not None
-        return first.time_of_day is None and any(each.kind == sentence.kind for each in self._sentences)
+        started, instant = self._get_instant()
+        if not started:
+            return False
+        if sentence.time_of_day != instant:
+            return True
+        return instant is None and any(each.kind == sentence.kind for each in self._sentences)
 
-    def _close(self, is_silent: bool) -> list[NmeaEpoch]:
+    def _is_late(self, sentence: NmeaSentence, timed: bool) -> bool:
+        if timed:
+            started, _ = self._get_instant()
+            late = not started and sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            self._is_regular = self._is_regular and not (late and self._is_closed_by_end)
+            return late
+        if not self._sentences and self._is_closed_by_end and sentence.kind != self._first:
+            # it trails an epoch that was thought complete: this receiver's cycles differ, do not guess their end again
+            self._is_regular = False
+            return sentence.kind != "ZDA"
+        return False
+
+    def _is_end(self, sentence: NmeaSentence) -> bool:
+        if not self._is_regular or sentence.kind != self._last:
+            return False
+        last, since = self._last_instant, self._stable_since
+        if last is None or since is None or last - since < _MIN_STABLE_US:
+            return False
+        received = Counter(each.kind for each in self._sentences)
+        return all(received[kind] >= number for kind, number in self._cycle.items())
+
+    def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
         sentences, self._sentences = self._sentences, []
-        started = next((n for n, each in enumerate(sentences) if each.kind in _TIMED), None)
-        if started is None:
+        if not any(each.kind in _TIMED for each in sentences):
             return []
-        instant = self._last_instant = sentences[started].time_of_day
+        instant = next(each.time_of_day for each in sentences if each.kind in _TIMED)
+        cycle = Counter(each.kind for each in sentences)
+        if cycle != self._cycle or self._stable_since is None or instant is None or instant < self._stable_since:
+            self._stable_since = instant
+        self._is_closed_by_end, self._cycle, self._last_instant = by_end, cycle, instant
+        self._first, self._last = sentences[0].kind, sentences[-1].kind
         if not any(each.kind in POSITION_KINDS for each in sentences):
             return []
-        selected = [
-            each
-            for n, each in enumerate(sentences)
-            if each.kind not in _MOTION or (self._starts_after_silence if n < started else is_silent)
-        ]
-        return [merge_sentences(selected, instant, self._to_utime(instant))]
+        return [merge_sentences(self._select_sentences(sentences, is_silent), instant, self._to_utime(instant))]
 
     def _to_utime(self, instant: int | None) -> int:
         """Return the utime of a time of day on the day that is nearest to the last received date."""
