@@ -134,6 +134,7 @@ class BoundSignal:
     maximum: float
     names: Mapping[int, str] = field(default_factory=dict)
     is_j1939: bool = False
+    unit: str = ""
 
     @property
     def path(self) -> str:
@@ -310,6 +311,7 @@ def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
         inf if signal.maximum is None else float(signal.maximum),
         {int(number): str(name) for number, name in (signal.choices or {}).items()},
         message.protocol == "j1939",
+        signal.unit or "",
     )
 
 
