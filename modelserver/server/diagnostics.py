@@ -14,7 +14,6 @@ import fcntl
 import logging
 import os
 import secrets
-import shutil
 import socket
 import struct
 import sys
@@ -91,64 +90,18 @@ def filter_by_level(
     return tuple(each for each in findings if each.level >= min_level)
 
 
-MAX_SLEW_RATE = 500e-6
-"""The kernel's limit of slewing (ntp_adjtime(2)), s/s; more between two readings is a step."""
-
-MIN_TIME_S = 1_672_531_200
-"""Start of 2023: a clock before it was never set since power-on."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockFacts:
-    """Readings of the host's clocks.
-
-    Attributes
-    ----------
-    synchronized: the kernel's state; None = unknown.
-    error: the kernel's bound of the error, s.
-    slew, duration: how far the time of day has advanced beyond the monotonic clock over a duration, s.
-    tool: installed time service: chrony, ntp, timesyncd or empty.
-    """
-
-    utime: int
-    synchronized: bool | None = None
-    error: float | None = None
-    slew: float = 0.0
-    duration: float = 0.0
-    tool: str = ""
-
-
-_SYNC_COMMANDS = {
-    "chrony": "sudo systemctl enable --now chrony && chronyc tracking",
-    "ntp": "sudo systemctl enable --now ntp && ntpq -p",
-    "timesyncd": "sudo timedatectl set-ntp true && timedatectl timesync-status",
-    "": "sudo apt install chrony",
-}
-
-
-def evaluate_clock(facts: ClockFacts, shared: bool) -> Iterator[Diagnosis]:
-    """Check the clock. On a `shared` bus, which leaves the machine, other machines' clocks matter."""
-    subject = "clock"
-    command = _SYNC_COMMANDS[facts.tool]
-    if facts.utime < MIN_TIME_S * 1_000_000:
-        why = "time stamps, the magnetic field model and logs depend on it; is the clock's battery empty?"
-        yield Diagnosis(ERROR, subject, "it was never set: its year is before 2023", why, command)
-        return
-    if abs(facts.slew) > MAX_SLEW_RATE * facts.duration + 1e-3:
-        observed = f"it was stepped by {facts.slew:+.3f} s during the check"
-        why = "poses are invalid until localization has samples of the new time; permit steps only at boot"
-        yield Diagnosis(WARNING, subject, observed, why, _SYNC_COMMANDS["chrony"] if facts.tool else command)
-    if facts.synchronized is None:
-        yield Diagnosis(NOTE, subject, "its synchronization state cannot be read on this system")
-    elif facts.synchronized:
-        error = "" if facts.error is None else f", to {facts.error * 1e3:.1f} ms or better"
-        yield Diagnosis(OK, subject, f"synchronized{error}")
-    elif shared:
+def evaluate_clock(synchronized: bool | None, shared: bool) -> Diagnosis:
+    """Check whether the clock is synchronized, None: unknown. On a `shared` bus other machines' clocks matter."""
+    if synchronized is None:
+        return Diagnosis(NOTE, "clock", "its synchronization state cannot be read on this system")
+    if synchronized:
+        return Diagnosis(OK, "clock", "synchronized")
+    command = "sudo timedatectl set-ntp true || sudo apt install chrony"
+    if shared:
         why = "time stamps of several machines are not comparable"
-        yield Diagnosis(WARNING, subject, "not synchronized", why, command)
-    else:
-        why = "time stamps are consistent on this machine, but not true time"
-        yield Diagnosis(NOTE, subject, "not synchronized", why, command)
+        return Diagnosis(WARNING, "clock", "not synchronized", why, command)
+    why = "time stamps are consistent on this machine, but not true time"
+    return Diagnosis(NOTE, "clock", "not synchronized", why, command)
 
 
 SYSCTL_FILE = "/etc/sysctl.d/60-modelserver.conf"
@@ -479,50 +432,14 @@ _TIMEX: Final = struct.Struct("@I4li")
 """Start of struct timex (adjtimex(2)): modes, offset, freq, maxerror, esterror, status."""
 
 
-def read_kernel_clock() -> tuple[bool | None, float | None]:
-    """Read whether the kernel considers the time of day synchronized, and its bound of the error, s."""
+def is_clock_synchronized() -> bool | None:
+    """Return whether the kernel considers the time of day synchronized, None if unknown."""
     timex = ctypes.create_string_buffer(512)  # more than its size on any machine; modes 0: read only
     try:
         result = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
     except (OSError, AttributeError):
-        return None, None
-    if result < 0:
-        return None, None
-    _, _, _, max_error_us, _, status = _TIMEX.unpack_from(timex)
-    if result == _TIME_ERROR or status & _STA_UNSYNC:
-        return False, None
-    return True, max_error_us * 1e-6
-
-
-def find_time_service() -> str:
-    """Return the installed time service: chrony, ntp, timesyncd or empty."""
-    folders = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
-    if shutil.which("chronyd", path=folders):
-        return "chrony"
-    if shutil.which("ntpd", path=folders):
-        return "ntp"
-    if any(Path(place, "systemd-timesyncd").exists() for place in ("/lib/systemd", "/usr/lib/systemd")):
-        return "timesyncd"
-    return ""
-
-
-class HostClockMonitor:
-    """Compares the time of day with the monotonic clock from construction until `read_facts`."""
-
-    def __init__(self) -> None:
-        self._start = self._read_clocks()
-
-    def read_facts(self) -> ClockFacts:
-        """Return the readings of the clocks."""
-        (utime, monotonic), (utime_now, monotonic_now) = self._start, self._read_clocks()
-        elapsed = monotonic_now - monotonic
-        slew = (utime_now - utime - elapsed) * 1e-9
-        is_synchronized, error = read_kernel_clock()
-        return ClockFacts(utime_now // 1000, is_synchronized, error, slew, elapsed * 1e-9, find_time_service())
-
-    @staticmethod
-    def _read_clocks() -> tuple[int, int]:
-        return time.time_ns(), time.monotonic_ns()
+        return None
+    return None if result < 0 else result != _TIME_ERROR and not _TIMEX.unpack_from(timex)[5] & _STA_UNSYNC
 
 
 ECHO_TIMEOUT_S: Final = 2.0

@@ -4,33 +4,31 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
+from support_signing import ALLOWED, write_test_key
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Problem, Severity
 from modelserver.server import diagnostics
 from modelserver.server.diagnostics import (
     BusFacts,
-    ClockFacts,
     Diagnosis,
     DiagnosisLevel,
     DiscoveredServers,
     NetworkInterface,
     Server,
-    get_worst_level,
 )
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress
 from msdrivers.settings import read_drivers
 from mstools.cli import main
 from mstools.commands import doctor
-from mstools.commands.doctor import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
+from mstools.commands.doctor import diagnose_connections, diagnose_vehicle_file
 
 LO = NetworkInterface("lo", loopback=True)
 WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
@@ -49,9 +47,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
         monkeypatch.setattr(diagnostics, "read_bus_facts", lambda url, delivery=None: facts)
         monkeypatch.setattr(diagnostics, "discover_servers", lambda *_: answers)
-        monkeypatch.setattr(
-            diagnostics.HostClockMonitor, "read_facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01)
-        )
+        monkeypatch.setattr(diagnostics, "is_clock_synchronized", lambda: True)
         with pytest.raises(SystemExit) as ended:
             main(["doctor", *map(str, arguments)])
         output = capsys.readouterr()
@@ -126,27 +122,31 @@ def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_expla
     assert "own message" in out
 
 
-def test_given_a_geometry_for_the_vehicle_file_then_that_is_reported_and_does_not_send_to_check(
-    run: Run, tmp_path: Path
-) -> None:
+def test_given_a_geometry_for_the_vehicle_file_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     path = write_vehicle(tmp_path).parent / "geometry.yaml"
     code, out, _ = run("-c", path)
     assert code == 3
-    assert f"{path} is wrong: this is a geometry file, not a vehicle file" in out
-    assert "give the vehicle file, which names it" in out
-    assert "modelserver check" not in out
+    assert f"{path} has 1 error, the first: this is a geometry file, not a vehicle file" in out
 
 
 def test_given_no_such_vehicle_file_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     code, out, err = run("-c", tmp_path / "vehicel.yaml")
     assert (code, out) == (2, "")
-    assert "there is no vehicle file" in err
-    assert "did you mean" not in err
-    write_vehicle(tmp_path, VEHICLE)
-    assert re.search(r"did you mean\s[\s\S]*vehicle\.yaml", run("-c", tmp_path / "vehicel.yaml")[2])
+    assert "does not exist" in err
     assert run("-c", tmp_path / "vehicle.yaml" / "x")[0] == 2
     code, _, err = run("-c", tmp_path)
-    assert (code, "is a folder" in err) == (2, True)
+    assert (code, "is a directory" in err) == (2, True)
+
+
+def test_given_a_key_file_that_others_may_read_then_the_vehicle_file_has_an_error(run: Run, tmp_path: Path) -> None:
+    path = write_vehicle(tmp_path, VEHICLE + ALLOWED)
+    code, out, _ = run("-c", path)
+    assert (code, "there is no key file" in out) == (3, True)
+    key = write_test_key(tmp_path)
+    assert run("-c", path)[0] == 0
+    key.chmod(0o644)
+    code, out, _ = run("-c", path)
+    assert (code, "is open to others" in out) == (3, True)
 
 
 def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
@@ -157,7 +157,7 @@ def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
     def raise_permission_error(file: Path) -> None:
         raise PermissionError(13, "Permission denied", str(file))
 
-    monkeypatch.setattr("modelserver.config.vehicle_file.load_config", raise_permission_error)
+    monkeypatch.setattr("mstools.commands.check.check_vehicle", raise_permission_error)
     code, out, _ = run("-c", path)
     assert code == 3
     assert f"{path} cannot be read: Permission denied" in out
@@ -172,11 +172,10 @@ def test_given_findings_with_odd_words_then_they_are_escaped() -> None:
 # --- the vehicle file ---------------------------------------------------------------------------------------
 
 
-def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_path: Path) -> None:
+def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(run: Run, tmp_path: Path) -> None:
     path = write_vehicle(tmp_path, VEHICLE, GEOMETRY)
-    config = load_config(path)
-    Path(config.geometry).unlink()
-    assert get_worst_level(diagnose_vehicle(config, path)) is DiagnosisLevel.ERROR
+    Path(load_config(path).geometry).unlink()
+    assert run("-c", path)[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -217,9 +216,8 @@ def test_given_a_serial_port_then_who_may_use_it_is_reported(tmp_path: Path, mon
     hint = "it belongs to group dialout: sudo usermod -aG dialout ann, then log in again"
     monkeypatch.setattr(serial_port, "explain_permission", lambda path: hint)
     (found,) = lines(sections)
-    assert (found.level, found.command) == (DiagnosisLevel.ERROR, "sudo usermod -aG dialout ann")
-    monkeypatch.setattr(serial_port, "explain_permission", lambda path: "give this user access")
-    assert lines(sections)[0].command == f"ls -l {port}"
+    assert (found.level, found.why) == (DiagnosisLevel.ERROR, hint)
+    assert found.command == f"ls -l {port}"
 
 
 def test_given_a_port_in_use_then_it_is_worth_knowing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
