@@ -108,17 +108,21 @@ def test_given_an_empty_bus_then_status_reports_what_to_look_at_and_exits_1(lcm_
     assert lcm_url in done.stderr
 
 
-def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_is_interrupted(
+def test_given_watch_into_a_pipe_then_the_reports_follow_one_another_until_it_is_interrupted(
     start_daemon: StartDaemon,
 ) -> None:
     daemon = start_daemon()
     with run_command(["status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         with process.stdout:
-            lines = [process.stdout.readline() for _ in range(3)]
+            lines: list[str] = []
+            while sum(line.startswith("pose ") for line in lines) < 3:
+                lines.append(process.stdout.readline())
+                assert lines[-1]
             process.send_signal(signal.SIGINT)
             assert process.wait(TIMEOUT_S) == 0
-    assert all("STARTING; pose not valid" in line for line in lines)
+    assert all("NOT VALID" in line for line in lines if line.startswith("pose "))
+    assert sum(line.startswith("cart: STARTING") for line in lines) == 3
 
 
 class Screen:
