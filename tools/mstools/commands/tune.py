@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import multiprocessing
 import os
@@ -12,15 +11,14 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.messages import FixType, GpsSample
-from mstools.report import charts
-from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_outputs, escape, format_count, show_progress, to_json, write_file
+from mstools.terminal.options import argument, option
+from mstools.terminal.output import check_outputs, escape, format_count, show_progress, write_file
 from mstools.tuning import (
     EvaluationJob,
     EvaluationResult,
@@ -78,10 +76,7 @@ def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
-    plot: Annotated[str, option("--plot HTML", "Write a page with the scores of all settings that were tried.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
-    processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
-    as_json: JsonOption = False,
     force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
 ) -> None:
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
@@ -94,14 +89,11 @@ def command(
     \b
     Examples:
       modelserver tune drive.lcm -c config/husky/vehicle.yaml --quick
-      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml --plot scores.html
+      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml
     """
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
-    check_outputs((log, config), plot, output, as_json, force)
-    if plot:
-        charts.check_installed()
-
+    check_outputs((log, config), "", output, force)
     vehicle = load(config)
     gps_channel(vehicle)
     fixes = read_fixes(log, config)
@@ -118,7 +110,7 @@ def command(
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else ROUNDS
     bound = len(parts) * (1 + rounds * len(chosen) * 2)
-    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(processes, len(parts)) as runs:
+    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(len(parts)) as runs:
         trials = Trials(runs, log, config, parts, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
@@ -129,15 +121,8 @@ def command(
             )
         found = search(begin, first, chosen, trials, rounds, _print_step)
         after = trials.outcomes(found.settings)
-        attempts = trials.list_attempts()
     result = TuningResult(begin, first, before, found, after, trials.count)
-    if as_json:
-        typer.echo(json.dumps(as_data(result), indent=2, allow_nan=False))
-    else:
-        typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
-    if plot:
-        lines = format_result(escape(str(log)), result)
-        write_file(plot, render_page(escape(str(log)), lines, begin, attempts, found.settings), replace=force)
+    typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
     write_file(output, format_proposal(str(log), result), replace=force)
 
 
@@ -178,10 +163,6 @@ class Trials:
 
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
         return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
-
-    def list_attempts(self) -> list[Attempt]:
-        """Return all settings that were tried, in order, with their scores."""
-        return [Attempt(dict(key), self._score(found)) for key, found in self.results.items()]
 
     def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]
@@ -235,28 +216,6 @@ def format_result(log: str, result: TuningResult) -> list[str]:
     return text
 
 
-def as_data(result: TuningResult) -> dict[str, object]:
-    """Return the report as JSON data; unknown values are null."""
-
-    def format_side(score: Score, outcomes: Sequence[EvaluationResult]) -> dict[str, object]:
-        return {
-            "likelihood": to_json(score.likelihood),
-            "rmse": to_json(score.rmse),
-            "gap_ends": list(outcomes[-1].gaps),
-            "gap_nees": list(outcomes[-1].nees),
-            "nis": {each.kind: {"mean": each.mean, "beyond": each.beyond} for each in outcomes[0].consistency},
-        }
-
-    return {
-        "runs": result.runs,
-        "withheld": result.before[0].scored,
-        "before": format_side(result.first, result.before),
-        "after": format_side(result.found.score, result.after),
-        "proposal": dict(result.found.settings),
-        "unseen": list(result.found.insensitive),
-    }
-
-
 def format_proposal(log: str, result: TuningResult) -> str:
     """Format the proposed settings as part of a vehicle file."""
     first, found = result.first, result.found
@@ -273,15 +232,10 @@ def format_proposal(log: str, result: TuningResult) -> str:
 
 
 @contextmanager
-def _open_pool(
-    processes: int, parts: int
-) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+def _open_pool(parts: int) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
     """Yield a function that runs jobs in parallel processes, and returns their results in order."""
     # at most both steps of a setting run at once
-    count = min(processes or os.cpu_count() or 1, 2 * parts)
-    if count == 1:
-        yield lambda jobs: [_run(job) for job in jobs]
-        return
+    count = min(os.cpu_count() or 1, 2 * parts)
     pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
     try:
         yield lambda jobs: [future.result() for future in _submit(pool, jobs)]
@@ -338,54 +292,3 @@ def _print_step(step: SearchStep) -> None:
         f"RMSE {step.score.rmse:.3f} m",
         err=True,
     )
-
-
-class Attempt(NamedTuple):
-    """Settings that were tried, and their score; None where the filter rejects them."""
-
-    settings: Settings
-    score: Score | None
-
-
-def render_page(log: str, lines: Sequence[str], begin: Settings, attempts: Sequence[Attempt], best: Settings) -> str:
-    """Return an HTML page: `lines` of the result, and the scores of all attempts.
-
-    `begin` are the settings of the vehicle file, `best` those that are proposed. Raises as `charts.render_page`.
-    """
-    scored = [(number, each.settings, each.score) for number, each in enumerate(attempts) if each.score is not None]
-    texts = [_describe(begin, settings) for _, settings, _ in scored]
-    at = [float(number) for number, _, _ in scored]
-    x = charts.Axis("settings in the order in which they were tried", -0.5, max(len(attempts) - 0.5, 0.5))
-    proposed = next((number for number, settings, _ in scored if dict(settings) == dict(best)), 0)
-    panels = []
-    for title, unit, name, height in (
-        ("Log-likelihood of a withheld fix", "", "likelihood", 200.0),
-        ("RMSE at withheld fixes", "m", "rmse", 120.0),
-        ("Mean error at the ends of gaps", "m", "gaps", 120.0),
-        ("Mean NEES at the ends of gaps", "", "nees", 120.0),
-    ):
-        values = [float(getattr(score, name)) for _, _, score in scored]
-        if not any(map(math.isfinite, values)):
-            continue
-        # settings that are far off would hide the differences between the others
-        axis = charts.Axis(unit, *charts.value_range(values, 0.9))
-        chosen = [n for n, number in enumerate(at) if number == proposed]
-        drawn = [
-            charts.Series("tried", at, values, charts.BLUE, 5.0, "dots", texts=texts),
-            charts.Series(
-                "proposed",
-                [at[n] for n in chosen],
-                [values[n] for n in chosen],
-                charts.ORANGE,
-                9.0,
-                "dots",
-                texts=[texts[n] for n in chosen],
-            ),
-        ]
-        panels.append(charts.Panel(title, axis, drawn, height))
-    return charts.render_text_page(f"Tuning: {log}", lines, [charts.render_panels("Scores", x, panels)])
-
-
-def _describe(begin: Settings, settings: Settings) -> str:
-    changed = [f"{name} {begin[name]:g} -> {value:g}" for name, value in settings.items() if value != begin[name]]
-    return ", ".join(changed) or "the vehicle file's"
