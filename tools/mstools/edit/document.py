@@ -1,7 +1,7 @@
 """A geometry file as bodies, frames and constraints that are changed in its text.
 
 A frame of a template is on each body that names the template. Changed on one body, it gets an entry of its own there;
-with `in_template` the template is changed, and with it all bodies that use it.
+its entry as text is that of the template, for all bodies that use it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import ModelServerError, Problem, SyntaxProblemError, has_error, quote
+from modelserver.errors import Problem, SyntaxProblemError, has_error, quote
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
 from modelserver.formats.common import format_number, parse_number
@@ -83,27 +83,6 @@ class GeometryDocument:
             found += [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for frame in self._list_frames(body)]
         return found + [GeometryItem(ItemKind.CONSTRAINT, name) for name in self._yaml.keys(("constraints",))]
 
-    def find_item(self, line: int) -> GeometryItem | None:
-        """Return what stands on a line: the last item that begins on it or before."""
-        before = [(at, item) for at, item in self._list_places() if at <= line]
-        return max(before, key=lambda each: each[0])[1] if before else None
-
-    def _list_places(self) -> Iterator[tuple[int, GeometryItem]]:
-        """Yield each item with its line; a frame of a template is that of the first body that names it."""
-        for at, constraint in self._yaml.list_lines(("constraints",)):
-            yield at, GeometryItem(ItemKind.CONSTRAINT, constraint)
-        seen: set[str] = set()
-        for at, body in self._yaml.list_lines(("bodies",)):
-            yield at, GeometryItem(ItemKind.BODY, body)
-            template = self._get_template(body)
-            paths: list[KeyPath] = [("bodies", body, "frames")]
-            if template and template not in seen:
-                seen.add(template)
-                paths.append(("templates", template, "frames"))
-            for path in paths:
-                for of_frame, frame in self._yaml.list_lines(path):
-                    yield of_frame, GeometryItem(ItemKind.FRAME, names.join(body, frame))
-
     def find_template(self, item: GeometryItem) -> str:
         """Return the template from which a frame of a body comes, empty if it is the body's own."""
         if item.kind is not ItemKind.FRAME:
@@ -112,9 +91,6 @@ class GeometryDocument:
         template = self._get_template(body)
         own = self._yaml.has(("bodies", body, "frames", frame))
         return template if not own and self._yaml.has(("templates", template, "frames", frame)) else ""
-
-    def list_users(self, template: str) -> list[str]:
-        return [body for body in self._yaml.keys(("bodies",)) if self._get_template(body) == template]
 
     def get_yaml(self, item: GeometryItem) -> str:
         """Return the entry of an item as it is written, without indentation."""
@@ -141,14 +117,18 @@ class GeometryDocument:
             raise EditError(f"there is no {item.kind} {quote(item.name)}")
         return path
 
+    def _find_own_path(self, item: GeometryItem) -> KeyPath:
+        """Return where an item is written. Raises EditError if that is a template, whose other bodies have it too."""
+        if template := self.find_template(item):
+            raise EditError(f"{item.name} is a frame of template {template}; change the template in the file")
+        return self._find_path(item)
+
     # --- numbers and texts
 
-    def set_pose(
-        self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3, in_template: bool = False
-    ) -> GeometryDocument:
+    def set_pose(self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3) -> GeometryDocument:
         """Set the pose of a frame on its body, or of a constraint. Only what differs is written."""
         _check_finite((*xyz, *rpy_deg))
-        text, path = self._open(item, in_template)
+        text, path = self._open(item)
         old, new = _read_pose(text, path), Pose.from_rpy(xyz, *map(math.radians, rpy_deg))
         is_turned = old.distance(new)[1] > SAME_RADIANS
         has_matrix = text.has((*path, "matrix"))
@@ -161,12 +141,10 @@ class GeometryDocument:
             text = _set_numbers(text, path, "xyz", xyz)
         return GeometryDocument(text)
 
-    def set_sigma(
-        self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None, in_template: bool = False
-    ) -> GeometryDocument:
+    def set_sigma(self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None) -> GeometryDocument:
         """Set the standard deviations of a frame or constraint; a part that is None is not stated."""
         _check_finite([*(xyz or ()), *(rpy_deg or ())])
-        text, path = self._open(item, in_template)
+        text, path = self._open(item)
         stated = [
             f"{key}: {format_scalar_or_list(tuple([round(each, DECIMALS) for each in values]))}"
             for key, values in (("xyz", xyz), ("rpy_deg", rpy_deg))
@@ -176,9 +154,9 @@ class GeometryDocument:
             return GeometryDocument(_set(text, path, "sigma", f"{{{', '.join(stated)}}}"))
         return GeometryDocument(text.remove((*path, "sigma")) if text.has((*path, "sigma")) else text)
 
-    def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> GeometryDocument:
+    def set_description(self, item: GeometryItem, description: str) -> GeometryDocument:
         """Set the description of an item, or remove it where it is empty."""
-        text, path = self._open(item, in_template)
+        text, path = self._open(item)
         if description == text.get_text((*path, "description")):
             return GeometryDocument(text)
         if description:
@@ -245,46 +223,31 @@ class GeometryDocument:
         place = ("bodies", body, "frames") if body else path[:-1]
         return GeometryDocument(self._yaml.add(place, copy, after=path[-1], in_block=True))
 
-    def rename(self, item: GeometryItem, name: str, in_template: bool = False) -> GeometryDocument:
+    def rename(self, item: GeometryItem, name: str) -> GeometryDocument:
         """Rename an item, a frame without its body, and what refers to it in this file."""
         body, frame = names.split(item.name) if item.kind is ItemKind.FRAME else (item.name, "")
         new = self._make_new(item.kind, name, body if frame else "")
-        template = self.find_template(item)
-        if template and not in_template:
-            raise EditError(f"{item.name} is a frame of template {template}; change the template to rename it")
-        path = self._find_path(item)
+        path = self._find_own_path(item)
         text = self._yaml.rename(path, _format_key(name))
         if item.kind is ItemKind.CONSTRAINT:
             return GeometryDocument(_rename_leader(text, item.name, name))
-        renamed = {item.name: new.name}
-        if template:
-            users = [
-                each for each in self.list_users(template) if not self._yaml.has(("bodies", each, "frames", frame))
-            ]
-            renamed = {names.join(user, frame): names.join(user, name) for user in users}
         for constraint, end, joined in self._list_ends():
-            other = renamed.get(joined, joined)
+            other = new.name if joined == item.name else joined
             if item.kind is ItemKind.BODY and joined.partition(":")[0] == body:
                 other = names.join(name, joined.partition(":")[2])
             if other != joined:
                 text = text.set(("constraints", constraint, end), _format_full_name(other))
         return GeometryDocument(text)
 
-    def delete(self, item: GeometryItem, in_template: bool = False) -> GeometryDocument:
+    def delete(self, item: GeometryItem) -> GeometryDocument:
         """Delete an item, and the constraints at a body or frame."""
-        template = self.find_template(item)
-        if template and not in_template:
-            raise EditError(f"{item.name} is a frame of template {template}; change the template to delete it")
-        text = self._yaml.remove(self._find_path(item))
-        gone = {item.name}
-        if template:
-            gone = set(self._list_copies(template, names.split(item.name)[1]))
+        text = self._yaml.remove(self._find_own_path(item))
         if item.kind is not ItemKind.CONSTRAINT:
             # several ends of one constraint may be gone
             lost = {
                 constraint: None
                 for constraint, _, joined in self._list_ends()
-                if joined in gone or (item.kind is ItemKind.BODY and joined.partition(":")[0] == item.name)
+                if joined == item.name or (item.kind is ItemKind.BODY and joined.partition(":")[0] == item.name)
             }
             for constraint in lost:
                 text = text.remove(("constraints", constraint))
@@ -300,10 +263,10 @@ class GeometryDocument:
 
     # --- inside
 
-    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[YamlText, KeyPath]:
+    def _open(self, item: GeometryItem) -> tuple[YamlText, KeyPath]:
         """Return the text, in which a frame of a template has an entry on its body if that alone is changed."""
         path = self._find_path(item)
-        if path[0] != "templates" or in_template:
+        if path[0] != "templates":
             return self._yaml, path
         body, _ = names.split(item.name)
         text = self._yaml.add(("bodies", body, "frames"), self._yaml.get_entry(path), in_block=True)
@@ -318,11 +281,6 @@ class GeometryDocument:
         if item in self.list_items():
             raise EditError(f"there is a {kind} {quote(item.name)} already")
         return item
-
-    def _list_copies(self, template: str, frame: str) -> list[str]:
-        """Return the full names of a template's frame on the bodies that have it from there."""
-        found = [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for body in self.list_users(template)]
-        return [item.name for item in found if self.find_template(item)]
 
     def _list_ends(self) -> Iterator[tuple[str, str, str]]:
         """Yield each end of each constraint: constraint, key, frame."""
@@ -417,13 +375,6 @@ MAX_STEPS = 500
 _BOM = "\ufeff"
 
 
-class Step(NamedTuple):
-    """A document with the name of the change that led to it."""
-
-    document: GeometryDocument
-    change: str
-
-
 class CheckedText(NamedTuple):
     """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
 
@@ -489,8 +440,8 @@ class EditSession:
         if drawn is None:
             raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
         self._saved = saved
-        self._steps = [Step(document, "")]
-        self._undone: list[Step] = []
+        self._steps = [document]
+        self._undone: list[GeometryDocument] = []
         self.drawn: Model = drawn
         """The last model without an error; before there is one, the bodies of the file alone."""
         self.model: Model | None = None
@@ -509,7 +460,7 @@ class EditSession:
 
     @property
     def document(self) -> GeometryDocument:
-        return self._steps[-1].document
+        return self._steps[-1]
 
     @property
     def is_changed(self) -> bool:
@@ -522,28 +473,26 @@ class EditSession:
         return has_error(self.problems)
 
     @property
-    def undo_name(self) -> str:
-        """The change that `undo` undoes, empty for none."""
-        return self._steps[-1].change if len(self._steps) > 1 else ""
+    def can_undo(self) -> bool:
+        return len(self._steps) > 1
 
     @property
-    def redo_name(self) -> str:
-        """The change that `redo` makes again, empty for none."""
-        return self._undone[-1].change if self._undone else ""
+    def can_redo(self) -> bool:
+        return bool(self._undone)
 
-    def change(self, name: str, change: Callable[[GeometryDocument], GeometryDocument]) -> bool:
+    def change(self, change: Callable[[GeometryDocument], GeometryDocument]) -> bool:
         """Make a change; return whether it changed anything. Raises EditError, with all as before."""
         document = change(self.document)
         if document.text == self.document.text:
             return False
-        self._steps.append(Step(document, name))
+        self._steps.append(document)
         del self._steps[1:-MAX_STEPS]
         self._undone.clear()
         self._check()
         return True
 
     def undo(self) -> None:
-        if len(self._steps) > 1:
+        if self.can_undo:
             self._undone.append(self._steps.pop())
             self._check()
 
@@ -559,16 +508,6 @@ class EditSession:
             return self._loaded is not None and self._loaded.get_yaml(item) == self.document.get_yaml(item)
         except EditError:
             return False
-
-    def has_changed_on_disk(self) -> bool:
-        """Return whether the file is no longer what was read or saved."""
-        try:
-            return self.file.read() != self._saved
-        except (ModelServerError, OSError):
-            return True
-
-    def find_culprit(self, problem: Problem) -> GeometryItem | None:
-        return self.document.find_item(problem.line) if problem.file == str(self.file.path) else None
 
     def make_diff(self) -> str:
         """Return what saving changes, as a unified diff."""

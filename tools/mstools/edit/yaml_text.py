@@ -98,10 +98,6 @@ class YamlText:
         text = self.text[begin : found.end].replace("\r\n", "\n")
         return text if found.is_flow else textwrap.dedent(" " * found.key.start_mark.column + text)
 
-    def list_lines(self, path: KeyPath) -> list[tuple[int, str]]:
-        """Return the keys of a mapping with their lines, counted from 1."""
-        return [(each.key.start_mark.line + 1, each.name) for each in self.entries(path)]
-
     # --- changes
 
     def set(self, path: KeyPath, value: str) -> YamlText:

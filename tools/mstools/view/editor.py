@@ -13,17 +13,16 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
 import viser
 
 from modelserver.client.remote import Platform
-from modelserver.errors import ModelServerError, Problem, QueryError, Severity, quote
+from modelserver.errors import ModelServerError, Problem, QueryError, Severity
 from modelserver.formats.common import format_number, parse_number
 from modelserver.geometry import names
-from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
+from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
 from modelserver.geometry.placement import (
@@ -46,10 +45,6 @@ from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
-MAX_LABEL: Final = 60
-LOOK_PERIOD_S: Final = 2.0
-"""Period at which the file is compared with what was read, seconds."""
-
 MAX_DISTANCES: Final = 6
 NO_CHOICE: Final = "-"
 
@@ -59,16 +54,11 @@ PRECISION: Final = 6
 SAME: Final = 10.0**-PRECISION
 """A drag by less has not moved, or turned, what is dragged."""
 
-_INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
-
-_MINUS: Final = str.maketrans(dict.fromkeys("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d", "-"))
-"""Minus signs and dashes that keyboards and other programs write."""
-
 _RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
 
 Change = Callable[[GeometryDocument], GeometryDocument]
-ChangeItem = Callable[[Change, GeometryItem | None], bool]
-"""Makes a change and selects an item; returns whether it could be made."""
+ChangeItem = Callable[..., bool]
+"""Makes a `Change` and selects an item, if one is given; returns whether it could be made."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +106,6 @@ class Editor:
         self._item = self._find_first(ItemKind.FRAME)
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
-        self._next_look = 0.0
-        self._is_outdated = False
-        self._buttons: list[Any] = []
         self._status = gui.add_markdown("")
         self._message = gui.add_markdown("")
         self._undo = self._add_button("Undo", lambda: self._step(session.undo))
@@ -126,17 +113,15 @@ class Editor:
         self._save = self._add_button("Save ...", self._ask_save)
         self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
         self._add_button("Read the file again", self._ask_read)
-        self._problems = gui.add_folder("Problems")
-        with self._problems:
+        with gui.add_folder("Problems"):
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
         actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
         actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
-        self._fields = ItemFields(server, session, self._item, self._change_item, actions)
+        self._fields = ItemFields(server, session, self._item, self._change, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
-            self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
             actions.on_update(self._gizmo, self.show_gizmo)
         with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
@@ -146,7 +131,7 @@ class Editor:
             self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
         with gui.add_folder("Place by measurement", expand_by_default=False):
-            self._place = PlacePanel(gui, session, self._item, self._change_item, actions)
+            self._place = PlacePanel(gui, session, self._item, self._change, actions)
         with gui.add_folder("As text", expand_by_default=False):
             self._text: Any = gui.add_text("YAML", "", multiline=True)
             self._add_button("Write text", self._write_text)
@@ -202,14 +187,8 @@ class Editor:
 
     def _refresh(self) -> None:
         session = self._session
-        self._next_look = 0.0
         self._show_status()
-        for button, name, change in (
-            (self._undo, "Undo", session.undo_name),
-            (self._redo, "Redo", session.redo_name),
-        ):
-            button.label = f"{name}: {change}"[:MAX_LABEL] if change else name
-            button.disabled = not change
+        self._undo.disabled, self._redo.disabled = not session.can_undo, not session.can_redo
         self._save.disabled = not session.is_changed or session.has_errors
         self._apply.disabled = session.is_changed
         self._show_problems()
@@ -229,30 +208,18 @@ class Editor:
             state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
                 "the last model" if session.model is not None else "the bodies, not joined"
             )
-        if self._is_outdated:
-            state += ". **The file changed meanwhile on disk:** read it again before you go on"
         self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
 
     def _show_problems(self) -> None:
-        for button in self._buttons:
-            button.remove()
-        self._buttons = []
         found = sorted(self._session.problems, key=lambda each: list(Severity).index(each.severity))
         shown = [each for each in found if each.severity is not Severity.NOTE][:SHOWN_PROBLEMS]
         notes = sum(each.severity is Severity.NOTE for each in found)
         more = len(found) - len(shown) - notes
         lines = [f"- {_describe_problem(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
         text = "\n".join(lines) or "none"
-        if notes:
-            text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
-        self._problem_texts.content = text
-        with self._problems:
-            for number, problem in enumerate(shown, 1):
-                culprit = self._session.find_culprit(problem)
-                if culprit is not None:
-                    self._buttons.append(
-                        self._add_button(f"{number}: {culprit.name}", lambda item=culprit: self.select(item))  # type: ignore[misc]
-                    )
+        self._problem_texts.content = text + (
+            f"\n\n{format_count(notes, 'note')}: modelserver check --notes" if notes else ""
+        )
 
     def _report(self, text: str) -> None:
         self._message.content = escape_markdown(text) if text else ""
@@ -274,29 +241,25 @@ class Editor:
         self._do(action)
         self._refresh()
 
-    def _change(self, name: str, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change, after which `new` is selected."""
-        if not self._do(lambda: self._session.change(name, change)):
+    def _change(self, change: Change, new: GeometryItem | None = None) -> bool:
+        """Make a change, after which `new` is selected; return whether it could be made."""
+        if not self._do(lambda: self._session.change(change)):
             return False
         if new is not None:
             self._item = new
         self._refresh()
         return True
 
-    def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change of what is selected; return whether it could be made."""
-        return self._change(f"edit {self._item.name}", change, new)
-
     def _add(self, kind: ItemKind) -> None:
         name = self._new.value.strip()
         item = self._item
         frames = list_frames(self._session.document)
         if kind is ItemKind.BODY:
-            self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
+            self._change(lambda document: document.add_body(name), GeometryItem(kind, name))
         elif kind is ItemKind.FRAME:
             body = item.name.partition(":")[0] if item.kind is not ItemKind.CONSTRAINT else frames[0].partition(":")[0]
             new = GeometryItem(kind, names.join(body, name))
-            self._change(f"add {new.name}", lambda document: document.add_frame(body, name), new)
+            self._change(lambda document: document.add_frame(body, name), new)
         else:
             from_ = item.name if item.kind is ItemKind.FRAME else frames[0]
             others = [each for each in frames if each.partition(":")[0] != from_.partition(":")[0]]
@@ -304,25 +267,22 @@ class Editor:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
             to = others[-1]
-            self._change(
-                f"add {name}", lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name)
-            )
+            self._change(lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name))
 
     def _duplicate(self) -> None:
         item = self._item
         plain = item.name.rpartition(":")[2]
         name = self._new.value.strip() or _find_free_name(self._session.document, item)
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
-        self._change(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
+        self._change(lambda document: document.duplicate(item, name), new)
 
     def _delete(self) -> None:
         item = self._item
-        in_template = self._fields.in_template
-        self._change(f"delete {item.name}", lambda document: document.delete(item, in_template))
+        self._change(lambda document: document.delete(item))
 
     def _write_text(self) -> None:
         item, text = self._item, self._text.value
-        self._change(f"write {item.name}", lambda document: document.set_yaml(item, text))
+        self._change(lambda document: document.set_yaml(item, text))
 
     # --- gizmo
 
@@ -337,7 +297,7 @@ class Editor:
 
     def _drag(self, pose: Pose, is_end: bool) -> None:
         """Follow the gizmo: the fields while it moves, a change when it is released. Called in the page's thread."""
-        self._actions.put(lambda: self._fields.set_dragged(pose, Snap(self._snap.value), is_end))
+        self._actions.put(lambda: self._fields.set_dragged(pose, is_end))
 
     # --- saving and applying
 
@@ -374,13 +334,8 @@ class Editor:
             self._report("asking the service ...")
             self._reloading = dry_run, self._executor.submit(self._editing.reload, dry_run)
 
-    def update(self, now: float) -> None:
-        """Show the reply of the service, once it is there, and that the file has changed on disk."""
-        if now >= self._next_look:
-            self._next_look = now + LOOK_PERIOD_S
-            if self._session.has_changed_on_disk() != self._is_outdated:
-                self._is_outdated = not self._is_outdated
-                self._show_status()
+    def update(self) -> None:
+        """Show the reply of the service, once it is there."""
         if self._reloading is None or not self._reloading[1].done():
             return
         (dry_run, future), self._reloading = self._reloading, None
@@ -427,12 +382,9 @@ def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
 
 
 def parse_typed(label: str, text: str) -> float:
-    """Return the number that was typed: with a sign, an exponent, a decimal comma. Raises EditError."""
-    plain = text.strip().translate(_MINUS)
-    if plain.count(",") == 1 and "." not in plain:
-        plain = plain.replace(",", ".")
+    """Return the number that was typed. Raises EditError."""
     try:
-        return parse_number(plain)
+        return parse_number(text.strip())
     except ValueError as error:
         raise EditError(f"{label}: {error}") from None
 
@@ -491,20 +443,6 @@ class NumberFields:
         self._problem.content = problem
 
 
-class Snap(StrEnum):
-    """Steps to which the gizmo rounds."""
-
-    NONE = "none"
-    FINE = "1 mm, 1 deg"
-    MEDIUM = "1 cm, 5 deg"
-    COARSE = "5 cm, 15 deg"
-
-    @property
-    def steps(self) -> tuple[float, float]:
-        """Meters and degrees; without snap what a hand can place."""
-        return {Snap.NONE: (1e-4, 0.01), Snap.FINE: (1e-3, 1.0), Snap.MEDIUM: (0.01, 5.0)}.get(self, (0.05, 15.0))
-
-
 def list_frames(document: GeometryDocument) -> list[str]:
     return [each.name for each in document.list_items() if each.kind is ItemKind.FRAME]
 
@@ -537,14 +475,13 @@ class ItemFields:
         self._part: BodyFrame | Constraint | None = None
         self._fields: dict[str, Any] = {}
         self._given: dict[str, Any] = {}
-        self._exact: dict[str, tuple[float, ...]] = {}
         self._place = gui.add_folder("Values")
 
     # --- what is shown
 
     def show(self, item: GeometryItem) -> None:
         self._item = item
-        self._fields, self._given, self._exact = {}, {}, {}
+        self._fields, self._given = {}, {}
         self._part = find_part(self._session.drawn, item)
         old = self._form
         with self._server.atomic():
@@ -558,13 +495,7 @@ class ItemFields:
         self._form.on_submit(lambda _: self._actions.put(self.set))
 
     def _add_fields(self, item: GeometryItem) -> None:
-        document = self._session.document
         self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
-        template = document.find_template(item)
-        if template:
-            users = ", ".join(document.list_users(template))
-            hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
-            self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
         if isinstance(self._part, Constraint):
             self._add_ends(self._part)
         if self._part is not None:
@@ -610,36 +541,7 @@ class ItemFields:
             return
         if joint.type in TYPES_WITH_AXIS:
             self._add_vector("axis", [f"axis {axis}" for axis in "xyz"], joint.axis)
-        if joint.count > 1:
-            gui.add_markdown("Limits and more of a joint with several coordinates: under *As text*.")
-            return
-        unit = "deg" if joint.type is JointType.REVOLUTE else "m"
-        scale = math.degrees(1.0) if unit == "deg" else 1.0
-        limits: tuple[float, ...] = ()
-        if joint.lower or joint.upper:
-            limits = (joint.lower or (-math.inf,)) + (joint.upper or (math.inf,))
-        for key, label, values in (
-            ("limits", f"limits ({unit})", limits),
-            ("rate_limit", f"rate limit ({unit}/s)", joint.rate_limit),
-            ("default", f"default ({unit})", joint.default),
-            ("sigma", f"joint sigma ({unit})", joint.sigma),
-        ):
-            self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
-            self._exact[key] = values
-        others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
-        leaders = (NO_CHOICE, *(each for each in others if each != self._item.name))
-        mimic = joint.mimic
-        leader = mimic.joint if mimic is not None and mimic.joint in leaders else NO_CHOICE
-        self._add("leader", gui.add_dropdown("follows", leaders, initial_value=leader))
-        known = mimic or Mimic("")
-        self._add("multiplier", gui.add_text("multiplier", format_number(known.multiplier)))
-        self._add("offset", gui.add_text(f"offset ({unit})", _format_values([known.offset], scale)))
-        self._exact |= {"multiplier": (known.multiplier,), "offset": (known.offset,)}
-
-    @property
-    def in_template(self) -> bool:
-        """Whether all bodies of the template are to change."""
-        return "template" in self._fields and bool(self._fields["template"].value)
+        gui.add_markdown("Limits and more of a joint: under *As text*.")
 
     # --- what is set
 
@@ -649,7 +551,7 @@ class ItemFields:
 
     def _is_typed(self) -> bool:
         try:
-            return any(self._differs(key) for key in self._fields if key != "template")
+            return any(self._differs(key) for key in self._fields)
         except EditError:
             return True
 
@@ -662,25 +564,24 @@ class ItemFields:
         return self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
 
     def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
-        in_template = self.in_template
         if self._is_changed("xyz", "rpy"):
             xyz, rpy = (so3.to_vector3(self._fields[key].value) for key in ("xyz", "rpy"))
-            document = document.set_pose(item, xyz, rpy, in_template)
+            document = document.set_pose(item, xyz, rpy)
         if self._is_changed("has_sigma", "sigma_xyz", "sigma_rpy"):
             # numbers that are typed are meant, whatever the checkbox has
             is_stated = self._fields["has_sigma"].value or self._is_changed("sigma_xyz", "sigma_rpy")
             fields = (self._fields["sigma_xyz"], self._fields["sigma_rpy"])
             stated = [so3.to_vector3(each.value) if is_stated else None for each in fields]
-            document = document.set_sigma(item, stated[0], stated[1], in_template)
+            document = document.set_sigma(item, stated[0], stated[1])
         if self._is_changed("description"):
-            document = document.set_description(item, self._fields["description"].value.strip(), in_template)
+            document = document.set_description(item, self._fields["description"].value.strip())
         if isinstance(self._part, Constraint):
             if self._is_changed("from", "to"):
                 document = document.set_ends(item.name, self._fields["from"].value, self._fields["to"].value)
             joint = self._read_joint(self._part.joint)
             if joint != self._part.joint:
                 document = document.set_joint(item.name, self._part.joint, joint)
-        return document.rename(item, name, in_template) if name else document
+        return document.rename(item, name) if name else document
 
     def _is_changed(self, *keys: str) -> bool:
         """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
@@ -694,54 +595,17 @@ class ItemFields:
         return field.is_changed if isinstance(field, NumberFields) else bool(field.value != self._given[key])
 
     def _read_joint(self, old: Joint) -> Joint:
-        keys = ("joint", "axis", "limits", "rate_limit", "default", "sigma", "leader", "multiplier", "offset")
-        if not any(key in self._fields and self._differs(key) for key in keys):
+        if not any(key in self._fields and self._differs(key) for key in ("joint", "axis")):
             return old
         kind = JointType(self._fields["joint"].value)
         axis = so3.to_vector3(self._fields["axis"].value) if "axis" in self._fields else (0.0, 0.0, 1.0)
+        if kind is JointType.FIXED:
+            return Joint()
         try:
-            if kind is JointType.FIXED:
-                return Joint()
-            if kind is not old.type:
-                # its numbers had other units
-                return Joint(kind, axis)
-            if "limits" not in self._fields:
-                return replace(old, axis=axis)
-            is_angle = kind is JointType.REVOLUTE
-            limits = self._read_values("limits", 2, is_angle)
-            if limits and limits[0] > limits[1]:
-                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
-            mimic = None
-            if self._fields["leader"].value != NO_CHOICE:
-                (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)
-                (offset,) = self._read_values("offset", 1, is_angle) or (0.0,)
-                mimic = Mimic(self._fields["leader"].value, multiplier, offset)
-            return Joint(
-                kind,
-                axis,
-                limits[:1],
-                limits[1:],
-                self._read_values("rate_limit", 1, is_angle),
-                self._read_values("default", 1, is_angle) if mimic is None else (),
-                self._read_values("sigma", 1, is_angle),
-                mimic,
-            )
+            # the numbers of another type had other units
+            return replace(old, axis=axis) if kind is old.type else Joint(kind, axis)
         except ValueError as error:
             raise EditError(str(error)) from None
-
-    def _read_values(self, key: str, count: int, is_angle: bool) -> tuple[float, ...]:
-        """Return the numbers in a text, none for an empty one, radians and meters."""
-        if not self._differs(key):
-            return self._exact[key]
-        text = self._fields[key].value.strip()
-        if not text:
-            return ()
-        label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
-        if len(parts) != count:
-            what = "two numbers, lower and upper" if count == 2 else "one number"
-            raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
-        numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
-        return tuple([math.radians(each) if is_angle else each for each in numbers])
 
     # --- gizmo
 
@@ -754,25 +618,20 @@ class ItemFields:
             return names.split(self._item.name)[0], Pose.identity(), part.pose
         return names.split(part.from_)[0], model.frame(part.from_).pose, part.pose
 
-    def set_dragged(self, pose: Pose, snap: Snap, is_end: bool) -> None:
-        """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
+    def set_dragged(self, pose: Pose, is_end: bool) -> None:
+        """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact.
+
+        It is rounded to what a hand can place: 0.1 mm and 0.01 degrees.
+        """
         if self._part is None:
             return
-        meters, degrees = snap.steps
         moved, turned = self._part.pose.distance(pose)
         if moved > SAME:
-            self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])
+            self._fields["xyz"].value = tuple([round(each, 4) for each in pose.xyz])
         if turned > SAME:
-            rpy = [math.degrees(each) for each in so3.to_rpy(pose.wxyz)]
-            self._fields["rpy"].value = tuple([round(round(each / degrees) * degrees, PRECISION) for each in rpy])
+            self._fields["rpy"].value = tuple([round(math.degrees(each), 2) for each in so3.to_rpy(pose.wxyz)])
         if is_end:
             self.set()
-
-
-def _format_values(values: Sequence[float], scale: float) -> str:
-    """Return numbers as a text, angles in degrees."""
-    known = {math.inf: ".inf", -math.inf: "-.inf"}
-    return ", ".join(known.get(each) or format_number(round(each * scale, 9) + 0.0) for each in values)
 
 
 # --- placing -------------------------------------------------------------------------------------------------
@@ -799,7 +658,6 @@ class PlacePanel:
                 frame = gui.add_dropdown(f"From {number}", (NO_CHOICE,))
                 self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
             self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
-            self._mirrored: Any = gui.add_checkbox("On the other side", False, hint="Three distances fit two positions")
             actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
             self._result = gui.add_markdown("")
 
@@ -829,7 +687,7 @@ class PlacePanel:
                 raise EditError("fix the errors first; a pose is computed from a geometry without any")
             return _write_placement(document, item, *compute(model, item))
 
-        self._change(change, None)
+        self._change(change)
 
     def _coincide(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
         target, position_only = self._target.value, self._position_only.value
@@ -855,10 +713,6 @@ class PlacePanel:
         sigmas = np.full(len(given), sigma_m)
         frame = model.frame(item.name)
         fit = locate_by_distances(points, distances, sigmas, frame.pose.xyz, P)
-        if self._mirrored.value:
-            if fit.mirrored is None:
-                raise EditError("the distances fit on one side only")
-            fit = locate_by_distances(points, distances, sigmas, fit.mirrored, P)
         self._result.content = _describe_fit(fit, [name for name, _ in given], sigma_m)
         rotation = (frame.sigma or Sigma()).rotation
         sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), rotation)
