@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 import typer
@@ -129,12 +129,9 @@ class Manifest:
             if content["version"] != MANIFEST_VERSION:
                 raise ValueError(f"its version is {content['version']!r}, not {MANIFEST_VERSION}")
             return cls(
-                {
-                    _parse("file", path): tuple(_parse("hash", each) for each in hashes)
-                    for path, hashes in content["files"].items()
-                },
-                tuple(_parse("unit", each) for each in content["units"]),
-                tuple(_parse("folder", each) for each in content["folders"]),
+                {str(path): tuple(map(str, hashes)) for path, hashes in content["files"].items()},
+                tuple(map(str, content["units"])),
+                tuple(map(str, content["folders"])),
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
@@ -183,7 +180,7 @@ def digest(content: bytes) -> str:
 
 
 def plan_install(
-    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, *, start: bool, notes: Iterable[str]
+    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, notes: Iterable[str] = (), start: bool = True
 ) -> Plan:
     """Return the steps that write `writes` and start `units`. Edited files are kept.
 
@@ -300,22 +297,6 @@ def _systemctl(facts: SystemFacts, what: str, verb: str, *units: str) -> RunProg
     return RunProgram((facts.programs.get("systemctl", "systemctl"), *root, verb, *now, *units), what)
 
 
-_OWN: Final = {
-    "file": rf"{re.escape(RULES)}|{re.escape(SYSCTL)}|{CONFIGURATION}/.*|{UNITS}/modelserver.*",
-    "unit": "modelserver[^/]*",
-    "folder": "/etc(/.*)?",
-    "hash": ".*",
-}
-"""What a manifest may name; it decides what is removed. A folder is removed only where it is empty."""
-
-
-def _parse(kind: str, value: Any) -> str:
-    is_own = isinstance(value, str) and re.fullmatch(_OWN[kind], value, re.DOTALL)
-    if not is_own or not {"..", "."}.isdisjoint(value.split("/")):
-        raise ValueError(f"{value!r} is no {kind} of this installation")
-    return str(value)
-
-
 BY_ID: Final = "/dev/serial/by-id/"
 DEVICE_FOLDER: Final = "/dev/modelserver/"
 REALTIME: Final = f"{UNITS}/{SERVICE}.d/50-realtime.conf"
@@ -372,10 +353,7 @@ def check_program(program: str) -> None:
 
 
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError with all problems.
-
-    A driver named `all` or `none` can only be selected together with others.
-    """
+    """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError."""
     known = tuple(known)
     names = tuple(dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip()))
     if names in (("all",), ()):
@@ -384,13 +362,7 @@ def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
         names = ()
     gathered = ProblemCollector()
     for name in names:
-        if name in ("all", "none") and name not in known:
-            others = ",".join(each for each in names if each not in ("all", "none"))
-            why = f"{name} is combined with other names in {quote(wanted, 80)}, and means "
-            why += "every driver" if name == "all" else "no driver at all"
-            fix = f"--drivers {name}, or only the names" + (f": --drivers {others}" if others else "")
-            gathered.add("--drivers", why, fix)
-        elif name not in known:
+        if name not in known:
             near = find_nearest_names(name, known)
             offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
             gathered.add("--drivers", f"the vehicle file has no driver {quote(name, 40)}; {offer}")
@@ -534,12 +506,10 @@ def render_udev_rules(
 ) -> tuple[list[WriteFile], list[str]]:
     """Return the udev rules that give each driver's device a name of its own, and notes on them.
 
-    `given` are names below /dev/serial/by-id by driver, which take precedence over the found ones. Raises
-    ModelServerError.
+    `given` are names below /dev/serial/by-id by driver, as `check_serial` accepts them; they take precedence over the
+    found ones. Raises ModelServerError.
     """
     lines, notes = [], []
-    drivers = list(drivers)
-    check_serial(given, drivers)
     for driver in drivers:
         own = f"{DEVICE_FOLDER}{driver.name}"
         device = given.get(driver.name, "") or (driver.port if driver.port.startswith(BY_ID) else "")

@@ -328,3 +328,12 @@ def test_given_endless_drivers_of_a_stranger_then_so_many_are_retained() -> None
 def test_given_a_bus_then_what_is_there_instead_is_reported_with_whether_it_is_a_report() -> None:
     bus = FakeLcm(("B_MODELSERVER_HEALTH", encode(BARE)), ("X", b"12345678"))
     assert status.probe_channels(bus, 0.05) == {"B_MODELSERVER_HEALTH": True, "X": False}  # type: ignore[arg-type]
+
+
+def test_given_a_report_then_the_status_has_how_many_measurements_were_used() -> None:
+    wheels = ChannelHealth("sensor:wheels", 1230, 100.0, 0.01, measured=217, used=215)
+    health = replace(WELL, channels=(IMU, wheels))
+    (row,) = (line for line in format_report(health).splitlines() if "sensor:wheels" in line)
+    assert "215/217" in row
+    (data,) = (each for each in as_data(health)["channels"] if each["channel"] == "sensor:wheels")
+    assert (data["measured"], data["used"]) == (217, 215)

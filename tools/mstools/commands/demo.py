@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import NoServerError, QueryError
-from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, PoseAnswer
+from modelserver.errors import NoServerError
+from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.status import HealthListener
@@ -138,44 +138,12 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
                 f"the pose never became valid in {seconds + LATE_SECONDS:g} s: {received} poses were received on POSE. "
                 "Run it again with --verbose; a busy machine may need --seconds 20"
             )
-        for text in (
-            f"{received} poses in {max(seconds, since):.0f} s, {len(valid)} of them valid",
-            *format_usage(listener.health),
-        ):
-            typer.echo(f"   {text}")
+        typer.echo(f"   {received} poses in {max(seconds, since):.0f} s, {len(valid)} of them valid")
 
         typer.echo("\n5. The camera in the world a second ago, from the history")
         at = valid[-1].transformation.utime - 1_000_000
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
-        history = platform.get_history(at - 1_000_000, at, 10.0)
-        typer.echo(f"get_history returned {len(history)} poses of the second before that")
-        typer.echo("\n6. Pose and motion of the nodding laser")
-        at = valid[-1].transformation.utime - 200_000
-        # the joint's messages may be late on a busy machine
-        moving = platform.get_motion("FrontSICKLaser:Scan", "Raptor:CG", at=at, wait_ms=1000)
-        typer.echo(describe(moving.pose))
-        typer.echo(f"  turns at        {math.degrees(-moving.angular_velocity[1]):.1f} deg/s, upwards positive")
-
-        typer.echo("\n7. A misspelled frame")
-        try:
-            platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
-        except QueryError as error:
-            typer.echo(f"{error}. Nearest: {', '.join(error.nearest)}")
     typer.echo(f"\nDone. Next: modelserver run -c {find_vehicle_file()}, and in another shell: modelserver tree --live")
-
-
-def format_usage(service: Health | None) -> list[str]:
-    """Format how many measurements of each sensor were used, and the warnings about sensors.
-
-    Raises LaunchError if no wheel measurement was used: the Raptor's front wheels steer, and must be used.
-    """
-    if service is None:
-        raise LaunchError("no health report on MODELSERVER_HEALTH; run the demo with --verbose")
-    used = {each.channel.removeprefix("sensor:"): each for each in service.channels if each.measured}
-    warnings = [f"{subject}: {text}" for subject, text in service.warnings if subject.startswith("sensor")]
-    if "wheels" in used and not used["wheels"].used:
-        raise LaunchError(f"no measurement of the wheels was used: {'; '.join(warnings) or 'see --verbose'}")
-    return [f"{name}: {each.used} of {each.measured} measurements used" for name, each in used.items()] + warnings
 
 
 class PoseListener(HealthListener):
