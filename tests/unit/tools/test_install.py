@@ -22,6 +22,7 @@ from mstools.deployment import (
     SerialDriver,
     SystemFacts,
     check_drivers,
+    check_serial,
     check_visible,
     find_hiding_setting,
     loopback_group,
@@ -485,7 +486,7 @@ def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_rejected(
 
 def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_rejected() -> None:
     with pytest.raises(ModelServerError, match="is not a driver on a serial port"):
-        render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {"imu": "usb-Y"}, SystemFacts())
+        check_serial({"imu": "usb-Y"}, [SerialDriver("gps", "/dev/ttyUSB0")])
 
 
 def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> None:
