@@ -15,12 +15,9 @@ from modelserver.server.diagnostics import (
     BusFacts,
     Diagnosis,
     DiagnosisLevel,
-    DiscoveredServers,
     NetworkInterface,
-    Server,
     evaluate_bus,
     evaluate_clock,
-    evaluate_servers,
     filter_by_level,
     get_worst_level,
     probe_bus,
@@ -31,7 +28,7 @@ from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress, parse_ud
 
 LO = NetworkInterface("lo", multicast=True, loopback=True)
 ETH = NetworkInterface("eth0")
-WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO, ETH), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
+WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO, ETH), True, True, RECEIVE_BUFFER_BYTES, 0)
 OUTWARD = replace(WELL, address=UdpAddress(ttl=1), interface=ETH)
 
 
@@ -163,29 +160,14 @@ def test_given_long_messages_that_are_lost_then_the_buffer_is_named() -> None:
     assert (found.level, "rmem_max" in found.command) == (DiagnosisLevel.WARNING, True)
 
 
-def test_given_a_small_default_buffer_then_it_is_worth_knowing_and_no_more() -> None:
-    findings = evaluate_bus(replace(WELL, buffer_default=212_992))
-    assert get_worst_level(findings) is DiagnosisLevel.NOTE
-    assert any("rmem_default=4194304" in each.command for each in findings)
-
-
 def test_given_an_unknown_interface_of_the_route_then_the_route_is_reported_alone() -> None:
     findings = evaluate_bus(replace(OUTWARD, interface=NetworkInterface("")))
     assert about(findings, "multicast route").level is DiagnosisLevel.OK
-    assert "messages leave the machine, for its network" in about(findings, "reach").observed
 
 
 def test_given_unknown_facts_then_nothing_is_reported_of_them() -> None:
     facts = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,))
-    assert {each.subject for each in evaluate_bus(facts)} == {"multicast route", "reach"}
-
-
-@pytest.mark.parametrize(("ttl", "words"), [(0, "nothing leaves"), (1, "for its network"), (3, "past 2 routers")])
-def test_given_a_ttl_then_its_reach_is_reported_with_the_interface(ttl: int, words: str) -> None:
-    facts = replace(OUTWARD, address=UdpAddress(ttl=ttl))
-    found = about(evaluate_bus(facts), "reach")
-    assert words in found.observed
-    assert (found.level is DiagnosisLevel.NOTE) == (ttl > 0) == ("eth0" in found.observed)
+    assert {each.subject for each in evaluate_bus(facts)} == {"multicast route"}
 
 
 # --- the daemon's part --------------------------------------------------------------------------------------
@@ -232,55 +214,6 @@ def test_given_a_clock_then_its_synchronization_counts_where_other_machines_are(
 ) -> None:
     found = evaluate_clock(synchronized, shared)
     assert (found.level, bool(found.command)) == (grade, synchronized is False)
-
-
-# --- the daemons --------------------------------------------------------------------------------------------
-
-ONE = Server("pc", 10, "raptor", "1.0")
-
-
-def test_given_one_daemon_then_it_is_well() -> None:
-    (found,) = evaluate_servers(DiscoveredServers((ONE,), 1), "", "1.0")
-    assert (found.level, "process 10" in found.observed) == (DiagnosisLevel.OK, True)
-
-
-def test_given_none_then_it_is_a_note_with_how_to_start_it() -> None:
-    (found,) = evaluate_servers(DiscoveredServers((), 0), "B_", "1.0")
-    assert (found.level, "B_" in found.observed) == (DiagnosisLevel.NOTE, True)
-    assert found.command.startswith("modelserver run")
-
-
-@pytest.mark.parametrize(
-    ("answers", "command"),
-    [
-        (DiscoveredServers((ONE, Server("pc", 11)), 2), "kill 11"),
-        (DiscoveredServers((ONE, Server("other", 10, "raptor", "1.0")), 1), "kill 10"),
-        (DiscoveredServers((ONE,), 2), "kill 10"),
-        (DiscoveredServers((), 2), "systemctl stop modelserver"),
-    ],
-)
-def test_given_two_daemons_then_it_is_an_error_and_one_is_to_be_stopped(
-    answers: DiscoveredServers, command: str
-) -> None:
-    found = next(evaluate_servers(answers, "", "1.0"))
-    assert found.level is DiagnosisLevel.ERROR
-    assert found.command.startswith(command)
-
-
-def test_given_servers_of_other_vehicles_then_their_prefixes_distinguish_them() -> None:
-    found = tuple(evaluate_servers(DiscoveredServers((ONE, Server("pc", 9, prefix="B_")), 1), "", "1.0"))
-    assert get_worst_level(found) is DiagnosisLevel.NOTE
-    assert "'B_'" in found[-1].observed
-
-
-def test_given_a_daemon_of_another_version_then_it_is_to_be_restarted() -> None:
-    found = tuple(evaluate_servers(DiscoveredServers((ONE,), 1), "", "2.0"))
-    assert get_worst_level(found) is DiagnosisLevel.WARNING
-
-
-def test_given_an_odd_host_name_then_it_is_escaped() -> None:
-    found = tuple(evaluate_servers(DiscoveredServers((Server("\x1b[31m\n" * 99, 1, version="\x07"),), 1), "", "1.0"))
-    assert all(each.observed.isprintable() and len(each.observed) < 400 for each in found)
 
 
 # --- findings -----------------------------------------------------------------------------------------------

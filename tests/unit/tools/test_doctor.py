@@ -5,34 +5,40 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
 from support_signing import ALLOWED, write_test_key
+from support_wire import EXAMPLES
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Problem, Severity
+from modelserver.messages import Health
 from modelserver.server import diagnostics
 from modelserver.server.diagnostics import (
     BusFacts,
     Diagnosis,
     DiagnosisLevel,
-    DiscoveredServers,
     NetworkInterface,
-    Server,
 )
+from modelserver.version import __version__
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress
 from msdrivers.settings import read_drivers
 from mstools.cli import main
-from mstools.commands import doctor
+from mstools.commands import doctor, status
 from mstools.commands.doctor import diagnose_connections, diagnose_vehicle_file
 
 LO = NetworkInterface("lo", loopback=True)
-WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
+WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, 0)
 Run = Callable[..., tuple[int, str, str]]
+
+
+def make_health(pid: int, host: str = "pc", version: str = __version__) -> Health:
+    return replace(EXAMPLES["health_t"][0], pid=pid, host=host, version=version)
 
 
 @pytest.fixture
@@ -40,13 +46,19 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     """Return the command, on a machine without problems except those in `facts` and `answers`."""
 
     def command(
-        *arguments: object, facts: BusFacts = WELL, answers: DiscoveredServers | None = None
+        *arguments: object, facts: BusFacts = WELL, daemons: tuple[Health, ...] = (make_health(1),)
     ) -> tuple[int, str, str]:
-        from modelserver.version import __version__
-
-        answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
         monkeypatch.setattr(diagnostics, "read_bus_facts", lambda url, delivery=None: facts)
-        monkeypatch.setattr(diagnostics, "discover_servers", lambda *_: answers)
+
+        class Listener:
+            def __init__(self, bus: object, prefix: str, handlers: dict[str, Callable[[Health], None]]):
+                for each in daemons:
+                    handlers["MODELSERVER_HEALTH"](each)
+
+            def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
+                return until()
+
+        monkeypatch.setattr(status, "DaemonListener", Listener)
         monkeypatch.setattr(diagnostics, "is_clock_synchronized", lambda: True)
         with pytest.raises(SystemExit) as ended:
             main(["doctor", *map(str, arguments)])
@@ -66,7 +78,7 @@ def test_given_a_machine_that_is_well_then_that_is_reported_and_exits_0(run: Run
 @pytest.mark.parametrize(
     ("facts", "code", "words"),
     [
-        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, 1000, 1 << 22), 1, "1 warning"),
+        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, 1000), 1, "1 warning"),
         (BusFacts(DEFAULT_URL, UdpAddress(), None, (LO,)), 3, "$ sudo ip link set lo up multicast on"),
         (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False), 3, "1 error"),
     ],
@@ -79,11 +91,29 @@ def test_given_something_to_fix_then_command_and_exit_code_report(
     assert words in out
 
 
-def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
-    code, out, _ = run(answers=DiscoveredServers((Server("a", 1), Server("b", 2)), 2))
-    assert code == 3
-    assert "2 answer at once: process 1 on 'a', process 2 on 'b'" in out
-    assert "$ kill 2" in out
+@pytest.mark.parametrize(
+    ("daemons", "expected", "words", "command"),
+    [
+        ((), 0, "none publishes health reports", "modelserver run -c vehicle.yaml"),
+        ((make_health(1, "a"),), 0, "one answers: process 1 on 'a'", ""),
+        ((make_health(1, "a", "9"),), 1, "process 1 on 'a' is version '9'", "sudo systemctl restart modelserver"),
+        (
+            (make_health(1, "a"), make_health(2, "b")),
+            3,
+            "2 answer at once: process 1 on 'a', process 2 on 'b'",
+            "kill 2",
+        ),
+        ((make_health(1, "\x1b[31m\n" * 99),), 0, r"one answers: process 1 on '\x1b[31m\n\x1b", ""),
+    ],
+)
+def test_given_daemons_then_there_is_one_of_this_version(
+    run: Run, daemons: tuple[Health, ...], expected: int, words: str, command: str
+) -> None:
+    code, out, _ = run(daemons=daemons)
+    assert code == expected
+    assert words in out
+    assert not command or f"$ {command}" in out
+    assert all(line.isprintable() and len(line) < 400 for line in out.splitlines())
 
 
 @pytest.mark.parametrize("url", ["udpm://nonsense", "udpm://10.0.0.1:7667", "udpm://239.255.76.67", "x://"])

@@ -27,11 +27,15 @@ from mstools.terminal.output import escape, format_count
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
+    from modelserver.messages import Health
     from msdrivers.settings import DriverSettings
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
 """2 is wrong usage, as for every command, and a missing vehicle file, with which nothing is checked."""
+
+REPORT_WAIT_S: Final = 1.3
+"""Time for the health reports of all daemons, seconds: each publishes one per second."""
 
 LEVEL_NAMES = ("ok", "note", "warning", "error")
 """Names of the levels of findings, by number."""
@@ -47,9 +51,9 @@ def command(
 ) -> None:
     """Diagnose the bus, the clock, and what a vehicle file needs of this machine; print the commands that fix it.
 
-    Sends a message to itself, and a request to all daemons: two on one bus are found. Nothing is changed. With a
-    vehicle file also: whether it, its geometry and its key file are valid, state and journal can be written, and the
-    drivers' ports exist and are accessible. Run it as the user of the service; for the systemd unit, as root.
+    Sends a message to itself, and listens for health reports: two daemons on one bus are found. Nothing is changed.
+    With a vehicle file also: whether it, its geometry and its key file are valid, state and journal can be written, and
+    the drivers' ports exist and are accessible. Run it as the user of the service; for the systemd unit, as root.
 
     Exit code: 0 no problem, 1 warnings, 3 errors, 2 wrong usage, also a missing vehicle file: then nothing was checked.
     (Other commands have 1 for wrong input, which would look like a warning here.)
@@ -65,16 +69,14 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     """Return all findings. Takes two seconds, most of it waiting for replies."""
     from modelserver.config.vehicle_file import load_config
     from modelserver.server import diagnostics as checks
-    from modelserver.server.diagnostics import discover_servers, is_clock_synchronized, probe_delivery, read_bus_facts
+    from modelserver.server.diagnostics import is_clock_synchronized, probe_delivery, read_bus_facts
     from modelserver.version import __version__
-    from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import find_url_problem, resolve_url
     from mstools.commands.check import check_vehicle
 
     vehicle: VehicleConfig | None = None
     versions = f"modelserver {__version__}, lcm {version('lcm')}, Python {platform.python_version()}"
     found = [Diagnosis(OK, "versions", versions)]
-    reply_prefix = REPLY_PREFIX
     if config is not None:
         try:
             found.append(diagnose_vehicle_file(check_vehicle(str(config))[1], config))
@@ -87,7 +89,6 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
             pass
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
-        reply_prefix = vehicle.lcm.reply_prefix
     provider = resolve_url(url)
     wrong, leaves = find_url_problem(provider), False
     if wrong:
@@ -98,8 +99,7 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
         found += checks.evaluate_bus(facts)
         if facts.address is None or facts.delivered:
             try:
-                servers = discover_servers(provider, prefix, reply_prefix)
-                found += checks.evaluate_servers(servers, prefix, __version__)
+                found += diagnose_daemons(provider, prefix, __version__)
             except BusError as error:
                 found.append(Diagnosis(ERROR, "bus", str(error), "no message can be received or sent"))
         leaves = facts.address is not None and facts.address.ttl > 0
@@ -107,6 +107,32 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     if config is not None and vehicle is not None:
         found += diagnose_vehicle(vehicle, config)
     return tuple(found)
+
+
+def diagnose_daemons(url: str, prefix: str, version: str) -> Iterator[Diagnosis]:
+    """Yield the findings on the daemons that publish health reports with this prefix. Raises BusError."""
+    from modelserver.wire.provider import open_lcm
+    from mstools.commands.status import HEALTH, DaemonListener
+
+    found: dict[tuple[str, int], Health] = {}
+
+    def add(health: Health) -> None:
+        found.setdefault((health.host[:64], health.pid), health)
+
+    DaemonListener(open_lcm(url), prefix, {HEALTH: add}).listen(REPORT_WAIT_S, lambda: len(found) > 1)
+    who = ", ".join(f"process {pid} on {host!r}" for host, pid in found)
+    if not found:
+        seen, why = "none publishes health reports", "start one if it should run"
+        yield Diagnosis(NOTE, "daemon", seen, why, "modelserver run -c vehicle.yaml")
+    elif len(found) > 1:
+        why = "clients get the replies of either, and POSE is from both; stop all but one, or give each its own prefix"
+        yield Diagnosis(ERROR, "daemon", f"{len(found)} answer at once: {who}", why, f"kill {list(found)[-1][1]}")
+    elif (theirs := next(iter(found.values())).version[:40]) != version:
+        why = "messages of one version may be undecodable for the other"
+        seen = f"{who} is version {theirs!r}, this command {version}"
+        yield Diagnosis(WARNING, "daemon", seen, why, "sudo systemctl restart modelserver")
+    else:
+        yield Diagnosis(OK, "daemon", f"one answers: {who}")
 
 
 def get_exit_code(findings: Sequence[Diagnosis]) -> int:
