@@ -23,9 +23,7 @@ START = 1_700_000_000_000_000
 
 
 def snapshot(t: float, **more: object) -> StateSample:
-    given = StateSample(
-        t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, lateral_speed=0.0, yaw_rate=0.0, phase=Phase.ALIGNED
-    )
+    given = StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, yaw_rate=0.0, phase=Phase.ALIGNED)
     return replace(given, **more)  # type: ignore[arg-type]
 
 

@@ -103,7 +103,6 @@ def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
     assert found.compare_distances() == pytest.approx((230.0, 230.0), rel=0.03)
     wheels, fixes = found.compare_distances()
     assert wheels / fixes == pytest.approx(1.0, abs=0.02)
-    assert found.distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.01)
     compared = compare_turn_rates(found.gyro, found.wheel_turn_rate)
     assert compared == pytest.approx((1.0, 1.0), abs=0.1)
     assert found.compare_with_course(found.gyro) == pytest.approx((1.0, 1.0), abs=0.1)
@@ -152,9 +151,7 @@ def test_given_samples_in_bursts_then_their_period_is_that_of_the_source(burst: 
 
 def make_data(**more: object) -> ReplayData:
     states = tuple(
-        StateSample(
-            t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, lateral_speed=0.0, yaw_rate=0.0, phase=Phase.ALIGNED
-        )
+        StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, yaw_rate=0.0, phase=Phase.ALIGNED)
         for t in range(100)
     )
     given = ReplayData(
@@ -276,13 +273,6 @@ def test_given_a_filter_that_was_restarted_then_checks_of_its_state_are_left_out
     (found,) = collect_findings(make_data(snapshots=states, decisions=restarts))
     assert found.title == "The filter was restarted"
     assert "first of 3 times" in found.observation
-
-
-def test_given_a_drive_then_its_distance_is_known_without_any_state() -> None:
-    assert make_motion().distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.05)
-    assert SensorMotion().distance_travelled() != SensorMotion().distance_travelled()  # not known
-    distances = make_motion().compare_distances()
-    assert distances.fixes == pytest.approx(distances.wheels, rel=0.1)
 
 
 @pytest.mark.parametrize(
