@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,7 +20,6 @@ import pytest
 from support_daemon import write_raptor
 from support_lcm import MODELSERVER, TIMEOUT_S
 
-from modelserver.errors import NoServerError
 from mstools.commands import demo
 from mstools.launch.processes import ChildProcesses, LaunchError
 
@@ -209,15 +208,16 @@ def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running(sma
     shutil.rmtree(Path(vehicle).parent)
 
 
-def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_reported_is_reported(tmp_path):
-    def nobody() -> list[str]:
+def test_given_a_daemon_that_fails_when_its_report_is_waited_for_then_what_it_reported_is_reported(tmp_path):
+    def listen(_: float, is_done: Callable[[], bool]) -> bool:
         children._started[0].process.wait()
-        raise NoServerError("no reply")
+        return is_done()
 
+    listener = cast(demo.PoseListener, SimpleNamespace(listen=listen, health=None, drivers={}))
     with ChildProcesses() as children:
         children.start("daemon", "-c", "import sys; sys.exit('the geometry is wrong')")
         with pytest.raises(LaunchError, match=r"process daemon ended with exit code 1(.|\n)*the geometry is wrong"):
-            demo.wait_for_answer(nobody, children)
+            demo.wait_for_reports(listener, (), children)
 
 
 def test_given_an_error_in_the_demo_when_it_leaves_then_its_children_are_ended(tmp_path):

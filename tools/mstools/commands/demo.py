@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import NoServerError
 from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
@@ -95,11 +94,9 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
     vehicle = load_config(lines.vehicle)
     prefix = vehicle.lcm.channel_prefix
     listener = PoseListener(lines.url, prefix)
-    with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=0.25, retries=0) as platform:
-        bodies = wait_for_answer(platform.get_body_list, children)
-        wait_for_drivers(listener, lines, children)
-        # a dozen processes on a busy machine: a reply may be late
-        platform.timeout, platform.retries = 1.0, 9
+    # a dozen processes on a busy machine: a reply may be late
+    with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=1.0, retries=9) as platform:
+        wait_for_reports(listener, lines.devices, children)
 
         typer.echo("\n2. Emulated devices, a process each, found by their drivers")
         start_utime = get_start_utime(time.monotonic() - start)
@@ -108,7 +105,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
         typer.echo("\n3. Queries of the geometry")
-        typer.echo(f"bodies            {', '.join(bodies)}")
+        typer.echo(f"bodies            {', '.join(platform.get_body_list())}")
         typer.echo(f"Digiclops has     {', '.join(platform.get_body_frame_list('Digiclops'))}")
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")))
 
@@ -156,29 +153,15 @@ class PoseListener(HealthListener):
             each.set_queue_capacity(0)
 
 
-def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> list[str]:
-    """Query until the daemon answers. Raises LaunchError if it fails or takes too long."""
-    deadline = time.monotonic() + START_TIMEOUT_S
-    while True:
-        try:
-            return ask()
-        except NoServerError:
-            children.check()
-            if time.monotonic() > deadline:
-                why = f"no reply of the daemon within {START_TIMEOUT_S:g} s"
-                raise LaunchError(f"{why}; run the demo with --verbose") from None
+def wait_for_reports(listener: PoseListener, drivers: Iterable[str], children: ChildProcesses) -> None:
+    """Wait for a health report of the daemon and of every driver. Raises LaunchError if one fails or takes too long."""
 
-
-def wait_for_drivers(listener: PoseListener, lines: EmulatedConnections, children: ChildProcesses) -> None:
-    """Wait for a health report of every driver. Raises LaunchError if one fails or takes too long."""
-
-    def has_all() -> bool:
+    def list_missing() -> list[str]:
         children.check()
-        return lines.devices.keys() <= listener.drivers.keys()
+        return ["daemon"] * (listener.health is None) + [name for name in drivers if name not in listener.drivers]
 
-    if not listener.listen(START_TIMEOUT_S, has_all):
-        missing = ", ".join(name for name in lines.devices if name not in listener.drivers)
-        raise LaunchError(f"no report within {START_TIMEOUT_S:g} s of driver {missing}; see --verbose")
+    if not listener.listen(START_TIMEOUT_S, lambda: not list_missing()):
+        raise LaunchError(f"no report within {START_TIMEOUT_S:g} s of {', '.join(list_missing())}; see --verbose")
 
 
 def list_missing_devices(drivers: dict[str, DriverHealth], lines: EmulatedConnections) -> list[str]:

@@ -39,7 +39,7 @@ SAME_METERS: Final = 1e-9
 SAME_RADIANS: Final = 1e-9
 """A position or rotation that differs by less stays as it is written."""
 
-WRITTEN_ORDER: Final = ("template", "from", "to", *POSE_KEYS, "sigma", "joint", "description")
+ENTRY_KEYS: Final = ("template", "from", "to", *POSE_KEYS, "sigma", "joint", "description")
 
 _PLAIN_NAME = re.compile(r"[A-Za-z][\w.-]*")
 _PLAIN_TEXT = re.compile(r"[A-Za-z][\w .;/()-]*[\w.)]")
@@ -132,13 +132,13 @@ class GeometryDocument:
         old, new = _read_pose(text, path), Pose.from_rpy(xyz, *map(math.radians, rpy_deg))
         is_turned = old.distance(new)[1] > SAME_RADIANS
         has_matrix = text.has((*path, "matrix"))
+        if has_matrix or max(abs(a - b) for a, b in zip(old.xyz, xyz, strict=True)) > SAME_METERS:
+            text = _set_numbers(text, path, "xyz", xyz)
         if is_turned or has_matrix:
             for key in ("rpy", "quaternion", "rotation", "matrix"):
                 if text.has((*path, key)):
                     text = text.remove((*path, key))
             text = _set_numbers(text, path, "rpy_deg", rpy_deg)
-        if has_matrix or max(abs(a - b) for a, b in zip(old.xyz, xyz, strict=True)) > SAME_METERS:
-            text = _set_numbers(text, path, "xyz", xyz)
         return GeometryDocument(text)
 
     def set_sigma(self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None) -> GeometryDocument:
@@ -151,7 +151,7 @@ class GeometryDocument:
             if values is not None
         ]
         if stated:
-            return GeometryDocument(_set(text, path, "sigma", f"{{{', '.join(stated)}}}"))
+            return GeometryDocument(text.set((*path, "sigma"), f"{{{', '.join(stated)}}}"))
         return GeometryDocument(text.remove((*path, "sigma")) if text.has((*path, "sigma")) else text)
 
     def set_description(self, item: GeometryItem, description: str) -> GeometryDocument:
@@ -160,7 +160,7 @@ class GeometryDocument:
         if description == text.get_text((*path, "description")):
             return GeometryDocument(text)
         if description:
-            return GeometryDocument(_set(text, path, "description", _format_word(description)))
+            return GeometryDocument(text.set((*path, "description"), _format_word(description)))
         return GeometryDocument(text.remove((*path, "description")) if text.has((*path, "description")) else text)
 
     def set_ends(self, constraint: str, from_: str, to: str) -> GeometryDocument:
@@ -168,28 +168,20 @@ class GeometryDocument:
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         for key, frame in (("from", from_), ("to", to)):
             if _normalize(text.get_text((*path, key))) != frame:
-                text = _set(text, path, key, _format_full_name(frame))
+                text = text.set((*path, key), _format_full_name(frame))
         return GeometryDocument(text)
 
     def set_joint(self, constraint: str, old: Joint, new: Joint) -> GeometryDocument:
-        """Set the joint of a constraint, `old` before; keys whose value is the same stay as they are written."""
+        """Set the type and axis of the joint of a constraint, `old` before."""
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         inside = (*path, "joint")
         if not new.is_movable:
             return GeometryDocument(text.remove(inside) if text.has(inside) else text)
-        was, now = (dict(each.split(": ", 1) for each in format_joint_fields(joint)) for joint in (old, new))
-        if not text.keys(inside):
-            value = f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}"
-            return GeometryDocument(_set(text, path, "joint", value))
-        for key in [*was, *(each for each in now if each not in was)]:
-            if was.get(key) == now.get(key):
-                continue
-            for written in (key, key.removesuffix("_deg")):
-                if text.has((*inside, written)) and (written != key or key not in now):
-                    text = text.remove((*inside, written))
-            if key in now:
-                text = text.set((*inside, key), now[key])
-        return GeometryDocument(text)
+        now = dict(each.split(": ", 1) for each in format_joint_fields(new))
+        if old.type is new.type and text.keys(inside):
+            return GeometryDocument(text.set((*inside, "axis"), now["axis"]) if old.axis != new.axis else text)
+        value = f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}"
+        return GeometryDocument(text.set(inside, value))
 
     # --- items
 
@@ -306,18 +298,7 @@ def _read_pose(text: YamlText, path: KeyPath) -> Pose:
         root = parse_yaml(text.get_entry(path).encode())
     except SyntaxProblemError:
         raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first") from None
-    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
-
-
-def _set(text: YamlText, path: KeyPath, key: str, value: str) -> YamlText:
-    """Set a key of an entry; a new one stands after those that usually precede it."""
-    if text.has((*path, key)):
-        return text.set((*path, key), value)
-    usual = WRITTEN_ORDER[: WRITTEN_ORDER.index(key)]
-    before = [each for each in text.keys(path) if each in usual]
-    if before or not text.keys(path):
-        return text.add(path, f"{key}: {value}", before[-1] if before else "")
-    return text.insert_first(path, f"{key}: {value}")
+    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", ENTRY_KEYS)) or Pose.identity()
 
 
 def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float]) -> YamlText:
@@ -329,7 +310,7 @@ def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float
         return text
     same = [a == b for a, b in zip(old, new, strict=True)]
     shown = [written[n] if same[n] else format_number(value) for n, value in enumerate(new)]
-    return _set(text, path, key, f"[{', '.join(shown)}]")
+    return text.set((*path, key), f"[{', '.join(shown)}]")
 
 
 def _check_finite(values: Sequence[float]) -> None:
@@ -372,8 +353,6 @@ def _normalize(name: str) -> str:
 MAX_STEPS = 500
 """Changes that can be undone."""
 
-_BOM = "\ufeff"
-
 
 class CheckedText(NamedTuple):
     """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
@@ -405,7 +384,7 @@ class EditedFile:
         if content.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
             raise EditError(f"{self.path} is XML; only YAML is edited: modelserver convert {self.path} geometry.yaml")
         try:
-            return content.decode()
+            return content.decode("utf-8-sig")
         except UnicodeDecodeError:
             raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
 
@@ -432,7 +411,7 @@ class EditSession:
     def read(self) -> None:
         """Read the file again; all changes are dropped. Raises as `EditSession`, with all as before."""
         saved = self.file.read()
-        document = GeometryDocument(saved.removeprefix(_BOM))
+        document = GeometryDocument(saved)
         if not document.list_items():
             path = self.file.path
             raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
@@ -465,7 +444,7 @@ class EditSession:
     @property
     def is_changed(self) -> bool:
         """Whether there is something to save."""
-        return self.document.text != self._saved.removeprefix(_BOM)
+        return self.document.text != self._saved
 
     @property
     def has_errors(self) -> bool:
@@ -511,7 +490,7 @@ class EditSession:
 
     def make_diff(self) -> str:
         """Return what saving changes, as a unified diff."""
-        old, new = (text.splitlines() for text in (self._saved.removeprefix(_BOM), self.document.text))
+        old, new = (text.splitlines() for text in (self._saved, self.document.text))
         name = self.file.path.name
         return "\n".join(difflib.unified_diff(old, new, name, f"{name} (edited)", lineterm=""))
 
@@ -525,7 +504,6 @@ class EditSession:
             raise EditError(f"{self.file.path} was removed meanwhile; nothing is saved") from None
         if current != self._saved:
             raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Read it again first")
-        text = (_BOM if self._saved.startswith(_BOM) else "") + self.document.text
         with open_atomic(str(self.file.path), replace=True) as stream:
-            stream.write(text)
-        self._saved = text
+            stream.write(self.document.text)
+        self._saved = self.document.text

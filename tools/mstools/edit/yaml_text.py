@@ -133,14 +133,13 @@ class YamlText:
             return self._replace(last.end, last.end, f", {entry}")
         indent = " " * entries[0].key.start_mark.column
         end = self._find_line_end(last.end)
-        gap = self._newline if self._has_gaps(entries) else ""
-        return self._replace(end, end, self._newline + gap + self._indent(entry, indent))
+        return self._replace(end, end, self._newline + self._indent(entry, indent))
 
     def _fill(self, path: KeyPath, entry: str, in_block: bool) -> YamlText:
         """Add the first entry of a mapping that is empty or has no value."""
         found = self._require(path)
         if in_block and not found.is_flow:
-            indent = " " * (found.key.start_mark.column + self._get_step())
+            indent = " " * (found.key.start_mark.column + 2)
             return self._set_value(found, self._newline + self._indent(entry, indent))
         return self._set_value(found, f" {{{entry}}}")
 
@@ -149,18 +148,6 @@ class YamlText:
         if entry.colon:
             return self._replace(entry.colon, entry.end, value)
         return self._replace(entry.end, entry.end, f":{value}")
-
-    def insert_first(self, path: KeyPath, entry: str) -> YamlText:
-        """Add an entry on one line before the others of a mapping."""
-        entries = self.entries(path)
-        if not entries:
-            return self.add(path, entry)
-        self._check_own(path, is_whole=False)
-        first = entries[0]
-        at = first.key.start_mark.index
-        if first.is_flow:
-            return self._replace(at, at, f"{entry}, ")
-        return self._replace(at, at, entry + self._newline + " " * first.key.start_mark.column)
 
     def remove(self, path: KeyPath) -> YamlText:
         """Remove a key with its value, and the comment on the lines directly before it."""
@@ -313,20 +300,6 @@ class YamlText:
                 break
             begin = previous
         return begin
-
-    def _has_gaps(self, entries: list[TextEntry]) -> bool:
-        """Return whether a blank line stands between the entries of a block, by its first two."""
-        if len(entries) < 2:
-            return False
-        return self._newline * 2 in self.text[entries[0].end : entries[1].line + 1]
-
-    def _get_step(self) -> int:
-        """Return by how much the file indents: as its first nested block does."""
-        for entry in self.entries():
-            for inner in self._list_entries(entry.value):
-                if not inner.is_flow:
-                    return int(inner.key.start_mark.column)
-        return 2
 
     def _indent(self, entry: str, indent: str) -> str:
         lines = [indent + line if line.strip() else "" for line in entry.splitlines()]
