@@ -173,16 +173,6 @@ def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
     if not interface.up:
         command = f"sudo ip link set {interface.name} up"
         return Diagnosis(ERROR, subject, f"{observed}, which is down", "published messages are lost", command)
-    if interface.loopback and not interface.multicast:
-        why = "some programs skip an interface without the multicast flag"
-        command = f"sudo ip link set {interface.name} multicast on"
-        return Diagnosis(NOTE, subject, f"{observed}, which lacks the multicast flag", why, command)
-    if address.ttl == 0 and not interface.loopback:
-        why = (
-            f"nothing leaves the machine (ttl=0), but the bus fails whenever {interface.name} goes down; a route "
-            f"through {lo} stays"
-        )
-        return Diagnosis(NOTE, subject, observed, why, by_lo)
     if address.ttl > 0 and interface.loopback:
         why = f"the URL has ttl={address.ttl}, but no other machine receives anything"
         flush = f"sudo ip route flush match {group} dev {lo}"

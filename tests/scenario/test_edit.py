@@ -283,6 +283,3 @@ def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page:
     press(page, "Save")
     wait_for_text(page, "changed meanwhile on disk")
     assert path.read_text() == other
-    press(page, "Read the file again")
-    press(page, "Drop them")
-    wait_for_text(page, "^geometry.yaml: saved$")

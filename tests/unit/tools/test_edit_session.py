@@ -115,8 +115,7 @@ def test_given_a_file_that_changed_meanwhile_then_it_is_not_written_over(folder:
     with pytest.raises(EditError, match="changed meanwhile"):
         session.save()
     assert path.read_text() == other
-    session.read()
-    assert not session.is_changed
+    session = open_session(path)
     move(session, 0.07)
     session.save()
     assert load_model(path).name == "other"
@@ -138,14 +137,11 @@ def test_given_a_folder_without_permission_then_the_error_names_the_file_and_the
     assert session.is_changed
 
 
-def test_given_a_file_that_was_broken_meanwhile_then_it_is_neither_read_nor_overwritten(folder: Path) -> None:
+def test_given_a_file_that_was_broken_meanwhile_then_it_is_not_overwritten(folder: Path) -> None:
     path = folder / "geometry.yaml"
     session = open_session(path)
     move(session, 0.07)
     path.write_text("bodies: {")
-    with pytest.raises(EditError, match="not well-formed"):
-        session.read()
-    assert session.is_changed
     with pytest.raises(EditError, match="changed meanwhile"):
         session.save()
     assert path.read_text() == "bodies: {"

@@ -151,7 +151,7 @@ def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken
     before = config.read_bytes()
     code, words, err = run(log, "-c", config, "--quick", "-o", out)
     assert code == 0
-    assert "NIS, gps_position" in words
+    assert "RMSE at withheld fixes" in words
     assert "gps_white_share: 0.15 -> 0.3" in err
     proposed = yaml.safe_load(out.read_text())["localization"]["filter"]
     assert proposed["gps_white_share"] >= 0.3

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
-from modelserver.errors import Problem, Severity
+from modelserver.errors import GeometryError, Problem, Severity
 from modelserver.geometry import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
@@ -35,7 +35,7 @@ class EditedPage:
         self.actions = Actions()
         self.shown: list[Model] = []
         scene = VehicleScene(server, None, lambda frame, is_reference: None)
-        scene.set_model(self.session.drawn, "Raptor:CG")
+        scene.set_model(self.session.model, "Raptor:CG")
         self.scene = scene
         self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
         self.fields = self.editor._fields
@@ -53,7 +53,6 @@ class EditedPage:
 
     @property
     def model(self) -> Model:
-        assert self.session.model is not None
         return self.session.model
 
     def constraint(self, name: str) -> Any:
@@ -69,43 +68,11 @@ def page(tmp_path: Path) -> Iterator[EditedPage]:
     opened.close()
 
 
-ERRORS = {
-    "unknown body": ("to: Digiclops:Mount", "to: Digiclopz:Mount", (ItemKind.CONSTRAINT, "DigiclopsFixed")),
-    "sigma": ("xyz: [1.15, 0.6, -0.017]", "xyz: [1.15, 0.6]", (ItemKind.FRAME, "Raptor:CG")),
-}
-
-
-@pytest.fixture(params=ERRORS)
-def wrong_page(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[EditedPage, GeometryItem]]:
-    right, wrong, culprit = ERRORS[request.param]
-    for each in ("vehicle.yaml", "raptor.dbc"):
-        shutil.copy(RAPTOR / each, tmp_path)
+def test_given_a_file_with_an_error_then_it_is_not_edited(tmp_path: Path) -> None:
     text = (RAPTOR / "geometry.yaml").read_text()
-    assert right in text
-    (tmp_path / "geometry.yaml").write_text(text.replace(right, wrong, 1))
-    opened = open_page(port=0)
-    yield EditedPage(tmp_path / "vehicle.yaml", opened.server), GeometryItem(*culprit)
-    opened.close()
-
-
-def test_given_a_file_with_an_error_then_it_opens_with_its_problems_and_can_be_fixed(
-    wrong_page: tuple[EditedPage, GeometryItem],
-) -> None:
-    page, item = wrong_page
-    session, editor = page.session, page.editor
-    assert session.model is None
-    assert "not joined" in editor._status.content
-    assert "**error**" in editor._problem_texts.content
-    editor.select(item)
-    text = session.document.get_yaml(item)
-    for right, wrong, _ in ERRORS.values():
-        text = text.replace(wrong, right)
-    editor._text.value = text
-    editor._write_text()
-    assert not session.has_errors
-    assert page.shown == [session.model]
-    session.save()
-    assert (session.file.path).read_text() == (RAPTOR / "geometry.yaml").read_text()
+    (tmp_path / "geometry.yaml").write_text(text.replace("to: Digiclops:Mount", "to: Digiclopz:Mount", 1))
+    with pytest.raises(GeometryError, match="Digiclopz"):
+        EditSession(EditedFile.open(tmp_path / "geometry.yaml"))
 
 
 @pytest.mark.slow
@@ -298,16 +265,13 @@ def test_given_a_number_in_any_notation_then_it_is_what_was_typed(page: EditedPa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1", "0,1,2", "1.000,5", "--1", "nan", "inf"])
-def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
+def test_given_what_is_no_number_then_it_is_named_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
     page.editor.select(LENS)
     before, field = page.session.document.text, page.fields._fields["xyz"]
     field.texts = (typed, "0", "0.06")
-    assert "color" in field._problem.content
     assert "x (m)" in page.set()
     assert page.session.document.text == before
     assert field.texts[0] == typed
-    field.texts = ("0.1", "0", "0.06")
-    assert field._problem.content == ""
 
 
 def test_given_a_typed_number_when_another_item_is_selected_then_it_is_set(page: EditedPage) -> None:

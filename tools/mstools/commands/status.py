@@ -220,9 +220,7 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
         return f"{text}Other reports: {there}. Did you mean {do}?"
     if channels:
         names = ", ".join(quote(each, 64) for each in sorted(channels)[:MAX_SHOWN_NAMES])
-        names += f" and {len(channels) - MAX_SHOWN_NAMES} more" if len(channels) > MAX_SHOWN_NAMES else ""
-        do = "is the daemon running? modelserver run -c FILE, or systemctl status modelserver"
-        return f"{text}The bus has other channels ({names}): {do}"
+        return f"{text}The bus has other channels ({names}): is the daemon running? modelserver run -c FILE"
     return (
         f"{text}The bus has no messages at all: is the daemon running (modelserver run -c FILE, or systemctl status "
         "modelserver), and on this bus (--url, or -c with its vehicle file)? modelserver doctor checks the bus"

@@ -202,12 +202,6 @@ def format_result(log: str, result: TuningResult) -> list[str]:
         ("log-likelihood of a withheld fix", result.first.likelihood, found.score.likelihood),
     ]
     text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
-    later = {each.kind: each for each in result.after[0].consistency}
-    for each in result.before[0].consistency:
-        nis, beyond = f"{each.mean:10.2f}{'':10}", f"{each.beyond:.1%}"
-        if (after := later.get(each.kind)) is not None:
-            nis, beyond = f"{each.mean:10.2f}{after.mean:10.2f}", f"{each.beyond:.1%} -> {after.beyond:.1%}"
-        text.append(f"{'NIS, ' + each.kind:34}{nis}   beyond 95 %: {beyond}")
     text += [f"{name}: {result.begin[name]:g} -> {value:g}" for name, value in found.settings.items()]
     if not found.settings:
         text.append("No step helps enough: the settings fit this recording.")

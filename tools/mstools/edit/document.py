@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import Problem, SyntaxProblemError, has_error, quote
+from modelserver.errors import GeometryError, Problem, SyntaxProblemError, has_error, quote
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
 from modelserver.formats.common import format_number, parse_number
@@ -127,7 +127,6 @@ class GeometryDocument:
 
     def set_pose(self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3) -> GeometryDocument:
         """Set the pose of a frame on its body, or of a constraint. Only what differs is written."""
-        _check_finite((*xyz, *rpy_deg))
         text, path = self._open(item)
         old, new = _read_pose(text, path), Pose.from_rpy(xyz, *map(math.radians, rpy_deg))
         is_turned = old.distance(new)[1] > SAME_RADIANS
@@ -143,7 +142,6 @@ class GeometryDocument:
 
     def set_sigma(self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None) -> GeometryDocument:
         """Set the standard deviations of a frame or constraint; a part that is None is not stated."""
-        _check_finite([*(xyz or ()), *(rpy_deg or ())])
         text, path = self._open(item)
         stated = [
             f"{key}: {format_scalar_or_list(tuple([round(each, DECIMALS) for each in values]))}"
@@ -313,13 +311,6 @@ def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float
     return text.set((*path, key), f"[{', '.join(shown)}]")
 
 
-def _check_finite(values: Sequence[float]) -> None:
-    """Raise EditError for a number that is not finite."""
-    for value in values:
-        if not math.isfinite(value):
-            raise EditError(f"{value} is no number of a pose or sigma; enter a finite one")
-
-
 def _parse(text: str) -> float:
     try:
         return parse_number(text)
@@ -354,14 +345,6 @@ MAX_STEPS = 500
 """Changes that can be undone."""
 
 
-class CheckedText(NamedTuple):
-    """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
-
-    model: Model | None
-    drawn: Model | None
-    problems: tuple[Problem, ...]
-
-
 @dataclass(frozen=True)
 class EditedFile:
     """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it."""
@@ -388,54 +371,39 @@ class EditedFile:
         except UnicodeDecodeError:
             raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
 
-    def check(self, text: str, variables: Mapping[str, str]) -> CheckedText:
-        """Return what a text has, with all problems, also of frames in the vehicle file."""
-        builder = parse_content(text.encode(), str(self.path), variables)
-        model, problems = builder.check()
-        partial = model or builder.build_bodies()
-        if self.config is not None and partial is not None:
+    def check(self, text: str, variables: Mapping[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
+        """Return the model in a text, None if it has an error, and all problems, also of frames in the vehicle file."""
+        model, problems = parse_content(text.encode(), str(self.path), variables).check()
+        if self.config is not None and model is not None:
             from modelserver.server.vehicle import find_frame_problems
 
-            problems += tuple(find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
-        return CheckedText(model, partial, problems)
+            problems += tuple(find_frame_problems(self.config, model, str(self.vehicle), True))
+        return model, problems
 
 
 class EditSession:
-    """Edit a file. Raises EditError for a file that cannot be edited, OSError."""
+    """Edit a file. `model` is the last one without an error.
+
+    Raises EditError for a file that cannot be edited, GeometryError for one with an error, OSError.
+    """
 
     def __init__(self, file: EditedFile, variables: Mapping[str, str] | None = None):
         self.file = file
         self._variables = variables or {}
-        self.read()
-
-    def read(self) -> None:
-        """Read the file again; all changes are dropped. Raises as `EditSession`, with all as before."""
-        saved = self.file.read()
-        document = GeometryDocument(saved)
-        if not document.list_items():
-            path = self.file.path
-            raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
-        drawn = self.file.check(document.text, self._variables).drawn
-        if drawn is None:
-            raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
-        self._saved = saved
-        self._steps = [document]
+        self._saved = file.read()
+        self._steps = [GeometryDocument(self._saved)]
         self._undone: list[GeometryDocument] = []
-        self.drawn: Model = drawn
-        """The last model without an error; before there is one, the bodies of the file alone."""
-        self.model: Model | None = None
-        """The last model without an error."""
-        self._loaded: GeometryDocument | None = None
-        self._check()
+        if not self.document.list_items():
+            raise EditError(f"{file.path} has no bodies in YAML: modelserver convert {file.path} geometry.yaml")
+        model, self.problems = file.check(self._saved, self._variables)
+        if model is None:
+            raise GeometryError(self.problems)
+        self.model, self._loaded = model, self.document
 
     def _check(self) -> None:
-        found = self.file.check(self.document.text, self._variables)
-        self.problems = found.problems
-        if found.model is not None:
-            self.model = self.drawn = found.model
-            self._loaded = self.document
-        elif self.model is None and found.drawn is not None:
-            self.drawn = found.drawn
+        model, self.problems = self.file.check(self.document.text, self._variables)
+        if model is not None:
+            self.model, self._loaded = model, self.document
 
     @property
     def document(self) -> GeometryDocument:
@@ -484,7 +452,7 @@ class EditSession:
     def is_as_loaded(self, item: GeometryItem) -> bool:
         """Return whether the entry of an item is written as in the document of `model`."""
         try:
-            return self._loaded is not None and self._loaded.get_yaml(item) == self.document.get_yaml(item)
+            return self._loaded.get_yaml(item) == self.document.get_yaml(item)
         except EditError:
             return False
 
@@ -503,7 +471,7 @@ class EditSession:
         except FileNotFoundError:
             raise EditError(f"{self.file.path} was removed meanwhile; nothing is saved") from None
         if current != self._saved:
-            raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Read it again first")
+            raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Open it again")
         with open_atomic(str(self.file.path), replace=True) as stream:
             stream.write(self.document.text)
         self._saved = self.document.text

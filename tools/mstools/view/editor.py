@@ -8,7 +8,6 @@ computes a pose from a frame with which it coincides, or from distances to other
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -53,8 +52,6 @@ PRECISION: Final = 6
 
 SAME: Final = 10.0**-PRECISION
 """A drag by less has not moved, or turned, what is dragged."""
-
-_RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
 
 Change = Callable[[GeometryDocument], GeometryDocument]
 ChangeItem = Callable[..., bool]
@@ -102,7 +99,7 @@ class Editor:
         self._editing = editing
         self._actions = actions
         self._show = show
-        self._shown = session.drawn
+        self._shown = session.model
         self._item = self._find_first(ItemKind.FRAME)
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
@@ -112,7 +109,6 @@ class Editor:
         self._redo = self._add_button("Redo", lambda: self._step(session.redo))
         self._save = self._add_button("Save ...", self._ask_save)
         self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
-        self._add_button("Read the file again", self._ask_read)
         with gui.add_folder("Problems"):
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
@@ -187,7 +183,11 @@ class Editor:
 
     def _refresh(self) -> None:
         session = self._session
-        self._show_status()
+        errors = sum(each.severity is Severity.ERROR for each in session.problems)
+        state = "not saved" if session.is_changed else "saved"
+        if errors:
+            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows the last model"
+        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
         self._undo.disabled, self._redo.disabled = not session.can_undo, not session.can_redo
         self._save.disabled = not session.is_changed or session.has_errors
         self._apply.disabled = session.is_changed
@@ -195,20 +195,9 @@ class Editor:
         if self._item not in session.document.list_items():
             self._item = self._find_first(self._item.kind)
         self.select(self._item)
-        if session.model is not None and session.model is not self._shown:
-            self._shown = session.drawn
+        if session.model is not self._shown:
+            self._shown = session.model
             self._show(session.model)
-
-    def _show_status(self) -> None:
-        """Show whether there is something to save, and what is against it."""
-        session = self._session
-        errors = sum(each.severity is Severity.ERROR for each in session.problems)
-        state = "not saved" if session.is_changed else "saved"
-        if errors:
-            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
-                "the last model" if session.model is not None else "the bodies, not joined"
-            )
-        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
 
     def _show_problems(self) -> None:
         found = sorted(self._session.problems, key=lambda each: list(Severity).index(each.severity))
@@ -310,14 +299,6 @@ class Editor:
         text = f"{fence}diff\n{diff}\n{fence}"
         self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
 
-    def _ask_read(self) -> None:
-        """Read the file again, after a question if changes would be lost."""
-        if not self._session.is_changed:
-            self._step(self._session.read)
-            return
-        text = "The changes that are not saved are dropped."
-        self._ask("Read the file again", text, "Drop them", lambda: self._step(self._session.read))
-
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
             # in another tab
@@ -347,7 +328,7 @@ class Editor:
         if not dry_run:
             self._report(f"applied: the service has geometry revision {reply.revision}")
             return
-        own = self._session.model.revision if self._session.model is not None else ""
+        own = self._session.model.revision
         if reply.revision != own:
             self._report(
                 f"not applied: the service reads another geometry (revision {reply.revision}, this file {own}); "
@@ -394,17 +375,14 @@ def _format_field(value: float) -> str:
 
 
 class NumberFields:
-    """Fields of numbers with a label each. What is no number is marked in red, and stays."""
+    """Fields of numbers with a label each."""
 
-    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float], actions: Actions):
+    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float]):
         self._labels = tuple(labels)
         self._given = tuple(map(float, values))
         self._texts: list[Any] = [
             gui.add_text(label, _format_field(value)) for label, value in zip(labels, values, strict=True)
         ]
-        self._problem: Any = gui.add_html("")
-        for each in self._texts:
-            actions.on_update(each, self.mark)
 
     @property
     def value(self) -> tuple[float, ...]:
@@ -431,25 +409,15 @@ class NumberFields:
     def texts(self, words: Sequence[str]) -> None:
         for each, word in zip(self._texts, words, strict=True):
             each.value = word
-        self.mark()
-
-    def mark(self) -> None:
-        """Show why the numbers cannot be read, if so."""
-        problem = ""
-        try:
-            _ = self.value
-        except EditError as error:
-            problem = _RED.format(html.escape(str(error)))
-        self._problem.content = problem
 
 
 def list_frames(document: GeometryDocument) -> list[str]:
     return [each.name for each in document.list_items() if each.kind is ItemKind.FRAME]
 
 
-def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint | None:
+def find_part(model: Model, item: GeometryItem) -> BodyFrame | Constraint | None:
     """Return the frame or constraint of a model that an item is; None for a body, and for one that is not there."""
-    if model is None or item.kind is ItemKind.BODY:
+    if item.kind is ItemKind.BODY:
         return None
     if item.kind is ItemKind.CONSTRAINT:
         return next((each for each in model.constraints if each.name == item.name), None)
@@ -482,7 +450,7 @@ class ItemFields:
     def show(self, item: GeometryItem) -> None:
         self._item = item
         self._fields, self._given = {}, {}
-        self._part = find_part(self._session.drawn, item)
+        self._part = find_part(self._session.model, item)
         old = self._form
         with self._server.atomic():
             with self._place:
@@ -508,14 +476,14 @@ class ItemFields:
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:
             return self._part.description
-        bodies = {each.name: each for each in self._session.drawn.bodies}
+        bodies = {each.name: each for each in self._session.model.bodies}
         return bodies[item.name].description if item.name in bodies else ""
 
     def _add(self, key: str, field: Any) -> None:
         self._fields[key], self._given[key] = field, field.value
 
     def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
-        self._fields[key] = NumberFields(self._gui, labels, values, self._actions)
+        self._fields[key] = NumberFields(self._gui, labels, values)
 
     def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
         degrees = [math.degrees(each) for each in pose.rpy]
@@ -611,7 +579,7 @@ class ItemFields:
 
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
-        model, part = self._session.drawn, self._part
+        model, part = self._session.model, self._part
         if part is None:
             return None
         if isinstance(part, BodyFrame):
@@ -656,8 +624,8 @@ class PlacePanel:
             self._rows: list[tuple[Any, NumberFields]] = []
             for number in range(1, MAX_DISTANCES + 1):
                 frame = gui.add_dropdown(f"From {number}", (NO_CHOICE,))
-                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
-            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
+                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,))))
+            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,))
             actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
             self._result = gui.add_markdown("")
 
@@ -682,10 +650,9 @@ class PlacePanel:
         item = self._item
 
         def change(document: GeometryDocument) -> GeometryDocument:
-            model = self._session.model
-            if model is None or self._session.has_errors:
+            if self._session.has_errors:
                 raise EditError("fix the errors first; a pose is computed from a geometry without any")
-            return _write_placement(document, item, *compute(model, item))
+            return _write_placement(document, item, *compute(self._session.model, item))
 
         self._change(change)
 
