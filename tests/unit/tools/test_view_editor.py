@@ -298,35 +298,13 @@ def test_given_frames_that_coincide_then_the_constraint_is_placed(page: EditedPa
     page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FLEALateral"))
     place = page.editor._place
     place._frame.value, place._target.value = "FLEA:Lens", "Digiclops:RightLens"
-    place._place(place._coincide)
+    place._place()
     assert page.message == ""
     assert page.model.get_transformation("FLEA:Lens", "Digiclops:RightLens").pose.is_close(Pose.identity(), 2e-6, 1e-7)
     place._target.value = "Raptor:CG"
     place._frame.value = "Raptor:Origin"
-    place._place(place._coincide)
+    place._place()
     assert "one side" in page.message
-
-
-def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page: EditedPage) -> None:
-    item = GeometryItem(ItemKind.FRAME, "Raptor:CG")
-    page.editor.select(item)
-    true = np.array((1.2, 0.55, 0.1))
-    place = page.editor._place
-    others = ["Raptor:FrontLeftCorner", "Raptor:FrontRightCorner", "Raptor:RearLeftCorner", "Raptor:CabFrontRailCenter"]
-    for (frame, distance), name in zip(place._rows, others, strict=False):
-        frame.value = name
-        distance.value = [float(np.linalg.norm(true - page.model.frame(name).pose.xyz))]
-    place._place(place._measure)
-    assert page.message == ""
-    frame = page.model.frame(item.name)
-    assert frame.pose.xyz == pytest.approx(true, abs=1e-5)
-    assert frame.sigma is not None
-    assert 0.0 < max(frame.sigma.position) < 0.5
-    assert "+0.0 mm" in place._result.content.replace("-0.0", "+0.0")
-    for row, _ in place._rows[2:]:
-        row.value = "-"
-    place._place(place._measure)
-    assert "three frames" in page.message
 
 
 def test_given_an_error_elsewhere_then_an_item_keeps_its_notation(page: EditedPage) -> None:

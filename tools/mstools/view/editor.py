@@ -3,7 +3,7 @@
 All changes go through an `EditSession`. Callbacks of the page only queue an action, which the viewer executes between
 two pictures. `ItemFields` sets the numbers and texts of an item together: each number has a text field, so that what is
 typed stays as it is typed, and a number that was not changed in its field is as exact as it was given. `PlacePanel`
-computes a pose from a frame with which it coincides, or from distances to others.
+computes a pose from a frame with which it coincides.
 """
 
 from __future__ import annotations
@@ -24,15 +24,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
-from modelserver.geometry.placement import (
-    DistanceFit,
-    Placement,
-    PlacementError,
-    list_measured_points,
-    locate_by_distances,
-    place_constraint,
-    place_frame,
-)
+from modelserver.geometry.placement import Placement, PlacementError, place_constraint, place_frame
 from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -40,11 +32,10 @@ from modelserver.transforms.so3 import Vector3
 from mstools.edit.document import SAME_RADIANS, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError
 from mstools.terminal.output import format_count
-from mstools.view.page import Actions, escape_markdown, format_table
+from mstools.view.page import Actions, escape_markdown
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
-MAX_DISTANCES: Final = 6
 NO_CHOICE: Final = "-"
 
 PRECISION: Final = 6
@@ -126,7 +117,7 @@ class Editor:
             self._add_button("Add constraint", lambda: self._add(ItemKind.CONSTRAINT))
             self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
-        with gui.add_folder("Place by measurement", expand_by_default=False):
+        with gui.add_folder("Frames that coincide", expand_by_default=False):
             self._place = PlacePanel(gui, session, self._item, self._change, actions)
         with gui.add_folder("As text", expand_by_default=False):
             self._text: Any = gui.add_text("YAML", "", multiline=True)
@@ -606,7 +597,7 @@ class ItemFields:
 
 
 class PlacePanel:
-    """Two folders: frames that coincide, and distances."""
+    """Place what is selected where frames coincide."""
 
     def __init__(
         self, gui: viser.GuiApi, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
@@ -614,25 +605,14 @@ class PlacePanel:
         self._session = session
         self._change = change
         self._item = item
-        with gui.add_folder("Frames that coincide"):
-            self._hint = gui.add_markdown("")
-            self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
-            self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
-            self._position_only: Any = gui.add_checkbox("Position only", False)
-            actions.add_button(gui, "Place there", lambda: self._place(self._coincide))
-        with gui.add_folder("Distances from frames"):
-            self._rows: list[tuple[Any, NumberFields]] = []
-            for number in range(1, MAX_DISTANCES + 1):
-                frame = gui.add_dropdown(f"From {number}", (NO_CHOICE,))
-                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,))))
-            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,))
-            actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
-            self._result = gui.add_markdown("")
+        self._hint = gui.add_markdown("")
+        self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
+        self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
+        self._position_only: Any = gui.add_checkbox("Position only", False)
+        actions.add_button(gui, "Place there", self._place)
 
     def show(self, item: GeometryItem) -> None:
         """Offer the frames for an item."""
-        if item != self._item:
-            self._result.content = ""
         self._item = item
         frames = (NO_CHOICE, *list_frames(self._session.document))
         is_constraint = item.kind is ItemKind.CONSTRAINT
@@ -641,18 +621,17 @@ class PlacePanel:
             ItemKind.CONSTRAINT: "Moves the constraint so that two frames, one on each side, are the same place.",
             ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
         }.get(item.kind, "Select a frame or a constraint.")
-        for dropdown in (self._frame, self._target, *(frame for frame, _ in self._rows)):
+        for dropdown in (self._frame, self._target):
             # a frame that is not among them gives way to the first
             dropdown.options = frames
 
-    def _place(self, compute: Callable[[Model, GeometryItem], tuple[Placement, Pose]]) -> None:
-        """Place the item where a function of the model computes it; that returns its old pose too."""
+    def _place(self) -> None:
         item = self._item
 
         def change(document: GeometryDocument) -> GeometryDocument:
             if self._session.has_errors:
                 raise EditError("fix the errors first; a pose is computed from a geometry without any")
-            return _write_placement(document, item, *compute(self._session.model, item))
+            return _write_placement(document, item, *self._coincide(self._session.model, item))
 
         self._change(change)
 
@@ -669,22 +648,6 @@ class PlacePanel:
             raise EditError("choose the two frames that coincide")
         return place_constraint(model, item.name, self._frame.value, target, position_only), part.pose
 
-    def _measure(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
-        """Place a frame by its distances from others."""
-        if item.kind is not ItemKind.FRAME:
-            raise EditError("select the frame to which the distances were measured")
-        given = [(frame.value, distance.value[0]) for frame, distance in self._rows if frame.value != NO_CHOICE]
-        points, P = list_measured_points(model, item.name, [name for name, _ in given])
-        distances = np.array([distance for _, distance in given], float)
-        (sigma_m,) = self._sigma.value
-        sigmas = np.full(len(given), sigma_m)
-        frame = model.frame(item.name)
-        fit = locate_by_distances(points, distances, sigmas, frame.pose.xyz, P)
-        self._result.content = _describe_fit(fit, [name for name, _ in given], sigma_m)
-        rotation = (frame.sigma or Sigma()).rotation
-        sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), rotation)
-        return Placement(Pose(fit.position, frame.pose.wxyz), sigma), frame.pose
-
 
 def _write_placement(document: GeometryDocument, item: GeometryItem, found: Placement, old: Pose) -> GeometryDocument:
     """Write a placement; a rotation that is the old one stays as it is written."""
@@ -698,17 +661,3 @@ def _write_placement(document: GeometryDocument, item: GeometryItem, found: Plac
 
 def _round(values: Any) -> Vector3:
     return so3.to_vector3(round(float(each), PRECISION) + 0.0 for each in values)
-
-
-def _describe_fit(fit: DistanceFit, frames: list[str], sigma: float) -> str:
-    deviations = np.sqrt(np.diag(fit.covariance)).tolist()
-    rows = [
-        (frame, f"{1000.0 * residual:+.1f} mm", "too large" if abs(residual) > 3.0 * sigma else "")
-        for frame, residual in zip(frames, fit.residuals.tolist(), strict=True)
-    ]
-    parts = [format_table(("from", "residual", ""), rows)]
-    parts.append("Sigma x, y, z: " + ", ".join(f"{1000.0 * each:.1f} mm" for each in deviations))
-    if fit.mirrored is not None:
-        place = ", ".join(f"{each:.4f}" for each in fit.mirrored)
-        parts.append(escape_markdown(f"They fit at {place} m too, on the other side of the plane of the frames."))
-    return "\n\n".join(parts)
