@@ -115,7 +115,7 @@ def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
     with reserved_url() as url, Answering(url, applies=False):
         code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
     assert (code, out) == (1, "")
-    assert "but the daemon stays in mode full (bad_signature: the daemon has another key" in err
+    assert "but the daemon stays in mode full (bad_signature: see docs/words.md)" in err
 
 
 def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(

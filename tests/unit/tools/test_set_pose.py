@@ -126,10 +126,10 @@ def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
 USED = Decision(5, "operator", 1, "absolute_pose", Verdict.USED, "", (0.0,) * 6, statistic=3.25, limit=22.5)
 
 
-def result(decision: Decision | None, has_decisions: bool = True, reasons: int = 0) -> SetPoseResult:
+def result(decision: Decision | None, reasons: int = 0) -> SetPoseResult:
     request = Transformation("Cart:Base", "World:UTM", Pose((30.0, 40.0, 2.0)))
     after = PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose((30.5, 40.0, 2.0)), None, 9, reasons))
-    return SetPoseResult(request, GEODESY, (1.0, 5.0), decision, has_decisions, after)
+    return SetPoseResult(request, GEODESY, (1.0, 5.0), decision, after)
 
 
 @pytest.mark.parametrize(
@@ -144,10 +144,9 @@ def result(decision: Decision | None, has_decisions: bool = True, reasons: int =
             result(Decision(5, "operator", 1, "absolute_pose", Verdict.REJECTED, "evil\x1b[2J")),
             r"decision: rejected: evil\x1b[2J",
         ),
-        (result(None), "decision: accepted for localization; no decision on it was received"),
         (
-            result(None, has_decisions=False),
-            "decision: accepted for localization; LOCALIZATION_DECISIONS is silent (publish.decisions: false?)",
+            result(None),
+            "decision: accepted for localization; no decision on it was received (publish.decisions: false?)",
         ),
     ],
 )

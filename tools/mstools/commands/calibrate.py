@@ -104,7 +104,6 @@ def imu(
 def magnetometer(
     log: LogArgument,
     channel: ChannelOption = "IMU",
-    gps_channel: Annotated[str, option("--gps-channel NAME", "The receiver's channel, for the location.")] = "GPS",
     place: Annotated[str, option("--place LAT,LON", "The location in degrees, for a log without fixes.")] = "",
     begin: FromOption = 0.0,
     end: ToOption = math.inf,
@@ -124,7 +123,7 @@ def magnetometer(
     """
     _check_options(begin, end, log, plot, output, force)
     given = _parse_place(place)
-    recorded = read_recording(log, channel, gps_channel, begin, end)
+    recorded = read_recording(log, channel, "GPS", begin, end)
     good = finite_rows(recorded.fields)
     if not good.any():
         why = "none with a magnetic field: it has no magnetometer, or its driver does not publish it"

@@ -117,17 +117,8 @@ def find_rejection(before: Health | None, now: Health, sources: Collection[str])
     counts = {} if before is None else {(source, why): count for source, why, count in before.rejected}
     for source, why, count in now.rejected:
         if source in sources and count > counts.get((source, why), 0):
-            return f" ({why}: {_REASONS.get(why, 'see its log')})"
+            return f" ({why}: see docs/words.md)"
     return ""
-
-
-_REASONS = {
-    "unknown_key": "the daemon has no key of that name: it was started with another key file",
-    "bad_signature": "the daemon has another key of that name, or another channel prefix",
-    "stale": "too old or in the future by the daemon's clock, or the daemon has just started",
-    "replayed": "the daemon has accepted a newer one of this sender; was a clock set back?",
-}
-"""Descriptions of the daemon's reasons to reject a signed message."""
 
 
 def parse_mode(text: str) -> Mode:
@@ -263,7 +254,7 @@ def set_pose(
     decision = listener.decisions.get(accepted.header.utime)
     listener.pose = None
     listener.listen(timeout, lambda: listener.pose is not None)
-    result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
+    result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.pose)
     typer.echo(describe_set_pose(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
@@ -279,7 +270,6 @@ class SetPoseResult(NamedTuple):
     geodesy: Geodesy
     sigmas: tuple[float, float]
     decision: Decision | None
-    has_decisions: bool
     after: PoseAnswer | None
 
 
@@ -351,7 +341,6 @@ class SetPoseListener(DaemonListener):
 
     def __init__(self, bus: lcm.LCM, prefix: str):
         self.pose: PoseAnswer | None = None
-        self.has_decisions = False
         self.decisions: dict[int, Decision] = {}
         super().__init__(bus, prefix, {"POSE": self._on_pose, "LOCALIZATION_DECISIONS": self._on_decisions})
 
@@ -359,7 +348,6 @@ class SetPoseListener(DaemonListener):
         self.pose = pose
 
     def _on_decisions(self, published: PublishDecisions) -> None:
-        self.has_decisions = True
         for each in published.decisions:
             if each.source == OPERATOR and each.kind == "absolute_pose":
                 self.decisions[each.utime] = each
@@ -380,14 +368,13 @@ def describe_set_pose(result: SetPoseResult) -> str:
         f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
         f"  sigma {sigma:g} m, {sigma_deg:g} deg",
     ]
-    decision, silent = result.decision, "LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
+    decision = result.decision
     if decision is not None:
         text = _VERDICTS[decision.verdict] + (f": {escape(decision.reason)}" if decision.reason else "")
         if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
             text += f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
     else:
-        why = "no decision on it was received" if result.has_decisions else silent
-        text = f"accepted for localization; {why}"
+        text = "accepted for localization; no decision on it was received (publish.decisions: false?)"
     lines.append(f"decision: {text}")
     if result.after is not None:
         now = result.after.transformation

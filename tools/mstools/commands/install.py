@@ -157,10 +157,6 @@ def _build_plan(
             "the vehicle file sets journal.directory, which the unit can write only inside "
             f"{deployment.STATE[0]}; without it (megabytes only) the journal is written there"
         )
-    if facts.is_live and os.geteuid() != 0:
-        notes.append("run as root, this also checks for real-time scheduling and adds the drop-in for it")
-    if not facts.is_live and facts.root == "/":
-        notes.append("systemd does not run this system: the units are enabled, and nothing is started")
     return deployment.plan_install(writes, started, facts, notes, start)
 
 

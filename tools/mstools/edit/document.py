@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import GeometryError, Problem, SyntaxProblemError, has_error, quote
+from modelserver.errors import GeometryError, Problem, has_error, quote
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
 from modelserver.formats.common import format_number, parse_number
@@ -292,10 +292,7 @@ def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
 
 def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
-    try:
-        root = parse_yaml(text.get_entry(path).encode())
-    except SyntaxProblemError:
-        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first") from None
+    root = parse_yaml(text.get_entry(path).encode())
     return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", ENTRY_KEYS)) or Pose.identity()
 
 

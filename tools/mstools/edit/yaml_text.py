@@ -9,13 +9,12 @@ replaced. A path is a sequence of keys: ("bodies", "Rover", "frames", "GPS").
 from __future__ import annotations
 
 import textwrap
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import yaml
 
-from modelserver.errors import ModelServerError, SyntaxProblemError, quote
+from modelserver.errors import ModelServerError, SyntaxProblemError
 from modelserver.yaml_tree import LOADER, parse_yaml
 
 KeyPath = Sequence[str]
@@ -56,14 +55,12 @@ class YamlText:
         except UnicodeEncodeError as error:
             raise EditError(f"{text[error.start : error.end]!r} is no character of a text file; remove it") from None
         try:
-            # bounds depth and size: the parser below is recursive
-            parse_yaml(content)
+            # bounds depth and size, as the parser below is recursive; an alias would change more than what is edited
+            parse_yaml(content, has_aliases=False)
         except SyntaxProblemError as error:
             raise EditError(f"line {error.line}: {error}; {error.fix}") from None
         self._root = yaml.compose(text, Loader=LOADER)
         self._newline = "\r\n" if "\r\n" in text else "\n"
-        uses = Counter(id(node) for node in _walk(self._root))
-        self._shared = {node for node, count in uses.items() if count > 1}
 
     # --- reading
 
@@ -105,7 +102,6 @@ class YamlText:
         found = self._find(path)
         if found is None:
             return self.add(path[:-1], f"{path[-1]}: {value}")
-        self._check_own(path)
         begin = found.value.start_mark.index
         if found.end <= found.colon or "\n" in self.text[found.colon : begin]:
             # no value yet, or a block
@@ -122,7 +118,6 @@ class YamlText:
         if path and not self.has(path):
             block = f"{path[-1]}:\n{textwrap.indent(entry, '  ')}"
             return self.add(path[:-1], block if in_block else f"{path[-1]}: {{{entry}}}", in_block=in_block)
-        self._check_own(path, is_whole=False)
         entries = self.entries(path)
         if not entries:
             return self._fill(path, entry, in_block)
@@ -152,7 +147,6 @@ class YamlText:
     def remove(self, path: KeyPath) -> YamlText:
         """Remove a key with its value, and the comment on the lines directly before it."""
         found = self._require(path)
-        self._check_own(path)
         entries = self.entries(path[:-1])
         if len(entries) == 1 and len(path) > 1:
             return self._empty(path[:-1], found)
@@ -179,13 +173,11 @@ class YamlText:
     def rename(self, path: KeyPath, key: str) -> YamlText:
         """Write another key, as YAML, in the place of one."""
         found = self._require(path)
-        self._check_own(path[:-1], is_whole=False)
         return self._replace(found.key.start_mark.index, found.key.end_mark.index, key)
 
     def replace_entry(self, path: KeyPath, entry: str) -> YamlText:
         """Write another entry, `key: value` of one or more lines without indentation, in the place of one."""
         found = self._require(path)
-        self._check_own(path)
         if found.is_flow and "\n" in entry.strip():
             raise EditError("this entry is written within braces; write it on one line")
         indent = "" if found.is_flow else " " * found.key.start_mark.column
@@ -217,17 +209,6 @@ class YamlText:
         if found is None:
             raise EditError(f"there is no {' '.join(path)} in the file")
         return found
-
-    def _check_own(self, path: KeyPath, is_whole: bool = True) -> None:
-        """Raise EditError if what a path leads to, or with `is_whole` a part of it, is shared by an alias."""
-        for length in range(1, len(path) + 1):
-            found = self._find(path[:length])
-            if found is not None and id(found.value) in self._shared:
-                line = found.value.start_mark.line + 1
-                raise EditError(f"{quote(path[length - 1])} is shared by an alias (line {line}); write it out first")
-        found = self._find(path)
-        if is_whole and found is not None and any(id(each) in self._shared for each in _walk(found.value)):
-            raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first")
 
     def _list_entries(self, node: Any) -> Iterator[TextEntry]:
         if isinstance(node, yaml.MappingNode):
@@ -304,16 +285,3 @@ class YamlText:
     def _indent(self, entry: str, indent: str) -> str:
         lines = [indent + line if line.strip() else "" for line in entry.splitlines()]
         return self._newline.join(lines)
-
-
-def _walk(node: Any) -> Iterator[Any]:
-    """Yield all nodes, one that several aliases name once for each."""
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            yield from _walk(key)
-            yield from _walk(value)
-    elif isinstance(node, yaml.SequenceNode):
-        for each in node.value:
-            yield from _walk(each)
-    if node is not None:
-        yield node

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -39,9 +39,6 @@ POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 TRAILS: Final = {"10 s": 10.0, "60 s": 60.0, "10 min": 600.0, "all": math.inf}
 """Lengths of the trail, seconds."""
 
-NO_STATE: Final = "-"
-VALUE_COLOR: Final = "#228be6"
-SIGMA_COLOR: Final = "#9ab8d4"
 PICTURE_S: Final = 1.0 / 30.0
 """Period of pictures, seconds."""
 
@@ -436,33 +433,7 @@ class StatePanel:
         with gui.add_folder("Findings"):
             self._findings = gui.add_markdown("")
         with gui.add_folder("Filter", expand_by_default=False):
-            self._state: Any = gui.add_dropdown(
-                "State", (NO_STATE,), hint="Its last minute, with one sigma to each side"
-            )
-            self._course = gui.add_uplot(
-                (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
-                (
-                    {"label": "s"},
-                    {"label": "value", "stroke": VALUE_COLOR, "width": 2},
-                    {"label": "+ sigma", "stroke": SIGMA_COLOR},
-                    {"label": "- sigma", "stroke": SIGMA_COLOR},
-                ),
-                scales={"x": {"time": False}},
-                legend={"show": False},
-                height=180,
-                visible=False,
-            )
             self._states = gui.add_markdown("")
-
-    def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
-        options = (NO_STATE, *states)
-        if self._state.options != options:
-            # a state that is not among them gives way to the first
-            self._state.options = options
-        self._course.visible = self._state.value != NO_STATE
-        if self._course.visible:
-            times, values, sigmas = drive.get_state_course(self._state.value, utime)
-            self._course.data = (times, values, values + sigmas, values - sigmas)
 
     def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
         """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
@@ -486,7 +457,6 @@ class StatePanel:
         self._findings.content = "\n\n".join(parts)
         navigation = drive.get_report("LOCALIZATION_STATE", utime)
         self._states.content = "no state published" if navigation is None else _format_states(navigation)
-        self._show_course(drive, utime, navigation.names if navigation is not None else ())
 
 
 def _format_sensors(health: Health) -> str:
