@@ -215,13 +215,6 @@ def test_given_a_moving_vehicle_when_calibrated_then_its_axis_of_up_is_reported_
     assert "mount" not in out
 
 
-def test_given_a_few_stationary_seconds_then_no_bias_figure_is_proposed(stationary_log: Path, run: Run) -> None:
-    for end in (23, 26, 30, 50):
-        out = run("imu", stationary_log, "--from", 20, "--to", end)[1]
-        assert "gyro bias instability: not determined" in out
-        assert "accelerometer bias instability: not determined" in out
-
-
 def test_given_samples_that_are_not_numbers_when_calibrated_then_they_are_left_out_and_counted(
     tmp_path: Path, run: Run
 ) -> None:

@@ -266,7 +266,7 @@ def test_given_an_alias_then_it_is_not_edited() -> None:
     text = (
         "bodies:\n  A: &a {frames: {Origin: {}, P: {xyz: &p [1, 2, 3]}}}\n  B: *a\n  C:\n    frames: {Q: {xyz: *p}}\n"
     )
-    with pytest.raises(EditError, match="line 3: aliases .* are not supported"):
+    with pytest.raises(EditError, match=r"line 3: aliases .* are not supported"):
         GeometryDocument(text)
 
 

@@ -21,7 +21,7 @@ from mstools.calibration import (
     read_recording,
 )
 from mstools.calibration import report as calibrate_report
-from mstools.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
+from mstools.calibration.allan import allan_deviation, fit_noise_parameters
 from mstools.calibration.ellipsoid import MagnetometerFit, fit_level
 from mstools.calibration.report import AxisNoise, ImuNoise, MountCheck, axis_name, check_mount
 from mstools.report import charts
@@ -143,7 +143,7 @@ def magnetometer(
 def _compute_noise(recorded: ImuRecording, used: SampleRange, samples: int) -> ImuNoise:
     def compute_axis(values: Any) -> AxisNoise:
         curve = allan_deviation(values, used.rate_hz)
-        return AxisNoise(curve, _drop_bias_figures(fit_noise_parameters(curve), used.seconds))
+        return AxisNoise(curve, fit_noise_parameters(curve))
 
     rows = slice(used.start, used.stop)
     return ImuNoise(
@@ -156,15 +156,6 @@ def _compute_noise(recorded: ImuRecording, used: SampleRange, samples: int) -> I
         gyro=tuple(compute_axis(recorded.rates[rows, n]) for n in range(3)),
         accelerometer=tuple(compute_axis(recorded.forces[rows, n]) for n in range(3)),
     )
-
-
-def _drop_bias_figures(figures: NoiseParameters, seconds: float) -> NoiseParameters:
-    """Return the figures without those of the biases if the range is too short: the curve's minimum is then random."""
-    if seconds >= MIN_STATIONARY_S or (figures.instability is None and figures.random_walk is None):
-        return figures
-    others = tuple(each for each in figures.missing if not each.startswith("bias"))
-    why = f"biases: {seconds:.1f} s stationary are too short; record 10 minutes or more"
-    return dataclasses.replace(figures, instability=None, random_walk=None, missing=(*others, why))
 
 
 def _mount_advice(config: Path, forces: Any) -> MountCheck:
