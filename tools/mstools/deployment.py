@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
@@ -597,21 +596,7 @@ def check_installation() -> None:
     else:
         with gathered.collect(subject):
             check_program(command)
-    for path, what in paths:
-        is_seen = os.path.exists(path) and not find_hiding_setting(path)
-        if is_seen and (closed := find_unreadable_part(path)):
-            why = f"{what} is {path}, and the service's user may not read {closed}"
-            gathered.add(subject, why, f"sudo chmod -R o+rX {closed}")
     gathered.raise_any()
-
-
-def find_unreadable_part(path: str) -> str:
-    """Return the first part of a path that other users cannot read, empty for none."""
-    for part in (*reversed(Path(path).parents), Path(path)):
-        mode = part.stat().st_mode
-        if not mode & (stat.S_IXOTH if stat.S_ISDIR(mode) else stat.S_IROTH):
-            return str(part)
-    return ""
 
 
 def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:

@@ -117,7 +117,7 @@ def test_given_a_stationary_unit_after_a_drive_when_calibrated_then_its_noise_wh
     (used,) = re.findall(r"used: ([\d.]+) to [\d.]+ s of the log \(([\d.]+) s\)", err)
     assert float(used[0]) == pytest.approx(20.0, abs=1.1)
     assert float(used[1]) == pytest.approx(100.0, abs=1.2)
-    assert re.search(r"gyro bias random walk: not determined; at most [\d.e-]+ rad/s/sqrt", err)
+    assert "gyro bias random walk: not determined" in err
     assert "mount" not in err
 
 
@@ -128,7 +128,7 @@ def test_given_a_stationary_unit_when_calibrated_then_the_text_reports_what_was_
     assert (code, err) == (0, "")
     assert "2400 samples, 20.0 Hz; stationary, used: 2" in out
     assert "angle random walk: 0.00" in out
-    assert "gyro bias random walk: not determined; at most" in out
+    assert "gyro bias random walk: not determined" in out
     assert "record 10 minutes or more while stationary" in out
 
 

@@ -219,19 +219,10 @@ class _Quantity:
     def of(self, figures: NoiseParameters) -> NoiseParameter | None:
         return getattr(figures, self.figure)  # type: ignore[no-any-return]
 
-    def limit(self, figures: NoiseParameters) -> float:
-        """Return the upper limit for an axis, NaN where it is open."""
-        return float(getattr(figures, f"{self.figure}_limit", math.nan))
-
     def propose(self, noise: ImuNoise) -> float:
         """Return the value of the noisiest axis, NaN where no axis has one."""
         found = [each for axis in self.axes(noise) if (each := self.of(axis.figures)) is not None]
         return max((each.value for each in found), default=math.nan)
-
-    def upper_limit(self, noise: ImuNoise) -> float:
-        """Return the upper limit over all axes, NaN where one is open."""
-        limits = [self.limit(axis.figures) for axis in self.axes(noise)]
-        return max(limits) if all(map(math.isfinite, limits)) else math.nan
 
 
 QUANTITIES = (
@@ -264,8 +255,8 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
         lines.append(f"  {format_count(noise.dropped, 'sample')} without rates or forces dropped")
     for quantity in QUANTITIES:
         value = quantity.propose(noise)
-        words = f"{value:.3g}" if math.isfinite(value) else _format_limit(quantity.upper_limit(noise))
-        lines.append(f"{quantity.name}: {words}" + (f" {quantity.unit}" if words[-1].isdigit() else ""))
+        words = f"{value:.3g} {quantity.unit}" if math.isfinite(value) else "not determined"
+        lines.append(f"{quantity.name}: {words}")
         figures = [_format_figure(quantity, axis) for axis in quantity.axes(noise)]
         lines += [f"  {axis}: {figure}" for axis, figure in zip("xyz", figures, strict=True)]
     for name, axes in (("gyro", noise.gyro), ("accelerometer", noise.accelerometer)):
@@ -283,13 +274,9 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
 def _format_figure(quantity: _Quantity, axis: AxisNoise) -> str:
     figure = quantity.of(axis.figures)
     if figure is None:
-        return _format_limit(quantity.limit(axis.figures))
+        return "not determined"
     where = f"at {figure.tau:.3g} s, {format_count(round(figure.clusters), 'cluster')}"
     return f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
-
-
-def _format_limit(most: float) -> str:
-    return f"not determined; at most {most:.3g}" if math.isfinite(most) else "not determined"
 
 
 def format_noise_yaml(log: str, noise: ImuNoise) -> str:
@@ -303,9 +290,7 @@ def format_noise_yaml(log: str, noise: ImuNoise) -> str:
             more = f"; {VIBRATION_NOTE}" if each.setting == "accelerometer_noise" else ""
             lines.append(f"    {each.setting}: {value:.3e}   # {each.unit}, {each.name}{more}")
         else:
-            most = each.upper_limit(noise)
-            words = f", at most {most:.1e} {each.unit}" if math.isfinite(most) else ""
-            lines.append(f"    # {each.setting}: not determined from this record{words}")
+            lines.append(f"    # {each.setting}: not determined from this record")
     return _format_proposal(log, f"{noise.seconds:.0f} s stationary", "filter", lines)
 
 
