@@ -61,22 +61,20 @@ def _get_covariance(frame: BodyFrame) -> Array | None:
     return np.zeros((6, 6)) if frame.pose == Pose.identity() else None
 
 
-def place_frame(model: Model, frame: str, target: str, position_only: bool = False) -> Placement:
+def place_frame(model: Model, frame: str, target: str) -> Placement:
     """Return where a frame stands on its body if it coincides with another frame. Raises as `locate_on_body`."""
     if frame == target:
         raise PlacementError("a frame coincides with itself anywhere")
     pose, found = locate_on_body(model, names.split(frame)[0], target, avoid=frame)
-    if position_only:
-        pose = Pose(pose.xyz, model.frame(frame).pose.wxyz)
-    return Placement(pose, _to_sigma(found, model.frame(frame).sigma, position_only))
+    return Placement(pose, _to_sigma(found))
 
 
-def place_constraint(model: Model, constraint: str, frame: str, target: str, position_only: bool = False) -> Placement:
+def place_constraint(model: Model, constraint: str, frame: str, target: str) -> Placement:
     """Return the pose of a constraint for which two frames coincide, one on each side of it.
 
     X_FT = X_FG inverse(X_TM) inverse(X_J): F and T are the ends, G and M the frames on the sides of F and T, and X_J
-    the motion of the joint at its default. With `position_only` the rotation stays. Raises PlacementError if the frames
-    are on one side; QueryError as `Model.get_transformation`.
+    the motion of the joint at its default. Raises PlacementError if the frames are on one side; QueryError as
+    `Model.get_transformation`.
     """
     part = next((each for each in model.constraints if each.name == constraint), None)
     if part is None:
@@ -91,14 +89,8 @@ def place_constraint(model: Model, constraint: str, frame: str, target: str, pos
     found: Array | None = None
     if X_FG.covariance is not None and X_TM.covariance is not None:
         found = compose_covariance(X_FG.pose, X_FG.covariance, X_MT, invert_covariance(X_TM.pose, X_TM.covariance))
-    if position_only:
-        moved = part.pose @ X_J @ X_TM.pose
-        pose = Pose(
-            [p + g - m for p, g, m in zip(part.pose.xyz, X_FG.pose.xyz, moved.xyz, strict=True)], part.pose.wxyz
-        )
-    else:
-        pose = X_FG.pose @ X_MT @ X_J.inverse()
-    return Placement(pose, _to_sigma(found, part.sigma, position_only))
+    pose = X_FG.pose @ X_MT @ X_J.inverse()
+    return Placement(pose, _to_sigma(found))
 
 
 def _is_beyond(model: Model, constraint: Constraint, frame: str) -> bool:
@@ -110,12 +102,9 @@ def _is_beyond(model: Model, constraint: Constraint, frame: str) -> bool:
     return all(crossing.constraint.name != constraint.name for crossing in model.find_path(frame, constraint.to))
 
 
-def _to_sigma(found: Array | None, old: Sigma | None, position_only: bool) -> Sigma | None:
-    """Return the standard deviations of a covariance; the rotation's are the old ones if only the position is new."""
+def _to_sigma(found: Array | None) -> Sigma | None:
+    """Return the standard deviations of a covariance."""
     if found is None:
         return None
     deviations = np.sqrt(np.maximum(np.diag(found), 0.0))
-    rotation = so3.to_vector3(deviations[3:])
-    if position_only:
-        rotation = old.rotation if old is not None else (0.0, 0.0, 0.0)
-    return Sigma(so3.to_vector3(deviations[:3]), rotation)
+    return Sigma(so3.to_vector3(deviations[:3]), so3.to_vector3(deviations[3:]))

@@ -64,13 +64,6 @@ def test_given_two_frames_then_the_constraint_makes_them_coincide(frames: tuple[
     assert moved.joints["Pan"].joint.default_position == (math.radians(25),)
 
 
-def test_given_position_only_then_the_rotation_stays() -> None:
-    placed = place_constraint(load(), "Pan", "Head:Lens", "Cart:Mark", position_only=True)
-    assert placed.pose.wxyz == (1.0, 0.0, 0.0, 0.0)
-    moved = replace_pose("Pan", placed.pose)
-    assert math.hypot(*moved.get_transformation("Head:Lens", "Cart:Mark").pose.xyz) < 1e-9
-
-
 def test_given_sigmas_then_those_of_the_placed_constraint_are_what_random_surveys_have() -> None:
     model = load()
     placed = place_constraint(model, "Pan", "Head:Lens", "Cart:Mark")
@@ -110,8 +103,6 @@ def test_given_a_target_then_a_frame_stands_where_it_is() -> None:
     assert there.covariance is not None
     assert placed.sigma is not None
     assert placed.sigma.position == pytest.approx(np.sqrt(np.diag(there.covariance)[:3]))
-    moved = place_frame(model, "Cart:Mark", "Head:Lens", position_only=True)
-    assert moved.pose.is_close(Pose(there.pose.xyz, model.frame("Cart:Mark").pose.wxyz))
     for frame, target in (("Head:Foot", "Cart:Mark"), ("Cart:Mark", "Cart:Mark")):
         with pytest.raises(PlacementError):
             place_frame(model, frame, target)

@@ -222,7 +222,7 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     page.set(to="Beacon:Origin")
     assert page.model.get_transformation("Beacon:Lamp", "Raptor:CabRearRailCenter").pose == Pose.identity()
     editor.select(GeometryItem(ItemKind.FRAME, "Beacon:Lamp"))
-    editor._new.value = ""
+    editor._new.value = "Lamp2"
     editor._duplicate()
     assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp2")
     editor.select(GeometryItem(ItemKind.BODY, "Beacon"))

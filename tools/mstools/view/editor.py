@@ -252,7 +252,7 @@ class Editor:
     def _duplicate(self) -> None:
         item = self._item
         plain = item.name.rpartition(":")[2]
-        name = self._new.value.strip() or _find_free_name(self._session.document, item)
+        name = self._new.value.strip()
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
         self._change(lambda document: document.duplicate(item, name), new)
 
@@ -340,14 +340,6 @@ def _describe_problem(problem: Problem) -> str:
     fix = f"; {problem.fix}" if problem.fix else ""
     place = f" ({problem.element})" if problem.element else ""
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
-
-
-def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
-    """Return a name for a copy of an item: its own with the first free number."""
-    taken = {each.name for each in document.list_items() if each.kind is item.kind}
-    plain = item.name.rpartition(":")[2]
-    numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
-    return next(name for name in numbers if item.name.removesuffix(plain) + name not in taken)
 
 
 # --- fields of an item ---------------------------------------------------------------------------------------
@@ -605,22 +597,19 @@ class PlacePanel:
         self._session = session
         self._change = change
         self._item = item
-        self._hint = gui.add_markdown("")
+        gui.add_markdown(
+            "Moves a frame on its body to where another one is, or a constraint so that two frames, one on each side, "
+            "are the same place."
+        )
         self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
         self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
-        self._position_only: Any = gui.add_checkbox("Position only", False)
         actions.add_button(gui, "Place there", self._place)
 
     def show(self, item: GeometryItem) -> None:
         """Offer the frames for an item."""
         self._item = item
         frames = (NO_CHOICE, *list_frames(self._session.document))
-        is_constraint = item.kind is ItemKind.CONSTRAINT
-        self._frame.visible = is_constraint
-        self._hint.content = {
-            ItemKind.CONSTRAINT: "Moves the constraint so that two frames, one on each side, are the same place.",
-            ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
-        }.get(item.kind, "Select a frame or a constraint.")
+        self._frame.visible = item.kind is ItemKind.CONSTRAINT
         for dropdown in (self._frame, self._target):
             # a frame that is not among them gives way to the first
             dropdown.options = frames
@@ -636,17 +625,17 @@ class PlacePanel:
         self._change(change)
 
     def _coincide(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
-        target, position_only = self._target.value, self._position_only.value
+        target = self._target.value
         if target == NO_CHOICE:
             raise EditError("choose the frame with which it coincides")
         part = find_part(model, item)
         if part is None:
             raise EditError("select a frame or a constraint")
         if item.kind is ItemKind.FRAME:
-            return place_frame(model, item.name, target, position_only), part.pose
+            return place_frame(model, item.name, target), part.pose
         if self._frame.value == NO_CHOICE:
             raise EditError("choose the two frames that coincide")
-        return place_constraint(model, item.name, self._frame.value, target, position_only), part.pose
+        return place_constraint(model, item.name, self._frame.value, target), part.pose
 
 
 def _write_placement(document: GeometryDocument, item: GeometryItem, found: Placement, old: Pose) -> GeometryDocument:
