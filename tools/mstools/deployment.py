@@ -342,13 +342,6 @@ def check_visible(paths: Iterable[tuple[str, str]], fix: str, subject: str = "th
         raise make_error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
 
 
-def check_program(program: str) -> None:
-    """Raise ConfigError for a command path that cannot be written in a unit."""
-    if not _UNIT_PATH.fullmatch(program):
-        fix = "install to a folder whose path has only letters, digits and ._+@-"
-        raise make_error(f"{program!r} cannot be written in a unit", "this installation", fix)
-
-
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
     """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError."""
     known = tuple(known)
@@ -429,7 +422,6 @@ def render_units(
 
     `program` is the path of its command, `url` that of the bus; `hosts` are those of the drivers' devices.
     """
-    check_program(program)
     group, bus = loopback_group(url), bus_addresses(url)
     places = {"MODELSERVER": program, "GROUP": group, "IP": ip, "ADDRESSES": _join_addresses(bus)}
     places["DEVICES"] = _join_addresses((*bus, *host_addresses(hosts)))
@@ -591,9 +583,9 @@ def check_installation() -> None:
         check_visible(paths, INSTALL_HINT)
     if not os.path.isfile(command):
         gathered.add(subject, f"there is no {command}: the package is not installed", INSTALL_HINT)
-    else:
-        with gathered.collect(subject):
-            check_program(command)
+    if not _UNIT_PATH.fullmatch(command):
+        fix = "install to a folder whose path has only letters, digits and ._+@-"
+        gathered.add(subject, f"{command!r} cannot be written in a unit", fix)
     gathered.raise_any()
 
 

@@ -387,9 +387,12 @@ def test_given_a_driver_that_cannot_be_then_it_is_reported_why(wanted: str, know
 @pytest.mark.parametrize(
     "program", ["bin/modelserver", "/opt/my programs/modelserver", "/opt/%h/modelserver", "/a\n/b"]
 )
-def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_rejected(program: str) -> None:
+def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_rejected(
+    program: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(install_steps, "get_command_path", lambda: program)
     with pytest.raises(ModelServerError, match="cannot be written in a unit"):
-        render_units(TEMPLATES, program, "", "/sbin/ip", drivers=False)
+        install_steps.check_installation()
 
 
 @pytest.mark.parametrize(

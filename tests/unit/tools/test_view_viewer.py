@@ -66,7 +66,6 @@ def test_given_no_service_then_the_page_reports_it_and_shows_no_time(page: Page)
     source = make_live()
     viewer = Viewer(page, source)
     viewer.draw(0.0, 0.0)
-    assert viewer._title == "ModelServer: live - no message"
     assert viewer._state is not None
     assert viewer._time is not None
     assert "no message of a service yet" in viewer._state._validity.content

@@ -62,8 +62,7 @@ class Viewer:
         gui = page.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
-        self._title = ""
-        self._show_title("")
+        gui.set_panel_label(f"ModelServer: {source.title}")
         self._scene = VehicleScene(page.server, source.folder, self._pick)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Query"):
@@ -152,16 +151,8 @@ class Viewer:
             clock = time.time_ns() // 1000 if source.is_live else 0
             with source.lock:
                 self._state.show(drive, picture, utime, clock)
-                is_silent = source.is_live and bool(drive.find_silence(clock))
-            self._show_title("no message" if is_silent else "")
         if self._query.update(utime, now, picture.utime):
             self._scene.highlight_path(self._query.path)
-
-    def _show_title(self, note: str) -> None:
-        title = f"ModelServer: {self._source.title}{f' - {note}' if note else ''}"
-        if title != self._title:
-            self._title = title
-            self._server.gui.set_panel_label(title)
 
     def _set_model(self, model: Model, base_frame: str) -> None:
         size = self._scene.set_model(model, base_frame)
