@@ -260,7 +260,7 @@ def read_pipe(job: EvaluationJob) -> None:
     job.config.read_bytes()
 
 def command(log: Path, config: Path) -> None:
-    with tune._open_pool(1) as runs:
+    with tune._open_pool() as runs:
         runs([EvaluationJob(log, config, "half", ())] * 2)
 
 # in the workers too: each imports this file

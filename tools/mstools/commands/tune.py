@@ -68,6 +68,8 @@ TUNABLES = (
 """In search order."""
 
 
+PARTS: tuple[Part, ...] = ("half", "outage")
+
 ROUNDS = 2
 """Rounds over all settings, at most: a second one follows what the first one changed."""
 
@@ -83,8 +85,8 @@ def command(
 
     Every second fix is withheld, and all fixes in four gaps. A search changes each setting by factors of two while the
     likelihood of the withheld fixes increases, the accuracy does not decrease, and the covariance covers the errors at
-    the ends of the gaps. It is deterministic for a log, a
-    vehicle file and a version. Nothing is changed: the proposal is part of a vehicle file, to be reviewed and merged.
+    the ends of the gaps. It is deterministic for a log, a vehicle file and a version. Nothing is changed: the proposal
+    is part of a vehicle file, to be reviewed and merged.
 
     \b
     Examples:
@@ -105,13 +107,12 @@ def command(
         # a floor below the receiver's sigma has no effect: steps upward start there
         if each.name == "gps_sigma_floor":
             chosen[number] = Parameter(each.name, each.low, each.high, sigmas[len(sigmas) // 2])
-    parts: tuple[Part, ...] = ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else ROUNDS
-    bound = len(parts) * (1 + rounds * len(chosen) * 2)
-    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(len(parts)) as runs:
-        trials = Trials(runs, log, config, parts, show)
+    bound = len(PARTS) * (1 + rounds * len(chosen) * 2)
+    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool() as runs:
+        trials = Trials(runs, log, config, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
         if first is None or not before[0].scored or before[0].missing == before[0].scored:
@@ -120,8 +121,7 @@ def command(
                 f"modelserver replay {escape(str(log))} -c {escape(str(config))} --report report.html"
             )
         found = search(begin, first, chosen, trials, rounds, _print_step)
-        after = trials.outcomes(found.settings)
-    result = TuningResult(begin, first, before, found, after, trials.count)
+    result = TuningResult(begin, first, before[0].scored, len(before[1].gaps), found, trials.count)
     typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
     write_file(output, format_proposal(str(log), result), replace=force)
 
@@ -144,7 +144,6 @@ class Trials:
     runs: Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]
     log: Path
     config: Path
-    parts: tuple[Part, ...]
     show: Callable[[float], None]
     count: int = 0
     results: dict[tuple[tuple[str, float], ...], list[EvaluationResult | None]] = field(default_factory=dict)
@@ -154,11 +153,11 @@ class Trials:
 
         keys = [tuple(sorted(each.items())) for each in trials]
         new = [key for key in dict.fromkeys(keys) if key not in self.results]
-        outcomes = self.runs([EvaluationJob(self.log, self.config, part, key) for key in new for part in self.parts])
+        outcomes = self.runs([EvaluationJob(self.log, self.config, part, key) for key in new for part in PARTS])
         self.count += len(outcomes)
         self.show(self.count)
         for n, key in enumerate(new):
-            self.results[key] = outcomes[n * len(self.parts) : (n + 1) * len(self.parts)]
+            self.results[key] = outcomes[n * len(PARTS) : (n + 1) * len(PARTS)]
         return [self._score(self.results[key]) for key in keys]
 
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
@@ -166,7 +165,7 @@ class Trials:
 
     def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]
-        if len(good) < len(self.parts):
+        if len(good) < len(PARTS):
             return None
         likelihood = sum(each.likelihood for each in good) / len(good)
         return Score(likelihood, good[0].rmse, _mean(good[-1].gaps), _mean(good[-1].nees))
@@ -178,21 +177,21 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class TuningResult:
-    """Initial settings, scores and results before and after."""
+    """Initial settings and score, numbers of withheld fixes and gaps, what the search found, and number of runs."""
 
     begin: Settings
     first: Score
-    before: Sequence[EvaluationResult]
+    withheld: int
+    gaps: int
     found: SearchResult
-    after: Sequence[EvaluationResult]
     runs: int
 
 
 def format_result(log: str, result: TuningResult) -> list[str]:
     found = result.found
     text = [
-        f"{log}: {format_count(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
-        f"{format_count(len(result.before[-1].gaps), 'gap')}; {format_count(result.runs, 'run')}",
+        f"{log}: {format_count(result.withheld, 'fix', 'fixes')} withheld in turn, "
+        f"{format_count(result.gaps, 'gap')}; {format_count(result.runs, 'run')}",
         f"{'':34}{'before':>10}{'after':>10}",
     ]
     rows = [
@@ -226,10 +225,10 @@ def format_proposal(log: str, result: TuningResult) -> str:
 
 
 @contextmanager
-def _open_pool(parts: int) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+def _open_pool() -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
     """Yield a function that runs jobs in parallel processes, and returns their results in order."""
     # at most both steps of a setting run at once
-    count = min(os.cpu_count() or 1, 2 * parts)
+    count = min(os.cpu_count() or 1, 2 * len(PARTS))
     spawn = multiprocessing.get_context("spawn")
     # Ctrl-C reaches all processes of a terminal: the workers leave it to the one that started them
     pool = ProcessPoolExecutor(count, spawn, signal.signal, (signal.SIGINT, signal.SIG_IGN))
