@@ -50,15 +50,13 @@ class MountCheck:
     """Result of the check of the stated mount against gravity.
 
     angle: between the measured and the stated up, radians. measured_up, stated_up: unit vectors along the sensor's
-    axes. strength: of the specific force, m/s2. candidates: mounts that are consistent, nearest to the stated one
-    first; empty where the stated one is.
+    axes. candidates: mounts that are consistent, nearest to the stated one first; empty where the stated one is.
     """
 
     is_consistent: bool
     angle: float
     measured_up: Vector3
     stated_up: Vector3
-    strength: float
     candidates: tuple[MountCandidate, ...]
 
     @property
@@ -112,7 +110,7 @@ def check_mount(mean_force: Vector3, q_base_sensor: Quaternion) -> MountCheck:
     angle = _angle(measured, stated)
     is_consistent = angle <= MAX_TILT
     candidates = () if is_consistent else _find_candidates(measured, q_stated)
-    return MountCheck(is_consistent, angle, measured, stated, strength, candidates)
+    return MountCheck(is_consistent, angle, measured, stated, candidates)
 
 
 def aligned_rotations() -> tuple[Quaternion, ...]:

@@ -72,7 +72,7 @@ def imu(
     Example: modelserver calibrate imu stationary.lcm --plot allan.html -o imu.yaml
     """
     _check_options(begin, end, log, plot, output, force)
-    recorded = read_recording(log, channel, "", begin, end)
+    recorded = read_recording(log, channel, begin, end)
     good = finite_rows(recorded.rates, recorded.forces)
     if not good.any():
         why = "none with angular velocity and specific force: it is no IMU's channel, or its driver publishes neither"
@@ -123,7 +123,7 @@ def magnetometer(
     """
     _check_options(begin, end, log, plot, output, force)
     given = _parse_place(place)
-    recorded = read_recording(log, channel, "GPS", begin, end)
+    recorded = read_recording(log, channel, begin, end)
     good = finite_rows(recorded.fields)
     if not good.any():
         why = "none with a magnetic field: it has no magnetometer, or its driver does not publish it"
