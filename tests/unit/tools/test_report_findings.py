@@ -112,6 +112,14 @@ def test_given_fixes_with_a_latency_then_it_is_estimated(tau: float) -> None:
     )
 
 
+def test_given_a_latency_that_the_filter_estimates_then_the_finding_has_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mstools.report.findings.estimate_fix_latency", lambda data: (-0.07, 0.02))
+    states = tuple(snapshot(t, values={"gps_latency": 0.82}, sigmas={"gps_latency": 0.02}) for t in range(100))
+    assert titles(make_data(snapshots=states)) == ["Fixes lie 0.75 s behind the vehicle"]
+
+
 def test_given_a_straight_drive_then_no_latency_can_be_estimated() -> None:
     fixes = tuple(FixRecord(0.25 * n, None, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
     assert estimate_fix_latency(make_data(fixes=fixes)) is None
