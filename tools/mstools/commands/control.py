@@ -254,7 +254,7 @@ def set_pose(
     decision = listener.decisions.get(accepted.header.utime)
     listener.pose = None
     listener.listen(timeout, lambda: listener.pose is not None)
-    result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.pose)
+    result = SetPoseResult(request, (sigma, sigma_deg), decision, listener.pose)
     typer.echo(describe_set_pose(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
@@ -267,7 +267,6 @@ class SetPoseResult(NamedTuple):
     """The pose that was set, `decision` on it if one was received, and the next pose that the daemon published."""
 
     request: Transformation
-    geodesy: Geodesy
     sigmas: tuple[float, float]
     decision: Decision | None
     after: PoseAnswer | None
@@ -357,15 +356,9 @@ _VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RE
 
 
 def describe_set_pose(result: SetPoseResult) -> str:
-    pose = result.request.pose
-    origin = result.geodesy.origin
-    east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))
-    latitude, longitude, _ = result.geodesy.geodetic_from_utm(east, north, height)
     sigma, sigma_deg = result.sigmas
     lines = [
-        f"{escape(result.request.frame_of_interest)} in World:UTM: {pose}",
-        f"  easting {east:.3f} m, northing {north:.3f} m, height {height:.3f} m, zone {origin.zone} "
-        f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
+        f"{escape(result.request.frame_of_interest)} in World:UTM: {result.request.pose}",
         f"  sigma {sigma:g} m, {sigma_deg:g} deg",
     ]
     decision = result.decision

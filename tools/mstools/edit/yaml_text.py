@@ -157,11 +157,6 @@ class YamlText:
             return self._replace(entries[number - 1].end if number else found.key.start_mark.index, found.end, "")
         begin = self._find_comment_begin(found)
         end = self._find_next_line(found.end)
-        is_after_gap = begin == 0 or self.text[:begin].endswith(self._newline * 2)
-        if is_after_gap and self.text.startswith(self._newline, end):
-            end += len(self._newline)
-        elif end >= len(self.text) and is_after_gap:
-            begin = max(begin - len(self._newline), 0)
         return self._replace(begin, end, "")
 
     def _empty(self, path: KeyPath, last: TextEntry) -> YamlText:

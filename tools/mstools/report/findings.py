@@ -192,8 +192,7 @@ def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
 
 def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
     raw = data.sensor_motion
-    by_gyro = bool(raw.gyro)
-    reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
+    reference = raw.gyro
     if any(check_gyro_unit(data)):
         reference = {second: math.radians(rate) for second, rate in raw.gyro.items()}
     against, straight = raw.count_opposed(reference)
@@ -202,15 +201,17 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
         names = ", ".join(backward)
         yield error(
             f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
-            f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
+            f"In {against} of {straight} s of straight driving by the gyro the sides rolled against each other.",
             REVERSE_WHEEL,
         )
         return
     course = raw.compare_with_course(raw.wheel_turn_rate)
-    compared = compare_turn_rates(raw.gyro, raw.wheel_turn_rate) if by_gyro else course
+    compared, what = (
+        (compare_turn_rates(raw.gyro, raw.wheel_turn_rate), "gyro") if raw.gyro else (course, "fixes' course")
+    )
     if compared is None or compared.correlation > -0.6:
         return
-    if by_gyro and course is not None and course.correlation > 0.6:
+    if raw.gyro and course is not None and course.correlation > 0.6:
         yield error(
             "The gyro's rate has the opposite sign of wheels and fixes",
             f"Its correlation with the wheels' turn rate is {compared.correlation:.2f}).",

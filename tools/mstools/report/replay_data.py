@@ -124,13 +124,6 @@ class SensorMotion:
                 turns.append((t, u, turn))
         return turns
 
-    def course_turn_rate(self) -> dict[int, float]:
-        """Return the turn rate of the fixes' course, rad/s."""
-        rates: dict[int, float] = {}
-        for t, u, turn in self.course_changes():
-            rates.update(dict.fromkeys(range(math.floor(t), math.floor(u)), turn / (u - t)))
-        return rates
-
     def compare_with_course(self, rates: Mapping[int, float]) -> TurnRateComparison | None:
         """Compare a turn rate with the fixes' course, integrated over the intervals of its changes."""
         found: dict[int, tuple[float, float]] = {}

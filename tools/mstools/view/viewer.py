@@ -127,13 +127,13 @@ class Viewer:
                 self._time.advance(drive, seconds)
                 utime = self._time.utime
             picture = drive.get_picture(utime)
-            utimes, track = drive.get_track(picture.utime, display.trail_s)
+            utimes, track = drive.get_track(picture.utime, TRAILS[display.trail.value])
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
             origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
             if model is not None and model is not self._model:
                 self._set_model(model, base_frame)
-            if (named := (display.labels, self._query.frames)) != self._named:
+            if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
             self._scene.show(picture, display.follow.value)
@@ -499,18 +499,10 @@ class DisplayPanel:
     """What the scene shows."""
 
     def __init__(self, gui: viser.GuiApi):
-        self._labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
+        self.labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
         self.follow = gui.add_checkbox("Follow the vehicle", True)
         self.uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid (95 %) and protection levels")
-        self._trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
-
-    @property
-    def labels(self) -> NameLabels:
-        return NameLabels(self._labels.value)
-
-    @property
-    def trail_s(self) -> float:
-        return TRAILS[self._trail.value]
+        self.trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
 
 
 class JointsPanel:
