@@ -173,19 +173,6 @@ def test_given_an_odd_file_then_it_is_one_that_loads() -> None:
                 "+       axis: [0, 0, 1]",
             ],
         ),
-        (
-            lambda d: d.duplicate(frame("Rover:A"), "A2"),
-            [
-                "+           A2:",
-                "+               xyz:",
-                "+               - 1.0",
-                "+               - 2",
-                "+               - 0.5",
-                "+               description: >",
-                "+                 folded text",
-                "+                 # no comment",
-            ],
-        ),
         (lambda d: d.add_frame("on", "New", (0.0, 0.0, 1.5)), ["+             New: {xyz: [0, 0, 1.5]}"]),
         (
             lambda d: d.set_description(frame("on:12"), 'it: "is" [here]'),
@@ -314,7 +301,7 @@ def test_given_any_changes_then_the_model_is_what_they_state(data: st.DataObject
         item = data.draw(st.sampled_from(document.list_items()))
         before, old = document, load(document)
         is_shared = bool(document.find_template(item))
-        kind = data.draw(st.sampled_from(["pose", "sigma", "text", "rename", "duplicate", "yaml"]))
+        kind = data.draw(st.sampled_from(["pose", "sigma", "text", "rename", "yaml"]))
         changes = []
         if kind == "pose" and item.kind is not ItemKind.BODY:
             xyz, rpy = data.draw(vectors), data.draw(angles)
@@ -350,11 +337,6 @@ def test_given_any_changes_then_the_model_is_what_they_state(data: st.DataObject
             again = document.rename(new, item.name.rpartition(":")[2])
             assert describe_changes(old, load(again)) == ()
             document = again
-        elif kind == "duplicate" and item.kind is not ItemKind.CONSTRAINT:
-            document = document.duplicate(item, "Copy-1")
-            copy = item._replace(name=f"{item.name.partition(':')[0]}:Copy-1" if ":" in item.name else "Copy-1")
-            document = document.delete(copy)
-            assert describe_changes(old, load(document)) == ()
         elif kind == "yaml":
             assert document.set_yaml(item, document.get_yaml(item)).text == document.text
 

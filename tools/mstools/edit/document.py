@@ -203,16 +203,6 @@ class GeometryDocument:
         entry = f"{_format_key(name)}:\n  from: {_format_full_name(from_)}\n  to: {_format_full_name(to)}"
         return GeometryDocument(self._yaml.add(("constraints",), entry, in_block=True))
 
-    def duplicate(self, item: GeometryItem, name: str) -> GeometryDocument:
-        """Add a copy of an item directly after it; a frame's copy is on the same body, `name` without the body."""
-        path = self._find_path(item)
-        body = names.split(item.name)[0] if item.kind is ItemKind.FRAME else ""
-        self._make_new(item.kind, name, body)
-        entry = YamlText(self._yaml.get_entry(path))
-        copy = entry.rename((path[-1],), _format_key(name)).text
-        place = ("bodies", body, "frames") if body else path[:-1]
-        return GeometryDocument(self._yaml.add(place, copy, after=path[-1], in_block=True))
-
     def rename(self, item: GeometryItem, name: str) -> GeometryDocument:
         """Rename an item, a frame without its body, and what refers to it in this file."""
         body, frame = names.split(item.name) if item.kind is ItemKind.FRAME else (item.name, "")

@@ -108,11 +108,10 @@ class YamlText:
             return self._set_value(found, f" {value}")
         return self._replace(begin, found.end, value)
 
-    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> YamlText:
+    def add(self, path: KeyPath, entry: str, *, in_block: bool = False) -> YamlText:
         """Add an entry `key: value`, of one or more lines without indentation, to a mapping.
 
-        It stands after the key `after`, else last. An empty mapping gets braces, or with `in_block` lines of its own;
-        one that is absent is added.
+        An empty mapping gets braces, or with `in_block` lines of its own; one that is absent is added.
         """
         node: Any = self._root if not path else self._get(path)
         if path and not self.has(path):
@@ -121,7 +120,7 @@ class YamlText:
         entries = self.entries(path)
         if not entries:
             return self._fill(path, entry, in_block)
-        last = next((each for each in entries if each.name == after), entries[-1])
+        last = entries[-1]
         if node.flow_style:
             if "\n" in entry:
                 raise EditError(f"{' '.join(path)} is written in braces; write it on lines of its own first")

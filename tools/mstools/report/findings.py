@@ -206,9 +206,8 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
         )
         return
     course = raw.compare_with_course(raw.wheel_turn_rate)
-    compared, what = (
-        (compare_turn_rates(raw.gyro, raw.wheel_turn_rate), "gyro") if raw.gyro else (course, "fixes' course")
-    )
+    by_gyro = compare_turn_rates(raw.gyro, raw.wheel_turn_rate)
+    compared, what = (by_gyro, "gyro") if raw.gyro else (course, "fixes' course")
     if compared is None or compared.correlation > -0.6:
         return
     if raw.gyro and course is not None and course.correlation > 0.6:

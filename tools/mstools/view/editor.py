@@ -110,12 +110,11 @@ class Editor:
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
             actions.on_update(self._gizmo, self.show_gizmo)
-        with gui.add_folder("Add, copy, delete", expand_by_default=False):
+        with gui.add_folder("Add, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
             self._add_button("Add body", lambda: self._add(ItemKind.BODY))
             self._add_button("Add frame to the body", lambda: self._add(ItemKind.FRAME))
             self._add_button("Add constraint", lambda: self._add(ItemKind.CONSTRAINT))
-            self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
         with gui.add_folder("Frames that coincide", expand_by_default=False):
             self._place = PlacePanel(gui, session, self._item, self._change, actions)
@@ -248,13 +247,6 @@ class Editor:
                 return
             to = others[-1]
             self._change(lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name))
-
-    def _duplicate(self) -> None:
-        item = self._item
-        plain = item.name.rpartition(":")[2]
-        name = self._new.value.strip()
-        new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
-        self._change(lambda document: document.duplicate(item, name), new)
 
     def _delete(self) -> None:
         item = self._item
