@@ -93,11 +93,8 @@ class ChildProcesses:
     `on_line` gets each line that a child prints, with the child's name; it is called by a thread for each child.
     """
 
-    def __init__(
-        self, on_line: Callable[[str, str], object] | None = None, environment: Mapping[str, str] | None = None
-    ):
+    def __init__(self, on_line: Callable[[str, str], object] | None = None):
         self._on_line = on_line
-        self._environment = dict(environment or {})
         self._started: list[ChildProcess] = []
         self._before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
         self._signal = 0
@@ -170,7 +167,7 @@ class ChildProcesses:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **self._environment},
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
             start_new_session=True,
         )
 
