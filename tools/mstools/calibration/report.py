@@ -152,14 +152,7 @@ def _format_rpy(rpy_deg: Vector3) -> str:
 
 
 def _rpy_deg(q: Quaternion) -> Vector3:
-    roll, pitch, yaw = so3.to_rpy(q)
-    return (_round_degrees(roll), _round_degrees(pitch), _round_degrees(yaw))
-
-
-def _round_degrees(angle: float) -> float:
-    """Return degrees to a hundredth, -180 as 180, without a negative zero."""
-    degrees = round(math.degrees(angle), 2) + 0.0
-    return 180.0 if degrees == -180.0 else degrees
+    return so3.to_vector3(round(math.degrees(each), 2) + 0.0 for each in so3.to_rpy(q))
 
 
 def _rotation_angle(a: Quaternion, b: Quaternion) -> float:

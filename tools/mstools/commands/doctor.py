@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from modelserver.errors import BusError, ConfigError, Problem, Severity
+from modelserver.server import diagnostics
 from modelserver.server.diagnostics import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
 from modelserver.server.journal.writer import get_journal_directory, get_max_bytes, list_segments
 from modelserver.server.persistence import get_state_directory
@@ -68,8 +69,6 @@ def command(
 def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
     """Return all findings. Takes two seconds, most of it waiting for replies."""
     from modelserver.config.vehicle_file import load_config
-    from modelserver.server import diagnostics as checks
-    from modelserver.server.diagnostics import is_clock_synchronized, probe_delivery, read_bus_facts
     from modelserver.version import __version__
     from modelserver.wire.provider import find_url_problem, resolve_url
     from mstools.commands.check import check_vehicle
@@ -94,16 +93,16 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     if wrong:
         found.append(Diagnosis(ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
     else:
-        facts = read_bus_facts(provider, probe_delivery)
+        facts = diagnostics.read_bus_facts(provider, diagnostics.probe_delivery)
         found.append(Diagnosis(OK, "bus", escape(provider)))
-        found += checks.evaluate_bus(facts)
+        found += diagnostics.evaluate_bus(facts)
         if facts.address is None or facts.delivered:
             try:
                 found += diagnose_daemons(provider, prefix, __version__)
             except BusError as error:
                 found.append(Diagnosis(ERROR, "bus", str(error), "no message can be received or sent"))
         leaves = facts.address is not None and facts.address.ttl > 0
-    found.append(checks.evaluate_clock(is_clock_synchronized(), leaves))
+    found.append(diagnostics.evaluate_clock(diagnostics.is_clock_synchronized(), leaves))
     if config is not None and vehicle is not None:
         found += diagnose_vehicle(vehicle, config)
     return tuple(found)
@@ -136,9 +135,7 @@ def diagnose_daemons(url: str, prefix: str, version: str) -> Iterator[Diagnosis]
 
 
 def get_exit_code(findings: Sequence[Diagnosis]) -> int:
-    from modelserver.server.diagnostics import get_worst_level
-
-    return (0, 0, EXIT_WARNINGS, EXIT_ERRORS)[get_worst_level(findings)]
+    return (0, 0, EXIT_WARNINGS, EXIT_ERRORS)[diagnostics.get_worst_level(findings)]
 
 
 def describe(findings: Sequence[Diagnosis]) -> str:
@@ -167,7 +164,6 @@ MIN_FREE: Final = 200_000_000
 
 def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> Iterator[Diagnosis]:
     """Yield the findings on what a vehicle file without errors needs of this machine."""
-    from modelserver.server.diagnostics import list_interfaces
     from mstools.commands.driver import load_drivers
 
     is_unit = os.path.realpath(file) == VEHICLE and os.path.exists(f"{UNITS}/{SERVICE}")
@@ -179,7 +175,7 @@ def diagnose_vehicle(vehicle: VehicleConfig, file: Path) -> Iterator[Diagnosis]:
     else:
         yield from diagnose_storage(vehicle, unit_directory)
     with suppress(ConfigError):
-        yield from diagnose_connections(load_drivers(file)[1].values(), list_interfaces())
+        yield from diagnose_connections(load_drivers(file)[1].values(), diagnostics.list_interfaces())
 
 
 def diagnose_vehicle_file(problems: Iterable[Problem], file: Path) -> Diagnosis:

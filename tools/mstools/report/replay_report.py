@@ -213,12 +213,6 @@ def _render_validity(data: ReplayData) -> str:
             for flag in Invalid
         ),
         row("stationary", (each.is_stationary for each in states), charts.SKY),
-        *(
-            row(f"{name} {value.name.lower()}", (getattr(each, name) is value for each in states), color)
-            for name, color in (("phase", charts.GRAY), ("mode", charts.AMBER))
-            for value in dict.fromkeys(getattr(each, name) for each in states)
-            if value is not None
-        ),
     ]
     rows = [each for each in rows if each.intervals or each.name in ("valid", "stationary")]
     events = _events(data)

@@ -104,7 +104,7 @@ class Editor:
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
-        actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
+        actions.on_update(self._kind, lambda: self.select(self._find_first(ItemKind(self._kind.value))))
         actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
         self._fields = ItemFields(server, session, self._item, self._change, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
@@ -157,14 +157,6 @@ class Editor:
         self._place.show(item)
         self._text.value = self._session.document.get_yaml(item)
         self.show_gizmo()
-
-    def _select_first(self, kind: ItemKind) -> None:
-        found = self._find_first(kind)
-        if found.kind is not kind:
-            self._report(f"there is no {kind} yet; add one below")
-            self._kind.value = self._item.kind
-        else:
-            self.select(found)
 
     def _find_first(self, kind: ItemKind) -> GeometryItem:
         """Return the first item of a kind, without one the first of all."""
@@ -288,9 +280,7 @@ class Editor:
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
         elif self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
-        message = self._message.content
         self._refresh()
-        self._message.content = message
 
     def _start_reload(self, dry_run: bool) -> None:
         """Ask the service what a reload would change, or reload."""
