@@ -55,19 +55,9 @@ def command(
     """
     with (
         tempfile.TemporaryDirectory(prefix="modelserver-demo-") as scratch,
-        ChildProcesses(print_line if verbose else None) as children,
+        ChildProcesses((lambda name, text: typer.echo(f"{name}: {text}", err=True)) if verbose else None) as children,
     ):
         run_demo(make_connections(find_vehicle_file(), Path(scratch), own_bus=True), seconds, children)
-
-
-def print_line(name: str, text: str) -> None:
-    typer.echo(f"{name}: {text}", err=True)
-
-
-def show_commands(commands: Iterable[str]) -> None:
-    """Print command lines, which may be typed in a shell."""
-    for each in commands:
-        typer.echo(escape(each))
 
 
 def find_vehicle_file() -> Path:
@@ -79,7 +69,8 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
     """Start all processes, query, and print. Raises LaunchError if something is missing."""
     typer.echo(f"1. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to emulated devices")
     start = time.monotonic()
-    show_commands(start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url)))
+    commands = start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url))
+    typer.echo("\n".join(map(escape, commands)))
     # heavy imports, while the child processes load
     from modelserver.client.remote import Platform
     from modelserver.config.vehicle_file import load_config
@@ -96,7 +87,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         typer.echo("\n2. Emulated devices, a process each, found by their drivers")
         start_utime = get_start_utime(time.monotonic() - start)
         options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
-        show_commands(start_devices(children, lines, start_utime, options))
+        typer.echo("\n".join(map(escape, start_devices(children, lines, start_utime, options))))
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
         typer.echo("\n3. Queries of the geometry")
