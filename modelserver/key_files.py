@@ -74,18 +74,6 @@ def _show(path: object) -> str:
     return quote(str(path), MAX_PATH_LENGTH)
 
 
-def find_group_writable_folder(path: str | Path) -> str:
-    """Return a folder on the path of a file that its group may write, empty for none.
-
-    A member of the group can replace the file. Raises OSError.
-    """
-    for folder in _list_folders(Path(path)):
-        mode = folder.stat().st_mode
-        if mode & stat.S_IWGRP and not mode & stat.S_ISVTX:
-            return str(folder)
-    return ""
-
-
 def _list_folders(path: Path) -> list[Path]:
     """Return the folders on the path of a file, as named and with links resolved; the outermost first."""
     named = Path(os.path.abspath(path))

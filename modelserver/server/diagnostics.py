@@ -1,8 +1,8 @@
-"""Diagnostics of bus, host clock, machine and other servers: read facts, evaluate them, probe the bus.
+"""Diagnostics of bus, host clock, machine and duplicate servers: read facts, evaluate them, probe the bus.
 
 - `evaluate_*` turn facts into diagnoses, each with the command that fixes it. Pure.
 - `read_*` read the facts off the machine: resources of the process, network interfaces, kernel buffers, clocks.
-- `probe_delivery` and `discover_servers` are active probes, `probe_bus` the check that the daemon makes at its start.
+- `probe_delivery` is an active probe, `probe_bus` the check that the daemon makes at its start.
 - `DuplicateServerMonitor` watches the health reports while the daemon runs: two daemons on one bus receive each other's
   reports, and warn until the other one is gone.
 """
@@ -14,7 +14,6 @@ import fcntl
 import logging
 import os
 import secrets
-import shutil
 import socket
 import struct
 import sys
@@ -26,9 +25,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import BusError, WireError, quote
-from modelserver.messages import Gauges, GetBodyList, Health, RequestHeader
-from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, to_subscription_pattern
-from modelserver.wire.codec import decode, encode
+from modelserver.messages import Gauges, Health
+from modelserver.wire.channels import PROBE_CHANNEL, to_subscription_pattern
+from modelserver.wire.codec import decode
 from modelserver.wire.provider import (
     RECEIVE_BUFFER_BYTES,
     UdpAddress,
@@ -91,64 +90,18 @@ def filter_by_level(
     return tuple(each for each in findings if each.level >= min_level)
 
 
-MAX_SLEW_RATE = 500e-6
-"""The kernel's limit of slewing (ntp_adjtime(2)), s/s; more between two readings is a step."""
-
-MIN_TIME_S = 1_672_531_200
-"""Start of 2023: a clock before it was never set since power-on."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockFacts:
-    """Readings of the host's clocks.
-
-    Attributes
-    ----------
-    synchronized: the kernel's state; None = unknown.
-    error: the kernel's bound of the error, s.
-    slew, duration: how far the time of day has advanced beyond the monotonic clock over a duration, s.
-    tool: installed time service: chrony, ntp, timesyncd or empty.
-    """
-
-    utime: int
-    synchronized: bool | None = None
-    error: float | None = None
-    slew: float = 0.0
-    duration: float = 0.0
-    tool: str = ""
-
-
-_SYNC_COMMANDS = {
-    "chrony": "sudo systemctl enable --now chrony && chronyc tracking",
-    "ntp": "sudo systemctl enable --now ntp && ntpq -p",
-    "timesyncd": "sudo timedatectl set-ntp true && timedatectl timesync-status",
-    "": "sudo apt install chrony",
-}
-
-
-def evaluate_clock(facts: ClockFacts, shared: bool) -> Iterator[Diagnosis]:
-    """Check the clock. On a `shared` bus, which leaves the machine, other machines' clocks matter."""
-    subject = "clock"
-    command = _SYNC_COMMANDS[facts.tool]
-    if facts.utime < MIN_TIME_S * 1_000_000:
-        why = "time stamps, the magnetic field model and logs depend on it; is the clock's battery empty?"
-        yield Diagnosis(ERROR, subject, "it was never set: its year is before 2023", why, command)
-        return
-    if abs(facts.slew) > MAX_SLEW_RATE * facts.duration + 1e-3:
-        observed = f"it was stepped by {facts.slew:+.3f} s during the check"
-        why = "poses are invalid until localization has samples of the new time; permit steps only at boot"
-        yield Diagnosis(WARNING, subject, observed, why, _SYNC_COMMANDS["chrony"] if facts.tool else command)
-    if facts.synchronized is None:
-        yield Diagnosis(NOTE, subject, "its synchronization state cannot be read on this system")
-    elif facts.synchronized:
-        error = "" if facts.error is None else f", to {facts.error * 1e3:.1f} ms or better"
-        yield Diagnosis(OK, subject, f"synchronized{error}")
-    elif shared:
+def evaluate_clock(synchronized: bool | None, shared: bool) -> Diagnosis:
+    """Check whether the clock is synchronized, None: unknown. On a `shared` bus other machines' clocks matter."""
+    if synchronized is None:
+        return Diagnosis(NOTE, "clock", "its synchronization state cannot be read on this system")
+    if synchronized:
+        return Diagnosis(OK, "clock", "synchronized")
+    command = "sudo timedatectl set-ntp true || sudo apt install chrony"
+    if shared:
         why = "time stamps of several machines are not comparable"
-        yield Diagnosis(WARNING, subject, "not synchronized", why, command)
-    else:
-        why = "time stamps are consistent on this machine, but not true time"
-        yield Diagnosis(NOTE, subject, "not synchronized", why, command)
+        return Diagnosis(WARNING, "clock", "not synchronized", why, command)
+    why = "time stamps are consistent on this machine, but not true time"
+    return Diagnosis(NOTE, "clock", "not synchronized", why, command)
 
 
 SYSCTL_FILE = "/etc/sysctl.d/60-modelserver.conf"
@@ -179,7 +132,6 @@ class BusFacts:
     interfaces: all interfaces.
     delivered, delivered_large: whether an own message came back, and one of several packets.
     buffer: receive buffer that the kernel granted for `RECEIVE_BUFFER_BYTES`, bytes.
-    buffer_default: receive buffer of programs that request none, bytes.
     dropped: packets that receivers on the bus's port have lost so far, at most.
     """
 
@@ -190,19 +142,17 @@ class BusFacts:
     delivered: bool | None = None
     delivered_large: bool | None = None
     buffer: int | None = None
-    buffer_default: int | None = None
     dropped: int | None = None
 
 
 def evaluate_bus(facts: BusFacts) -> tuple[Diagnosis, ...]:
-    """Check route, delivery, reach and buffers of the bus."""
+    """Check route, delivery and buffers of the bus."""
     address = facts.address
     if address is None:
         return (Diagnosis(NOTE, "bus", f"{quote(facts.url)} is no UDP multicast", "only udpm:// is checked"),)
     return (
         _check_route(facts, address),
         *_check_delivery(facts, address),
-        _check_reach(facts, address),
         *_check_buffers(facts, address),
     )
 
@@ -223,16 +173,6 @@ def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
     if not interface.up:
         command = f"sudo ip link set {interface.name} up"
         return Diagnosis(ERROR, subject, f"{observed}, which is down", "published messages are lost", command)
-    if interface.loopback and not interface.multicast:
-        why = "some programs skip an interface without the multicast flag"
-        command = f"sudo ip link set {interface.name} multicast on"
-        return Diagnosis(NOTE, subject, f"{observed}, which lacks the multicast flag", why, command)
-    if address.ttl == 0 and not interface.loopback:
-        why = (
-            f"nothing leaves the machine (ttl=0), but the bus fails whenever {interface.name} goes down; a route "
-            f"through {lo} stays"
-        )
-        return Diagnosis(NOTE, subject, observed, why, by_lo)
     if address.ttl > 0 and interface.loopback:
         why = f"the URL has ttl={address.ttl}, but no other machine receives anything"
         flush = f"sudo ip route flush match {group} dev {lo}"
@@ -257,16 +197,6 @@ def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]
         yield Diagnosis(OK, subject, "it comes back")
 
 
-def _check_reach(facts: BusFacts, address: UdpAddress) -> Diagnosis:
-    if address.ttl == 0:
-        return Diagnosis(OK, "reach", "nothing leaves the machine (ttl=0)")
-    through = f" through {facts.interface.name}" if facts.interface is not None and facts.interface.name else ""
-    hops = "its network" if address.ttl == 1 else f"and past {address.ttl - 1} routers"
-    observed = f"messages leave the machine{through}, for {hops} (ttl={address.ttl})"
-    why = "every host there receives all messages and may send requests; write ttl=0 in lcm.url to prevent that"
-    return Diagnosis(NOTE, "reach", observed, why)
-
-
 def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
     subject = "receive buffer"
     if facts.buffer is not None and facts.buffer < RECEIVE_BUFFER_BYTES:
@@ -275,10 +205,6 @@ def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
         yield Diagnosis(WARNING, subject, observed, "messages are lost in bursts", command)
     elif facts.buffer is not None:
         yield Diagnosis(OK, subject, f"{_format_mib(facts.buffer)}, as requested")
-    if facts.buffer_default is not None and facts.buffer_default < MIB:
-        observed = f"{_format_mib(facts.buffer_default)} for programs that request none (net.core.rmem_default)"
-        why = "lcm-spy, lcm-logger and clients without recv_buf_size in their URL lose messages in bursts"
-        yield Diagnosis(NOTE, subject, observed, why, _sysctl_command("net.core.rmem_default", RECEIVE_BUFFER_BYTES))
     if facts.dropped:
         observed = f"running programs on this bus have lost up to {facts.dropped} packets so far"
         why = (
@@ -294,55 +220,6 @@ def _sysctl_command(name: str, value: int) -> str:
 
 def _format_mib(count: int) -> str:
     return f"{count / MIB:.1f} MiB" if count >= MIB / 10 else f"{count / 1024:.0f} KiB"
-
-
-@dataclass(frozen=True, slots=True)
-class Server:
-    """A server that published a health report. `prefix` is that of its channels."""
-
-    host: str
-    pid: int
-    vehicle: str = ""
-    version: str = ""
-    prefix: str = ""
-
-    def __str__(self) -> str:
-        return f"process {self.pid} on {quote(self.host, 64)}"
-
-
-@dataclass(frozen=True, slots=True)
-class DiscoveredServers:
-    """Servers by their health reports, and the number of replies to one request; None = no request was sent."""
-
-    servers: tuple[Server, ...] = ()
-    replies: int | None = None
-
-
-def evaluate_servers(discovered: DiscoveredServers, prefix: str, version: str) -> Iterator[Diagnosis]:
-    """Check which servers are on the bus; `prefix` is that of the checked vehicle."""
-    subject = "daemon"
-    own = [each for each in discovered.servers if each.prefix == prefix]
-    replies = discovered.replies or 0
-    if len(own) > 1 or replies > 1:
-        who = f": {', '.join(map(str, own))}" if len(own) > 1 else ""
-        observed = f"{max(len(own), replies)} answer at once{who}"
-        why = "clients get the replies of either, and POSE is from both; stop all but one, or give each its own prefix"
-        command = f"kill {own[-1].pid}" if own else "systemctl stop modelserver, on each machine but one"
-        yield Diagnosis(ERROR, subject, observed, why, command)
-    elif own or replies:
-        yield Diagnosis(OK, subject, f"one answers{f': {own[0]}' if own else ''}")
-    else:
-        observed = f"none answers{f' with prefix {prefix}' if prefix else ''}"
-        yield Diagnosis(NOTE, subject, observed, "start one if it should run", "modelserver run -c vehicle.yaml")
-    for each in own:
-        if each.version != version:
-            observed = f"{each} is version {quote(each.version, 40)}, this command {version}"
-            why = "messages of one version may be undecodable for the other"
-            yield Diagnosis(WARNING, subject, observed, why, "sudo systemctl restart modelserver")
-    others = sorted({each.prefix for each in discovered.servers} - {prefix})
-    if others:
-        names = ", ".join(quote(each, 40) if each else "none" for each in others)
-        yield Diagnosis(NOTE, "other vehicles", f"daemons with these prefixes are on the bus: {names}")
 
 
 STATM = Path("/proc/self/statm")
@@ -399,7 +276,6 @@ def read_bus_facts(
         delivered,
         delivered_large,
         get_granted_buffer(address.buffer or RECEIVE_BUFFER_BYTES),
-        _read_int(proc / "sys/net/core/rmem_default"),
         count_dropped(address.port, proc),
     )
 
@@ -479,50 +355,14 @@ _TIMEX: Final = struct.Struct("@I4li")
 """Start of struct timex (adjtimex(2)): modes, offset, freq, maxerror, esterror, status."""
 
 
-def read_kernel_clock() -> tuple[bool | None, float | None]:
-    """Read whether the kernel considers the time of day synchronized, and its bound of the error, s."""
+def is_clock_synchronized() -> bool | None:
+    """Return whether the kernel considers the time of day synchronized, None if unknown."""
     timex = ctypes.create_string_buffer(512)  # more than its size on any machine; modes 0: read only
     try:
         result = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
     except (OSError, AttributeError):
-        return None, None
-    if result < 0:
-        return None, None
-    _, _, _, max_error_us, _, status = _TIMEX.unpack_from(timex)
-    if result == _TIME_ERROR or status & _STA_UNSYNC:
-        return False, None
-    return True, max_error_us * 1e-6
-
-
-def find_time_service() -> str:
-    """Return the installed time service: chrony, ntp, timesyncd or empty."""
-    folders = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
-    if shutil.which("chronyd", path=folders):
-        return "chrony"
-    if shutil.which("ntpd", path=folders):
-        return "ntp"
-    if any(Path(place, "systemd-timesyncd").exists() for place in ("/lib/systemd", "/usr/lib/systemd")):
-        return "timesyncd"
-    return ""
-
-
-class HostClockMonitor:
-    """Compares the time of day with the monotonic clock from construction until `read_facts`."""
-
-    def __init__(self) -> None:
-        self._start = self._read_clocks()
-
-    def read_facts(self) -> ClockFacts:
-        """Return the readings of the clocks."""
-        (utime, monotonic), (utime_now, monotonic_now) = self._start, self._read_clocks()
-        elapsed = monotonic_now - monotonic
-        slew = (utime_now - utime - elapsed) * 1e-9
-        is_synchronized, error = read_kernel_clock()
-        return ClockFacts(utime_now // 1000, is_synchronized, error, slew, elapsed * 1e-9, find_time_service())
-
-    @staticmethod
-    def _read_clocks() -> tuple[int, int]:
-        return time.time_ns(), time.monotonic_ns()
+        return None
+    return None if result < 0 else result != _TIME_ERROR and not _TIMEX.unpack_from(timex)[5] & _STA_UNSYNC
 
 
 ECHO_TIMEOUT_S: Final = 2.0
@@ -533,10 +373,6 @@ RESEND_S: Final = 0.1
 
 LARGE_BYTES: Final = 100_000
 """Size of a message that LCM splits into packets."""
-
-MAX_SERVERS: Final = 16
-
-REPLY_NAME: Final = "MODELSERVER_DOCTOR"
 
 
 def probe_delivery(url: str, seconds: float = ECHO_TIMEOUT_S) -> tuple[bool, bool]:
@@ -562,40 +398,6 @@ def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, payload: bytes, seconds: floa
     finally:
         receiver.unsubscribe(subscription)
     return False
-
-
-def discover_servers(
-    url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds: float = 1.3
-) -> DiscoveredServers:
-    """Collect the servers that publish health reports, and count the replies to one request. Raises BusError.
-
-    The default time is longer than the period of health reports.
-    """
-    receiver = open_lcm(url)
-    servers: dict[Server, None] = {}
-    request = RequestHeader(secrets.randbits(62) + 1, f"{reply_prefix}{REPLY_NAME}")
-
-    def on_health(channel: str, data: bytes) -> None:
-        try:
-            health: Health = decode("health_t", data)
-        except WireError:
-            return
-        if len(servers) < MAX_SERVERS:
-            own_prefix = channel.removesuffix("MODELSERVER_HEALTH")
-            servers[Server(health.host, health.pid, health.vehicle, health.version, own_prefix)] = None
-
-    count = 0
-
-    def on_reply(_: str, data: bytes) -> None:
-        nonlocal count
-        # the request id follows the fingerprint
-        count += data[8:16] == request.request_id.to_bytes(8, "big", signed=True)
-
-    receiver.subscribe(r"[A-Za-z0-9_]*MODELSERVER_HEALTH", on_health)
-    receiver.subscribe(to_subscription_pattern(request.reply_channel), on_reply)
-    receiver.publish(f"{prefix}PLATFORM_GET_BODY_LIST", encode(GetBodyList(request)))
-    _receive_until(receiver, seconds, lambda: False)
-    return DiscoveredServers(tuple(servers), count)
 
 
 def _receive_until(receiver: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +18,7 @@ from support_signing import ALLOWED
 from modelserver.messages import GpsSample
 from modelserver.wire.codec import encode
 from mstools.cli import main
+from mstools.commands.control import SetPoseListener
 
 Run = Callable[..., tuple[int, str, str]]
 KNOWN_ORIGIN = (
@@ -76,16 +77,12 @@ def test_given_a_pose_near_the_estimate_then_it_is_used_and_one_far_off_is_rejec
         here = platform.get_state_vector()
         x, y, z = here.position
         # driving on at 2 m/s meanwhile, which 10 m allows for
-        code, out, err = run(
-            daemon, "--xyz", x, y, z, "--rpy", 0, 0, math.degrees(here.rpy[2]), "--sigma", 10, "--json"
-        )
+        code, out, err = run(daemon, "--xyz", x, y, z, "--yaw", math.degrees(here.rpy[2]), "--sigma", 10)
         assert (code, err) == (0, "")
-        found = json.loads(out)
-        assert found["decision"]["verdict"] == "used"
-        assert found["decision"]["statistic"] < found["decision"]["limit"]
-        assert found["frame_of_interest"] == "Cart:Base"
-        assert found["state_vector"][:3] == pytest.approx([x, y, z])
-        assert found["pose_after"]["utime"] > found["decision"]["utime"]
+        assert f"Cart:Base in World:UTM: position ({x:.3f}, {y:.3f}, {z:.3f}) m" in out
+        statistic, limit = map(float, re.findall(r"decision: used \(chi-square ([\d.]+) of ([\d.]+) allowed", out)[0])
+        assert statistic < limit
+        assert re.search("^now: .*; valid$", out, re.MULTILINE)
 
         code, out, err = run(daemon, "--xyz", x + 500, y, z, "--yaw", 0, "--sigma", 0.05)
         assert code == 1
@@ -99,16 +96,20 @@ def test_given_no_heading_yet_then_latitude_longitude_and_heading_set_the_pose_o
 ) -> None:
     daemon = start_signed(FAST_HEALTH + ALLOWED + KNOWN_ORIGIN)
     latitude, longitude, height = GEODESY.geodetic_from_enu((300.0, 200.0, 5.0))
+    listener = SetPoseListener(lcm.LCM(daemon.url), "")
+    for each in listener.subscriptions:
+        each.set_queue_capacity(0)
     with feeding(daemon, only_imu=True):
         code, out, err = run(
-            daemon, "--latlon", latitude, longitude, "--height", height, "--heading", 60, "--sigma", 0.05, "--json"
+            daemon, "--latlon", latitude, longitude, "--height", height, "--heading", 60, "--sigma", 0.05
         )
         assert (code, err) == (0, "")
-        found = json.loads(out)
-        set_then = daemon.platform().get_state_vector(at=found["decision"]["utime"] + 40_000)
-    assert (found["decision"]["verdict"], found["decision"]["reason"]) == ("set", "position and heading were set")
+        assert listener.listen(20.0, lambda: bool(listener.decisions))
+        set_then = daemon.platform().get_state_vector(at=min(listener.decisions) + 40_000)
+    assert "decision: set: position and heading were set" in out
     wanted = GEODESY.to_relative_utm(GEODESY.utm_from_geodetic(latitude, longitude, height))
-    assert found["state_vector"][:3] == pytest.approx(wanted, abs=1e-3)
+    x, y, z = wanted
+    assert f"position ({x:.3f}, {y:.3f}, {z:.3f}) m" in out
     assert set_then.position == pytest.approx(wanted, abs=0.5)
     yaw = math.pi / 2 - math.radians(60) + GEODESY.convergence(latitude, longitude)
     assert set_then.rpy[2] == pytest.approx(yaw, abs=math.radians(2.0))

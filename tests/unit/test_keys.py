@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import KeyFileError
-from modelserver.key_files import KEY_BYTES, find_group_writable_folder, generate_key, read_keys, write_key
+from modelserver.key_files import KEY_BYTES, generate_key, read_keys, write_key
 from mstools.cli import main
 
 HEX = "00112233445566778899aabbccddeeff"
@@ -153,14 +153,4 @@ def test_given_a_key_or_a_folder_of_another_user_then_it_is_not_read(
         with pytest.raises(KeyFileError, match="who can replace it"):
             read_keys(path)
         monkeypatch.undo()
-    assert read_keys(path)[0].name == "a"
-
-
-def test_given_a_folder_that_a_group_may_write_then_it_is_named(tmp_path: Path) -> None:
-    folder = tmp_path / "team"
-    folder.mkdir(mode=0o755)
-    path = write_file(folder, f"a {HEX}")
-    assert find_group_writable_folder(path) == ""
-    folder.chmod(0o775)
-    assert find_group_writable_folder(path) == str(folder)
     assert read_keys(path)[0].name == "a"

@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 import typer
@@ -110,15 +109,14 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Record of an earlier `install`: for each file the hashes that it wrote, units it enabled, folders it made."""
+    """Record of an earlier `install`: for each file the hashes that it wrote, and units it enabled."""
 
     files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: tuple[str, ...] = ()
-    folders: tuple[str, ...] = ()
 
     def encode(self) -> bytes:
         files = dict(sorted(self.files.items()))
-        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units, "folders": self.folders}
+        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units}
         return (json.dumps(content, indent=1) + "\n").encode()
 
     @classmethod
@@ -129,12 +127,8 @@ class Manifest:
             if content["version"] != MANIFEST_VERSION:
                 raise ValueError(f"its version is {content['version']!r}, not {MANIFEST_VERSION}")
             return cls(
-                {
-                    _parse("file", path): tuple(_parse("hash", each) for each in hashes)
-                    for path, hashes in content["files"].items()
-                },
-                tuple(_parse("unit", each) for each in content["units"]),
-                tuple(_parse("folder", each) for each in content["folders"]),
+                {str(path): tuple(map(str, hashes)) for path, hashes in content["files"].items()},
+                tuple(map(str, content["units"])),
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
@@ -150,7 +144,6 @@ class SystemFacts:
     Attributes
     ----------
     files : hash of each existing file of those that may be written
-    absent : missing folders around them
     by_id : device of each name below /dev/serial/by-id
     rules : content of the installed udev rules
     rmem_max : the kernel's limit of receive buffers, bytes, 0 if unknown
@@ -161,7 +154,6 @@ class SystemFacts:
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
-    absent: frozenset[str] = frozenset()
     manifest: Manifest = field(default_factory=Manifest)
     by_id: Mapping[str, str] = field(default_factory=dict)
     rules: str = ""
@@ -183,7 +175,7 @@ def digest(content: bytes) -> str:
 
 
 def plan_install(
-    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, *, start: bool, notes: Iterable[str]
+    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, notes: Iterable[str] = (), start: bool = True
 ) -> Plan:
     """Return the steps that write `writes` and start `units`. Edited files are kept.
 
@@ -218,8 +210,7 @@ def plan_install(
             steps.append(RemovePath(path, "installed earlier, no longer needed"))
     units = tuple(units)
     obsolete = [unit for unit in facts.manifest.units if unit not in units]
-    made = {folder for path in (*changed, MANIFEST) for folder in parent_folders(path)} & facts.absent
-    manifest = Manifest(owned, units, tuple(sorted({*facts.manifest.folders, *made})))
+    manifest = Manifest(owned, units)
     # first, so that an interrupted installation can be undone
     steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver install --remove`"))
     steps += _plan_reloads(facts, changed)
@@ -255,8 +246,11 @@ def plan_removal(facts: SystemFacts, *, purge: bool) -> Plan:
     steps.append(RemovePath(MANIFEST, "the record of the installation"))
     if purge:
         steps += [RemovePath(path, "the service's state", is_recursive=True) for path in STATE]
-    # nested folders first
-    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(manifest.folders, reverse=True)]
+    # those of this installation, nested folders first
+    around = {
+        folder for path in (*manifest.files, MANIFEST) for folder in parent_folders(path) if "modelserver" in folder
+    }
+    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(around, reverse=True)]
     steps += _plan_reloads(facts, removed)
     notes = []
     if SYSCTL in removed:
@@ -298,22 +292,6 @@ def _systemctl(facts: SystemFacts, what: str, verb: str, *units: str) -> RunProg
     root = () if facts.root == "/" else (f"--root={facts.root}",)
     now = ("--now",) if verb == "disable" and facts.is_live else ()
     return RunProgram((facts.programs.get("systemctl", "systemctl"), *root, verb, *now, *units), what)
-
-
-_OWN: Final = {
-    "file": rf"{re.escape(RULES)}|{re.escape(SYSCTL)}|{CONFIGURATION}/.*|{UNITS}/modelserver.*",
-    "unit": "modelserver[^/]*",
-    "folder": "/etc(/.*)?",
-    "hash": ".*",
-}
-"""What a manifest may name; it decides what is removed. A folder is removed only where it is empty."""
-
-
-def _parse(kind: str, value: Any) -> str:
-    is_own = isinstance(value, str) and re.fullmatch(_OWN[kind], value, re.DOTALL)
-    if not is_own or not {"..", "."}.isdisjoint(value.split("/")):
-        raise ValueError(f"{value!r} is no {kind} of this installation")
-    return str(value)
 
 
 BY_ID: Final = "/dev/serial/by-id/"
@@ -364,18 +342,8 @@ def check_visible(paths: Iterable[tuple[str, str]], fix: str, subject: str = "th
         raise make_error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
 
 
-def check_program(program: str) -> None:
-    """Raise ConfigError for a command path that cannot be written in a unit."""
-    if not _UNIT_PATH.fullmatch(program):
-        fix = "install to a folder whose path has only letters, digits and ._+@-"
-        raise make_error(f"{program!r} cannot be written in a unit", "this installation", fix)
-
-
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError with all problems.
-
-    A driver named `all` or `none` can only be selected together with others.
-    """
+    """Return the drivers that `wanted` selects: all, none, or names with commas. Raises ConfigError."""
     known = tuple(known)
     names = tuple(dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip()))
     if names in (("all",), ()):
@@ -384,13 +352,7 @@ def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
         names = ()
     gathered = ProblemCollector()
     for name in names:
-        if name in ("all", "none") and name not in known:
-            others = ",".join(each for each in names if each not in ("all", "none"))
-            why = f"{name} is combined with other names in {quote(wanted, 80)}, and means "
-            why += "every driver" if name == "all" else "no driver at all"
-            fix = f"--drivers {name}, or only the names" + (f": --drivers {others}" if others else "")
-            gathered.add("--drivers", why, fix)
-        elif name not in known:
+        if name not in known:
             near = find_nearest_names(name, known)
             offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
             gathered.add("--drivers", f"the vehicle file has no driver {quote(name, 40)}; {offer}")
@@ -460,7 +422,6 @@ def render_units(
 
     `program` is the path of its command, `url` that of the bus; `hosts` are those of the drivers' devices.
     """
-    check_program(program)
     group, bus = loopback_group(url), bus_addresses(url)
     places = {"MODELSERVER": program, "GROUP": group, "IP": ip, "ADDRESSES": _join_addresses(bus)}
     places["DEVICES"] = _join_addresses((*bus, *host_addresses(hosts)))
@@ -534,12 +495,10 @@ def render_udev_rules(
 ) -> tuple[list[WriteFile], list[str]]:
     """Return the udev rules that give each driver's device a name of its own, and notes on them.
 
-    `given` are names below /dev/serial/by-id by driver, which take precedence over the found ones. Raises
-    ModelServerError.
+    `given` are names below /dev/serial/by-id by driver, as `check_serial` accepts them; they take precedence over the
+    found ones. Raises ModelServerError.
     """
     lines, notes = [], []
-    drivers = list(drivers)
-    check_serial(given, drivers)
     for driver in drivers:
         own = f"{DEVICE_FOLDER}{driver.name}"
         device = given.get(driver.name, "") or (driver.port if driver.port.startswith(BY_ID) else "")
@@ -624,24 +583,10 @@ def check_installation() -> None:
         check_visible(paths, INSTALL_HINT)
     if not os.path.isfile(command):
         gathered.add(subject, f"there is no {command}: the package is not installed", INSTALL_HINT)
-    else:
-        with gathered.collect(subject):
-            check_program(command)
-    for path, what in paths:
-        is_seen = os.path.exists(path) and not find_hiding_setting(path)
-        if is_seen and (closed := find_unreadable_part(path)):
-            why = f"{what} is {path}, and the service's user may not read {closed}"
-            gathered.add(subject, why, f"sudo chmod -R o+rX {closed}")
+    if not _UNIT_PATH.fullmatch(command):
+        fix = "install to a folder whose path has only letters, digits and ._+@-"
+        gathered.add(subject, f"{command!r} cannot be written in a unit", fix)
     gathered.raise_any()
-
-
-def find_unreadable_part(path: str) -> str:
-    """Return the first part of a path that other users cannot read, empty for none."""
-    for part in (*reversed(Path(path).parents), Path(path)):
-        mode = part.stat().st_mode
-        if not mode & (stat.S_IXOTH if stat.S_ISDIR(mode) else stat.S_IROTH):
-            return str(part)
-    return ""
 
 
 def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
@@ -649,7 +594,6 @@ def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
     paths = tuple(paths)
     manifest = read_manifest(root)
     contents = {path: _read_file(path_in_root(root, path)) for path in {*paths, *manifest.files}}
-    around = {folder for path in (*paths, MANIFEST) for folder in parent_folders(path)}
     programs = {name: found for name in PROGRAMS if (found := shutil.which(name, path=SEARCH_PATH))}
     is_live = root == Path("/") and os.path.isdir("/run/systemd/system")
     by_id, rmem_max = {}, 0
@@ -659,7 +603,6 @@ def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
         rmem_max = int(Path("/proc/sys/net/core/rmem_max").read_text()) if root == Path("/") else 0
     return SystemFacts(
         files={path: digest(content) for path, content in contents.items() if content is not None},
-        absent=frozenset(folder for folder in around if not path_in_root(root, folder).is_dir()),
         manifest=manifest,
         by_id=by_id,
         rules=(_read_file(path_in_root(root, RULES)) or b"").decode("utf-8", "replace"),

@@ -46,12 +46,11 @@ from modelserver.estimation.filter.measurements.gnss import GpsPosition
 from modelserver.estimation.filter.state import Aligned
 from modelserver.estimation.history import Localizer
 from modelserver.estimation.modes import ModeLocalizer
-from modelserver.messages import Decision, GpsSample
+from modelserver.messages import GpsSample
 from modelserver.server.offline import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.report.findings import Consistency, compute_consistency
 
 Settings: TypeAlias = Mapping[str, float]
 
@@ -214,7 +213,7 @@ class EvaluationResult:
     """Result of a run. `likelihood` is the mean log density of the withheld fixes, 1/m2; `rmse` in meters.
 
     `gaps` are the mean errors over the last END_S of each gap, meters, and `nees` the medians of the NEES there; both
-    are empty in `half`. `consistency` is that of the measurements that were not withheld.
+    are empty in `half`.
     """
 
     scored: int
@@ -223,7 +222,6 @@ class EvaluationResult:
     rmse: float
     gaps: tuple[float, ...] = ()
     nees: tuple[float, ...] = ()
-    consistency: tuple[Consistency, ...] = ()
 
 
 class ScoredFix(NamedTuple):
@@ -331,12 +329,11 @@ def evaluate(job: EvaluationJob) -> EvaluationResult:
     known = read_fixes(job.log, job.config)
     withheld = known.withheld(job.part)
     skip = known.begin + round(1e6 * min(SKIP_S, 0.25 * known.seconds))
-    decisions: list[Decision] = []
     gps = vehicle.config.sensors.gps
     assert gps is not None
     with LogFile(job.log) as recording:
         events = _drop_withheld(recording, gps_channel(vehicle), {known.numbers[n] for n in withheld})
-        replay = OfflineRun(vehicle, events, gps.frame, on_decision=decisions.append)
+        replay = OfflineRun(vehicle, events, gps.frame)
         scored = [known.samples[n] for n in withheld]
         rows: list[ScoredFix] = []
         for sample, row in zip(scored, replay.rows([s.header.utime for s in scored]), strict=True):
@@ -352,7 +349,6 @@ def evaluate(job: EvaluationJob) -> EvaluationResult:
         math.sqrt(sum(error * error for error in good) / len(good)) if good else math.inf,
         tuple(sum(errors) / len(errors) for end in ends if (errors := _finite(each.error for each in end))),
         tuple(median(found) for end in ends if (found := _finite(each.nees for each in end))),
-        tuple(compute_consistency(decisions)),
     )
 
 

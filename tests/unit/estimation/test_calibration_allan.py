@@ -93,22 +93,14 @@ def test_given_simulated_noise_when_read_then_white_noise_and_walk_are_found_wit
         assert abs(float(np.mean(each))) < 0.8
 
 
-def test_given_a_minute_when_read_then_white_noise_alone_and_the_rest_is_bounded() -> None:
+def test_given_a_minute_when_read_then_white_noise_alone() -> None:
     for seed in range(10):
         found = fit_simulated_series(60.0, seed)
         assert found.white is not None
         assert found.white.value == pytest.approx(WHITE, rel=0.1)
         assert (found.random_walk, found.instability) == (None, None)
-        assert found.random_walk_limit > WALK
         assert len(found.missing) == 2
         assert all("record 10 minutes or more while stationary" in each for each in found.missing)
-
-
-@pytest.mark.slow
-def test_given_twenty_minutes_when_read_then_the_limit_of_the_walk_holds() -> None:
-    limits = [fit_simulated_series(1200.0, seed).random_walk_limit for seed in range(20)]
-    assert min(limits) > WALK
-    assert sorted(limits)[10] < 4.0 * WALK
 
 
 @pytest.mark.slow
@@ -123,10 +115,8 @@ def test_given_flicker_when_read_then_the_floor_gives_the_instability() -> None:
             pushes = chance.normal(0.0, 4e-4 * math.sqrt(1.0 - memory**2), series.size)
             series += lfilter([1.0], [1.0, -memory], pushes)
         found = fit_noise_parameters(allan_deviation(series, RATE))
-        assert found.instability_limit > 4e-4 / INSTABILITY_FLOOR * 0.8
         if found.instability is not None:
             instabilities.append(found.instability.value * INSTABILITY_FLOOR / 4e-4)
-            assert found.instability.value < found.instability_limit
     # the sum of these walks has a floor of their strength, within a tenth; a minimum is somewhat below it
     assert len(instabilities) >= 6
     assert float(np.mean(instabilities)) == pytest.approx(0.9, abs=0.2)

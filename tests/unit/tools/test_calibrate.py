@@ -108,18 +108,17 @@ def read_figures(page: Path) -> list[dict[str, Any]]:
 def test_given_a_stationary_unit_after_a_drive_when_calibrated_then_its_noise_while_stationary(
     stationary_log: Path, run: Run
 ) -> None:
-    code, out, err = run("imu", stationary_log, "--json")
-    report = json.loads(out)
-    assert (code, err) == (0, "")
-    assert report["proposal"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
-    assert report["proposal"]["accelerometer_noise"] == pytest.approx(FORCE_NOISE, rel=0.1)
-    assert "gyro_bias_walk" not in report["proposal"]
-    assert report["from"] == pytest.approx(20.0, abs=1.1)
-    assert report["seconds"] == pytest.approx(100.0, abs=1.2)
-    assert report["gyro"][0]["walk"] is None
-    assert report["gyro"][0]["walk_limit"] > 0
-    assert len(report["gyro"][0]["taus"]) == len(report["gyro"][0]["deviations"])
-    assert report["mount"] is None
+    code, out, err = run("imu", stationary_log, "-o", "-")
+    assert code == 0
+    proposal = yaml.safe_load(out)["localization"]["filter"]
+    assert proposal["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
+    assert proposal["accelerometer_noise"] == pytest.approx(FORCE_NOISE, rel=0.1)
+    assert "gyro_bias_walk" not in proposal
+    (used,) = re.findall(r"used: ([\d.]+) to [\d.]+ s of the log \(([\d.]+) s\)", err)
+    assert float(used[0]) == pytest.approx(20.0, abs=1.1)
+    assert float(used[1]) == pytest.approx(100.0, abs=1.2)
+    assert "gyro bias random walk: not determined" in err
+    assert "mount" not in err
 
 
 def test_given_a_stationary_unit_when_calibrated_then_the_text_reports_what_was_used_and_what_is_open(
@@ -129,7 +128,7 @@ def test_given_a_stationary_unit_when_calibrated_then_the_text_reports_what_was_
     assert (code, err) == (0, "")
     assert "2400 samples, 20.0 Hz; stationary, used: 2" in out
     assert "angle random walk: 0.00" in out
-    assert "gyro bias random walk: not determined; at most" in out
+    assert "gyro bias random walk: not determined" in out
     assert "record 10 minutes or more while stationary" in out
 
 
@@ -212,15 +211,8 @@ def test_given_a_moving_vehicle_when_calibrated_then_its_axis_of_up_is_reported_
     assert "from the IMU's +y axis, which points up" in out
     assert "mount: gravity is measured along the sensor's +y axis" in out
     assert "the mount is consistent" in out
-    code, out, _ = run("imu", log, "--json")
-    assert json.loads(out) == {"up": "+y", "mount": None}
-
-
-def test_given_a_few_stationary_seconds_then_no_bias_figure_is_proposed(stationary_log: Path, run: Run) -> None:
-    for end in (23, 26, 30, 50):
-        out = run("imu", stationary_log, "--from", 20, "--to", end)[1]
-        assert "gyro bias instability: not determined" in out
-        assert "accelerometer bias instability: not determined" in out
+    code, out, _ = run("imu", log)
+    assert "mount" not in out
 
 
 def test_given_samples_that_are_not_numbers_when_calibrated_then_they_are_left_out_and_counted(
@@ -230,10 +222,9 @@ def test_given_samples_that_are_not_numbers_when_calibrated_then_they_are_left_o
     for n in range(0, len(samples), 50):
         samples[n] = replace(samples[n], angular_velocity=NAN)
     samples[5] = replace(samples[5], specific_force=None)
-    code, out, _ = run("imu", log_of(tmp_path / "a.lcm", samples), "--json")
-    report = json.loads(out)
-    assert (code, report["dropped"]) == (0, 37)
-    assert report["proposal"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
+    code, out, err = run("imu", log_of(tmp_path / "a.lcm", samples), "-o", "-")
+    assert (code, "37 samples without rates or forces dropped" in err) == (0, True)
+    assert yaml.safe_load(out)["localization"]["filter"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
 
 
 def test_given_a_unit_that_reports_no_rates_when_calibrated_then_that_is_reported(tmp_path: Path, run: Run) -> None:
@@ -259,16 +250,16 @@ def test_given_a_frozen_unit_when_calibrated_then_nothing_is_proposed(tmp_path: 
 
 
 def test_given_two_turns_when_calibrated_then_the_iron_is_found(turning_log: Path, run: Run) -> None:
-    code, out, err = run("magnetometer", turning_log, "--place", PLACE, "--json")
-    report = json.loads(out)
-    assert (code, err) == (0, "")
-    assert report["proposal"]["hard_iron"][:2] == pytest.approx(HARD[:2], abs=3e-8)
-    soft = np.array(report["proposal"]["soft_iron"]).reshape(3, 3)
+    code, out, err = run("magnetometer", turning_log, "--place", PLACE, "-o", "-")
+    assert code == 0
+    proposal = yaml.safe_load(out)["localization"]["magnetometer"]
+    assert proposal["hard_iron"][:2] == pytest.approx(HARD[:2], abs=3e-8)
+    soft = np.array(proposal["soft_iron"]).reshape(3, 3)
     assert soft == pytest.approx(np.eye(3), abs=0.02)
-    assert report["sectors"] == [True] * 12
-    assert report["strength_known"] is True
+    assert "12 of 12 sectors" in err
     # World Magnetic Model for Boston, end of 2023: 20.5 microtesla horizontal, 51.6 in total
-    assert math.hypot(*report["field"]) == pytest.approx(51.6e-6, rel=0.01)
+    (field,) = re.findall(r"field at 42\.3600, -71\.0600: ([\d.]+) uT", err)
+    assert float(field) == pytest.approx(51.6, rel=0.01)
 
 
 def test_given_fixes_in_the_log_when_calibrated_then_they_give_the_position(tmp_path: Path, run: Run) -> None:
@@ -304,14 +295,7 @@ def test_given_a_quarter_turn_when_calibrated_then_it_reports_what_was_seen(tmp_
     log = log_of(tmp_path / "quarter.lcm", rotated_samples(turns=0.3))
     code, out, err = run("magnetometer", log)
     assert (code, out, err.count("\n")) == (1, "", 1)
-    assert "of 12 sectors of 30 degrees" in err
     assert "full circle" in err
-
-
-def test_given_a_level_turn_when_all_axes_are_claimed_then_rejected(turning_log: Path, run: Run) -> None:
-    code, _, err = run("magnetometer", turning_log, "--all-axes")
-    assert code == 1
-    assert "level" in err
 
 
 def test_given_a_unit_without_a_magnetometer_when_calibrated_then_that_is_reported(
@@ -363,7 +347,7 @@ def test_given_another_channel_then_the_nearest_is_offered(stationary_log: Path,
 def test_given_a_channel_of_another_type_then_that_is_reported(tmp_path: Path, run: Run, subcommand: str) -> None:
     fix = GpsSample(at(1.0, "gps"), FixType.FIX_3D, 42.0, -71.0)
     log = write_log(tmp_path / "gps.lcm", [event(fix, "GPS")])
-    code, _, err = run(subcommand, log, "--channel", "GPS", *(("--gps-channel", "X") if subcommand != "imu" else ()))
+    code, _, err = run(subcommand, log, "--channel", "GPS")
     assert (code, err.count("\n")) == (1, 1)
     assert "has no imu_t" in err
 
@@ -394,7 +378,6 @@ def test_given_junk_on_the_channel_and_a_torn_end_then_both_are_reported(
         ["--from", "-1"],
         ["--from", "nan"],
         ["--to", "nan"],
-        ["--json", "-o", "-"],
         ["--plot", "a", "-o", "a"],
         ["--nonsense"],
     ],

@@ -4,37 +4,41 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
+from support_signing import ALLOWED, write_test_key
+from support_wire import EXAMPLES
 
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Problem, Severity
+from modelserver.messages import Health
 from modelserver.server import diagnostics
 from modelserver.server.diagnostics import (
     BusFacts,
-    ClockFacts,
     Diagnosis,
     DiagnosisLevel,
-    DiscoveredServers,
     NetworkInterface,
-    Server,
-    get_worst_level,
 )
+from modelserver.version import __version__
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, UdpAddress
 from msdrivers.settings import read_drivers
 from mstools.cli import main
-from mstools.commands import doctor
-from mstools.commands.doctor import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
+from mstools.commands import doctor, status
+from mstools.commands.doctor import diagnose_connections, diagnose_vehicle_file
 
 LO = NetworkInterface("lo", loopback=True)
-WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
+WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, 0)
 Run = Callable[..., tuple[int, str, str]]
+
+
+def make_health(pid: int, host: str = "pc", version: str = __version__) -> Health:
+    return replace(EXAMPLES["health_t"][0], pid=pid, host=host, version=version)
 
 
 @pytest.fixture
@@ -42,16 +46,20 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     """Return the command, on a machine without problems except those in `facts` and `answers`."""
 
     def command(
-        *arguments: object, facts: BusFacts = WELL, answers: DiscoveredServers | None = None
+        *arguments: object, facts: BusFacts = WELL, daemons: tuple[Health, ...] = (make_health(1),)
     ) -> tuple[int, str, str]:
-        from modelserver.version import __version__
-
-        answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
         monkeypatch.setattr(diagnostics, "read_bus_facts", lambda url, delivery=None: facts)
-        monkeypatch.setattr(diagnostics, "discover_servers", lambda *_: answers)
-        monkeypatch.setattr(
-            diagnostics.HostClockMonitor, "read_facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01)
-        )
+
+        class Listener:
+            def __init__(self, bus: object, prefix: str, handlers: dict[str, Callable[[Health], None]]):
+                for each in daemons:
+                    handlers["MODELSERVER_HEALTH"](each)
+
+            def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
+                return until()
+
+        monkeypatch.setattr(status, "DaemonListener", Listener)
+        monkeypatch.setattr(diagnostics, "is_clock_synchronized", lambda: True)
         with pytest.raises(SystemExit) as ended:
             main(["doctor", *map(str, arguments)])
         output = capsys.readouterr()
@@ -70,7 +78,7 @@ def test_given_a_machine_that_is_well_then_that_is_reported_and_exits_0(run: Run
 @pytest.mark.parametrize(
     ("facts", "code", "words"),
     [
-        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, 1000, 1 << 22), 1, "1 warning"),
+        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, 1000), 1, "1 warning"),
         (BusFacts(DEFAULT_URL, UdpAddress(), None, (LO,)), 3, "$ sudo ip link set lo up multicast on"),
         (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False), 3, "1 error"),
     ],
@@ -83,11 +91,29 @@ def test_given_something_to_fix_then_command_and_exit_code_report(
     assert words in out
 
 
-def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
-    code, out, _ = run(answers=DiscoveredServers((Server("a", 1), Server("b", 2)), 2))
-    assert code == 3
-    assert "2 answer at once: process 1 on 'a', process 2 on 'b'" in out
-    assert "$ kill 2" in out
+@pytest.mark.parametrize(
+    ("daemons", "expected", "words", "command"),
+    [
+        ((), 0, "none publishes health reports", "modelserver run -c vehicle.yaml"),
+        ((make_health(1, "a"),), 0, "one answers: process 1 on 'a'", ""),
+        ((make_health(1, "a", "9"),), 1, "process 1 on 'a' is version '9'", "sudo systemctl restart modelserver"),
+        (
+            (make_health(1, "a"), make_health(2, "b")),
+            3,
+            "2 answer at once: process 1 on 'a', process 2 on 'b'",
+            "kill 2",
+        ),
+        ((make_health(1, "\x1b[31m\n" * 99),), 0, r"one answers: process 1 on '\x1b[31m\n\x1b", ""),
+    ],
+)
+def test_given_daemons_then_there_is_one_of_this_version(
+    run: Run, daemons: tuple[Health, ...], expected: int, words: str, command: str
+) -> None:
+    code, out, _ = run(daemons=daemons)
+    assert code == expected
+    assert words in out
+    assert not command or f"$ {command}" in out
+    assert all(line.isprintable() and len(line) < 400 for line in out.splitlines())
 
 
 @pytest.mark.parametrize("url", ["udpm://nonsense", "udpm://10.0.0.1:7667", "udpm://239.255.76.67", "x://"])
@@ -126,27 +152,31 @@ def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_expla
     assert "own message" in out
 
 
-def test_given_a_geometry_for_the_vehicle_file_then_that_is_reported_and_does_not_send_to_check(
-    run: Run, tmp_path: Path
-) -> None:
+def test_given_a_geometry_for_the_vehicle_file_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     path = write_vehicle(tmp_path).parent / "geometry.yaml"
     code, out, _ = run("-c", path)
     assert code == 3
-    assert f"{path} is wrong: this is a geometry file, not a vehicle file" in out
-    assert "give the vehicle file, which names it" in out
-    assert "modelserver check" not in out
+    assert f"{path} has 1 error, the first: this is a geometry file, not a vehicle file" in out
 
 
 def test_given_no_such_vehicle_file_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     code, out, err = run("-c", tmp_path / "vehicel.yaml")
     assert (code, out) == (2, "")
-    assert "there is no vehicle file" in err
-    assert "did you mean" not in err
-    write_vehicle(tmp_path, VEHICLE)
-    assert re.search(r"did you mean\s[\s\S]*vehicle\.yaml", run("-c", tmp_path / "vehicel.yaml")[2])
+    assert "does not exist" in err
     assert run("-c", tmp_path / "vehicle.yaml" / "x")[0] == 2
     code, _, err = run("-c", tmp_path)
-    assert (code, "is a folder" in err) == (2, True)
+    assert (code, "is a directory" in err) == (2, True)
+
+
+def test_given_a_key_file_that_others_may_read_then_the_vehicle_file_has_an_error(run: Run, tmp_path: Path) -> None:
+    path = write_vehicle(tmp_path, VEHICLE + ALLOWED)
+    code, out, _ = run("-c", path)
+    assert (code, "there is no key file" in out) == (3, True)
+    key = write_test_key(tmp_path)
+    assert run("-c", path)[0] == 0
+    key.chmod(0o644)
+    code, out, _ = run("-c", path)
+    assert (code, "is open to others" in out) == (3, True)
 
 
 def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
@@ -157,7 +187,7 @@ def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
     def raise_permission_error(file: Path) -> None:
         raise PermissionError(13, "Permission denied", str(file))
 
-    monkeypatch.setattr("modelserver.config.vehicle_file.load_config", raise_permission_error)
+    monkeypatch.setattr("mstools.commands.check.check_vehicle", raise_permission_error)
     code, out, _ = run("-c", path)
     assert code == 3
     assert f"{path} cannot be read: Permission denied" in out
@@ -172,11 +202,10 @@ def test_given_findings_with_odd_words_then_they_are_escaped() -> None:
 # --- the vehicle file ---------------------------------------------------------------------------------------
 
 
-def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_path: Path) -> None:
+def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(run: Run, tmp_path: Path) -> None:
     path = write_vehicle(tmp_path, VEHICLE, GEOMETRY)
-    config = load_config(path)
-    Path(config.geometry).unlink()
-    assert get_worst_level(diagnose_vehicle(config, path)) is DiagnosisLevel.ERROR
+    Path(load_config(path).geometry).unlink()
+    assert run("-c", path)[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -217,9 +246,8 @@ def test_given_a_serial_port_then_who_may_use_it_is_reported(tmp_path: Path, mon
     hint = "it belongs to group dialout: sudo usermod -aG dialout ann, then log in again"
     monkeypatch.setattr(serial_port, "explain_permission", lambda path: hint)
     (found,) = lines(sections)
-    assert (found.level, found.command) == (DiagnosisLevel.ERROR, "sudo usermod -aG dialout ann")
-    monkeypatch.setattr(serial_port, "explain_permission", lambda path: "give this user access")
-    assert lines(sections)[0].command == f"ls -l {port}"
+    assert (found.level, found.why) == (DiagnosisLevel.ERROR, hint)
+    assert found.command == f"ls -l {port}"
 
 
 def test_given_a_port_in_use_then_it_is_worth_knowing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,7 @@ def false_daemon(status: Status) -> Iterator[str]:
     ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],
     ["query", "A:A", "B:B", "--motion"], ["reload"], ["tree", "--live"],
     ["dynamics", "--equations"], ["dynamics", "--json"],
-    ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
+    ["query", "A:A", "B:B", "--json"],
     ["query", "A:A", "B:B", "--max-age", "1"],
 ])  # fmt: skip
 def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(

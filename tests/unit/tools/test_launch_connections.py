@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from modelserver.config.vehicle_file import load_config
 from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_drivers
 from mstools.launch import processes as connections
-from mstools.launch.processes import LaunchError
 
 
 def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_machine(tmp_path: Path) -> None:
@@ -40,19 +37,6 @@ def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_ma
     buses = {driver.line.can for driver in drivers.values() if isinstance(driver.line, CanSettings)}
     assert len(buses) == 1
     assert lines.url.split("?")[0].rpartition(":")[2] != buses.pop().rpartition(":")[2]
-
-
-def test_given_no_multicast_then_it_is_reported_and_nothing_is_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(connections, "has_multicast_loopback", lambda group, port: False)
-    with pytest.raises(LaunchError, match=r"multicast does not work(.|\n)*ip route replace 239"):
-        connections.make_connections(find_vehicle_file(), tmp_path, own_bus=True)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_given_a_group_that_is_none_then_nothing_comes_back() -> None:
-    assert not connections.has_multicast_loopback("127.0.0.1", 0)
 
 
 def test_given_the_raptor_then_its_drivers_are_as_the_vehicle_file_reports() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -15,19 +14,9 @@ from support_samples import START, VEHICLE
 from support_samples import write_vehicle as write_files
 from support_signing import KEY, write_test_key
 
-from modelserver.messages import (
-    VALID,
-    Decision,
-    Envelope,
-    Mode,
-    NavigationState,
-    Phase,
-    PublishDecisions,
-    SwitchMode,
-    Verdict,
-)
+from modelserver.core import RUNNING
+from modelserver.messages import VALID, Envelope, Health, LocalizationHealth, Mode, RejectedCount, SwitchMode
 from modelserver.signing import has_valid_signature
-from modelserver.transforms import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
 from mstools.commands.control import MODES, parse_mode
@@ -56,10 +45,11 @@ def write_vehicle(folder: Path, vehicle: str = VEHICLE) -> Path:
 
 
 class Answering:
-    """A daemon that receives mode commands and publishes its state, as far as a test wants."""
+    """A daemon that receives mode commands and publishes its health, as far as a test wants."""
 
-    def __init__(self, url: str, prefix: str = "", mode: Mode = Mode.FULL, applies: bool = True, decides: bool = False):
-        self.mode, self.applies, self.decides, self.prefix = mode, applies, decides, prefix
+    def __init__(self, url: str, prefix: str = "", mode: Mode | None = Mode.FULL, applies: bool = True):
+        self.mode, self.applies, self.prefix = mode, applies, prefix
+        self.rejected: tuple[RejectedCount, ...] = (RejectedCount(f"{prefix}MODELSERVER_SIGNED", "stale", 3),)
         self.commands: list[SwitchMode] = []
         self.bus = lcm.LCM(url)
         self.subscriptions = [self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.on_command)]
@@ -79,9 +69,12 @@ class Answering:
     def run(self) -> None:
         while not self.ended.is_set():
             self.bus.handle_timeout(20)
-            if self.mode is not Mode.RAW:
-                self.bus.publish(f"{self.prefix}LOCALIZATION_STATE", encode(state(self.mode)))
-            self.bus.publish(f"{self.prefix}POSE", b"")
+            health = Health(
+                *(START, 1.0, "1", "cart", "", RUNNING, VALID, 0, 0, 0, 0, 0, 0, 0),
+                localization=LocalizationHealth(self.mode),
+                rejected=self.rejected,
+            )
+            self.bus.publish(f"{self.prefix}MODELSERVER_HEALTH", encode(health))
 
     def on_command(self, _: str, data: bytes) -> None:
         envelope: Envelope = decode("signed_t", data)
@@ -91,19 +84,8 @@ class Answering:
         self.commands.append(command)
         if self.applies:
             self.mode = command.mode
-        if self.decides:
-            header = command.header
-            word = f"mode {command.mode.name.lower()}"
-            made = Decision(header.utime, header.source, header.seq, "mode", Verdict.RESET, word)
-            self.bus.publish(f"{self.prefix}LOCALIZATION_DECISIONS", encode(PublishDecisions(header.utime, (made,))))
-
-
-def state(mode: Mode) -> NavigationState:
-    nan = math.nan
-    nothing = (0.0, 0.0, 0.0)
-    return NavigationState(
-        START, mode, Phase.LEVELING, False, VALID, 0, nan, nan, nan, Pose(), nothing, nothing, (0.0,) * 36, (), (), ()
-    )
+        else:
+            self.rejected = (*self.rejected, RejectedCount(f"{self.prefix}MODELSERVER_SIGNED", "bad_signature", 1))
 
 
 @pytest.mark.parametrize("prefix", ["", "V1_"])
@@ -119,18 +101,11 @@ def test_given_a_daemon_that_applies_then_the_mode_before_and_now_are_reported(
     assert command.header.utime == command.header.host_utime > 1_700_000_000_000_000
 
 
-def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_reports(
-    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_given_a_daemon_that_goes_to_raw_mode_then_that_is_reported(tmp_path: Path, run: Run) -> None:
     config = write_vehicle(tmp_path, LISTENS)
-    with reserved_url() as url:
-        with Answering(url, decides=True):
-            assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
-        monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 1.0)
-        with Answering(url):
-            assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
-        with Answering(url, mode=Mode.RAW):
-            assert "not confirmed: LOCALIZATION_STATE is silent" in run("raw", "-c", config, "--url", url)[1]
+    with reserved_url() as url, Answering(url):
+        assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
+        assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was raw)\n")
 
 
 def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
@@ -140,7 +115,7 @@ def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
     with reserved_url() as url, Answering(url, applies=False):
         code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
     assert (code, out) == (1, "")
-    assert "but the daemon stays in mode full" in err
+    assert "but the daemon stays in mode full (bad_signature: see docs/words.md)" in err
 
 
 def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(
@@ -152,20 +127,18 @@ def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(
         listener = Listener(url, "MODELSERVER_SIGNED")
         code, out, err = run("full", "--config", config)
         assert (code, out) == (1, "")
-        assert "sent console/mode: full, but no message was received" in err
+        assert "sent console/mode: full, but no health report was received" in err
         assert listener.wait()
 
 
-def test_given_a_state_that_is_never_published_then_it_reports_that_nothing_confirms(
+def test_given_a_daemon_without_localization_then_it_reports_that(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mstools.commands.control.TIMEOUT_S", 0.5)
-    config = write_vehicle(tmp_path, f"{LISTENS}publish: {{state_hz: 0}}\n")
-    with reserved_url() as url, Answering(url, mode=Mode.RAW, applies=False):
-        code, out, _ = run("no_gps", "-c", config, "--url", url)
-    assert code == 0
-    assert "cannot be confirmed" in out
-    assert "publish.state_hz: 0" in out
+    with reserved_url() as url, Answering(url, mode=None, applies=False):
+        code, _, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
+    assert code == 1
+    assert "the daemon has no localization" in err
 
 
 def test_given_a_vehicle_file_without_a_channel_then_it_reports_what_to_write(tmp_path: Path, run: Run) -> None:

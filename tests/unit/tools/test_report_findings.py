@@ -23,9 +23,7 @@ START = 1_700_000_000_000_000
 
 
 def snapshot(t: float, **more: object) -> StateSample:
-    given = StateSample(
-        t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, lateral_speed=0.0, yaw_rate=0.0, phase=Phase.ALIGNED
-    )
+    given = StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, yaw_rate=0.0, phase=Phase.ALIGNED)
     return replace(given, **more)  # type: ignore[arg-type]
 
 
@@ -112,6 +110,14 @@ def test_given_fixes_with_a_latency_then_it_is_estimated(tau: float) -> None:
     assert found_titles == (
         [] if tau == 0.0 else [f"Fixes lie {abs(found[0]):.2f} s {'behind' if tau > 0 else 'ahead of'} the vehicle"]
     )
+
+
+def test_given_a_latency_that_the_filter_estimates_then_the_finding_has_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mstools.report.findings.estimate_fix_latency", lambda data: (-0.07, 0.02))
+    states = tuple(snapshot(t, values={"gps_latency": 0.82}, sigmas={"gps_latency": 0.02}) for t in range(100))
+    assert titles(make_data(snapshots=states)) == ["Fixes lie 0.75 s behind the vehicle"]
 
 
 def test_given_a_straight_drive_then_no_latency_can_be_estimated() -> None:

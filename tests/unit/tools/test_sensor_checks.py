@@ -103,7 +103,6 @@ def test_given_a_drive_anywhere_then_no_figure_depends_on_place_or_arrival(
     assert found.compare_distances() == pytest.approx((230.0, 230.0), rel=0.03)
     wheels, fixes = found.compare_distances()
     assert wheels / fixes == pytest.approx(1.0, abs=0.02)
-    assert found.distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.01)
     compared = compare_turn_rates(found.gyro, found.wheel_turn_rate)
     assert compared == pytest.approx((1.0, 1.0), abs=0.1)
     assert found.compare_with_course(found.gyro) == pytest.approx((1.0, 1.0), abs=0.1)
@@ -152,9 +151,7 @@ def test_given_samples_in_bursts_then_their_period_is_that_of_the_source(burst: 
 
 def make_data(**more: object) -> ReplayData:
     states = tuple(
-        StateSample(
-            t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, lateral_speed=0.0, yaw_rate=0.0, phase=Phase.ALIGNED
-        )
+        StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, yaw_rate=0.0, phase=Phase.ALIGNED)
         for t in range(100)
     )
     given = ReplayData(
@@ -181,12 +178,11 @@ def test_given_a_good_drive_then_nothing_is_found() -> None:
     assert collect_findings(make_data(sensor_motion=make_motion(with_gyro=False))) == []
 
 
-@pytest.mark.parametrize("with_gyro", [True, False])
 @pytest.mark.parametrize("name", ["left", "right"])
-def test_given_one_wheel_whose_sign_is_swapped_then_it_is_named(name: str, with_gyro: bool) -> None:
-    found = only(make_data(sensor_motion=make_motion(**{name: -1.0}, with_gyro=with_gyro)))  # type: ignore[arg-type]
+def test_given_one_wheel_whose_sign_is_swapped_then_it_is_named(name: str) -> None:
+    found = only(make_data(sensor_motion=make_motion(**{name: -1.0})))  # type: ignore[arg-type]
     assert (found.level, found.title) == (Severity.ERROR, f"Wheel {name} counts backward")
-    assert ("gyro" if with_gyro else "course") in found.observation
+    assert "gyro" in found.observation
 
 
 @pytest.mark.parametrize("with_gyro", [True, False])
@@ -225,7 +221,6 @@ def test_given_wheels_in_millimeters_then_the_unit_is_named_once_for_each_findin
     found = collect_findings(given)
     assert titles(found)[0] == "No sample of sensors.wheels is used: range"
     assert "mm" in found[0].advice
-    assert "The fastest second is 2030 m/s" in found[0].observation
     assert "mm per m" in found[1].advice
 
 
@@ -261,7 +256,6 @@ def test_given_a_sensor_of_which_the_log_has_nothing_then_channel_and_remedies_c
     assert titles(found) == ["No messages on channel IMU (sensors.imu)", "There was never a state"]
     assert found[0].observation == "The log has GPS, WHEELS."
     assert "localization.mode: no_imu" in found[0].advice
-    assert "Probably a consequence" in found[1].observation
     # a mode without it needs none
     assert collect_findings(make_data(missing_channels=(("imu", "IMU"),), mode=Mode.NO_IMU)) == []
 
@@ -276,13 +270,6 @@ def test_given_a_filter_that_was_restarted_then_checks_of_its_state_are_left_out
     (found,) = collect_findings(make_data(snapshots=states, decisions=restarts))
     assert found.title == "The filter was restarted"
     assert "first of 3 times" in found.observation
-
-
-def test_given_a_drive_then_its_distance_is_known_without_any_state() -> None:
-    assert make_motion().distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.05)
-    assert SensorMotion().distance_travelled() != SensorMotion().distance_travelled()  # not known
-    distances = make_motion().compare_distances()
-    assert distances.fixes == pytest.approx(distances.wheels, rel=0.1)
 
 
 @pytest.mark.parametrize(

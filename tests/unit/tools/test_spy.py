@@ -109,17 +109,6 @@ def test_given_no_java_when_run_then_it_reports_what_to_install(
     assert "sudo apt install default-jre default-jdk-headless" in _failure(capsys)
 
 
-def test_given_a_java_without_windows_when_run_then_it_reports_what_to_install(
-    only: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("DISPLAY", ":1")
-    _program(tmp_path / "jvm" / "bin" / "java")
-    (tmp_path / "jvm" / "lib").mkdir()
-    (tmp_path / "jvm" / "lib" / "libjava.so").touch()
-    (only / "java").symlink_to(tmp_path / "jvm" / "bin" / "java")
-    assert "this Java is headless: sudo apt install default-jre" in _failure(capsys)
-
-
 def test_given_no_display_when_run_then_it_reports_it(
     only: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,6 +33,8 @@ class CalibrationError(ModelServerError, ValueError):
 
 _NONE = (math.nan, math.nan, math.nan)
 
+GPS_CHANNEL = "GPS"
+
 
 @dataclass(frozen=True, slots=True)
 class ImuRecording:
@@ -58,7 +60,7 @@ class ImuRecording:
     damage: tuple[str, ...]
 
 
-def read_recording(log: Path, channel: str, gps_channel: str, begin: float, end: float) -> ImuRecording:
+def read_recording(log: Path, channel: str, begin: float, end: float) -> ImuRecording:
     """Return the samples of a log between two times in seconds since its first message.
 
     Raises RecordingError where there is no log, nothing on the channel, or no inertial samples; OSError.
@@ -76,7 +78,7 @@ def read_recording(log: Path, channel: str, gps_channel: str, begin: float, end:
             if number % 4096 == 0:
                 show(event.end)
             at = (event.utime - first) * 1e-6
-            if event.channel not in (channel, gps_channel) or not begin <= at < end:
+            if event.channel not in (channel, GPS_CHANNEL) or not begin <= at < end:
                 continue
             try:
                 sample: Any = decode("imu_t" if event.channel == channel else "gps_t", event.data)
@@ -115,10 +117,9 @@ def _median_fix(fixes: list[Vector3]) -> Vector3 | None:
     good = [each for each in fixes if math.isfinite(each[0]) and math.isfinite(each[1])]
     if not good:
         return None
-    latitude, longitude, _ = sorted(good)[len(good) // 2]
-    heights = [each[2] for each in good if math.isfinite(each[2])]
+    latitude, longitude, height = sorted(good)[len(good) // 2]
     # a kilometer of height changes the field by 0.05 %
-    return (latitude, longitude, float(np.median(heights)) if heights else 0.0)
+    return (latitude, longitude, height if math.isfinite(height) else 0.0)
 
 
 # --- ranges of samples --------------------------------------------------------------------------------------

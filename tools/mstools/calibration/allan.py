@@ -2,9 +2,8 @@
 
 White noise N (angle or velocity random walk) has the slope -1/2, sigma = N / sqrt(tau); bias instability B a flat
 floor, sigma = 0.664 B; a random walk K of the bias (rate random walk) the slope +1/2, sigma = K sqrt(tau / 3). Each is
-fitted where the curve has its slope, weighted by the errors of the deviations; where the record does not determine one,
-an upper limit with 99 % confidence is given. Limits: averaging times reach to a fifth of the record, and steady noise
-is assumed: vibration or temperature drift changes the slopes.
+fitted where the curve has its slope, weighted by the errors of the deviations. Limits: averaging times reach to a fifth
+of the record, and steady noise is assumed: vibration or temperature drift changes the slopes.
 
 Sources: IEEE Std 952-1997, annex C: Allan variance from averages over clusters (C.1), angle random walk (C.1.1), bias
 instability (C.1.3), rate random walk (C.1.4), the error of an estimate (C.1, 1 / sqrt(2 (N/n - 1))). W. Riley and
@@ -76,15 +75,12 @@ class NoiseParameters:
     """The noise parameters of an axis; u is the unit of the series, rad/s or m/s2.
 
     white: N, u/sqrt(Hz), angle or velocity random walk. instability: B, u. random_walk: K, u/sqrt(s), of the bias. None
-    where the record does not determine it: `missing` states why and what to do, and the limits are upper limits with 99
-    % confidence, NaN where even that is unknown.
+    where the record does not determine it: `missing` states why and what to do.
     """
 
     white: NoiseParameter | None
     instability: NoiseParameter | None
     random_walk: NoiseParameter | None
-    instability_limit: float
-    random_walk_limit: float
     missing: tuple[str, ...]
 
 
@@ -135,19 +131,19 @@ def fit_noise_parameters(curve: AllanCurve) -> NoiseParameters:
     taus, deviations = np.array(curve.taus), np.array(curve.deviations)
     if not (deviations > 0.0).all():
         text = "all values are equal: the unit is frozen, or its resolution is coarser than its noise"
-        return NoiseParameters(None, None, None, math.nan, math.nan, (text,))
+        return NoiseParameters(None, None, None, (text,))
     missing: list[str] = []
     white = _fit_white(curve, taus, deviations)
     if white is None:
         missing.append("white noise: no averaging time shows the slope of -1/2; vibration or quantization hides it")
-    instability, instability_limit = _fit_instability(curve, deviations)
+    instability = _fit_instability(curve, deviations)
     longer = f"record {max(3.0 * curve.seconds, 600.0) / 60.0:.0f} minutes or more while stationary"
-    walk, walk_limit, why = _fit_random_walk(curve, taus, deviations, white, longer)
+    walk, why = _fit_random_walk(curve, taus, deviations, white, longer)
     if instability is None:
         missing.append(f"bias instability: no minimum up to {curve.taus[-1]:.3g} s; {longer}")
     if walk is None:
         missing.append(f"bias random walk: {why}")
-    return NoiseParameters(white, instability, walk, instability_limit, walk_limit, tuple(missing))
+    return NoiseParameters(white, instability, walk, tuple(missing))
 
 
 def _fit_white(curve: AllanCurve, taus: Array, deviations: Array) -> NoiseParameter | None:
@@ -167,12 +163,11 @@ def _fit_white(curve: AllanCurve, taus: Array, deviations: Array) -> NoiseParame
     return NoiseParameter(value, value * float(errors.min()), curve.taus[first], curve.clusters[first])
 
 
-def _fit_instability(curve: AllanCurve, deviations: Array) -> tuple[NoiseParameter | None, float]:
-    """Return B from the minimum, None where the deviation decreases to the end; and its upper limit."""
+def _fit_instability(curve: AllanCurve, deviations: Array) -> NoiseParameter | None:
+    """Return B from the minimum, None where the deviation decreases to the end."""
     errors = curve.relative_errors
     at = int(np.argmin(deviations))
     least = float(deviations[at])
-    limit = math.sqrt(float(_upper_limit(curve, deviations**2)[at])) / INSTABILITY_FLOOR
     # after the minimum the curve must rise significantly, or stay flat over the last decade
     half_decade = curve.taus[-1] >= 3.0 * curve.taus[at]
     risen = half_decade and any(
@@ -181,50 +176,35 @@ def _fit_instability(curve: AllanCurve, deviations: Array) -> tuple[NoiseParamet
     last = slice(max(len(deviations) - POINTS_PER_DECADE, 0), None)
     slope, slope_error = _slope(np.log(curve.taus[last]), np.log(deviations[last]), np.array(errors[last]))
     if not (risen or slope - slope_error > -FLAT_SLOPE):
-        return None, limit
-    return NoiseParameter(
-        least / INSTABILITY_FLOOR, least / INSTABILITY_FLOOR * errors[at], curve.taus[at], curve.clusters[at]
-    ), limit
+        return None
+    floor = least / INSTABILITY_FLOOR
+    return NoiseParameter(floor, floor * errors[at], curve.taus[at], curve.clusters[at])
 
 
 def _fit_random_walk(
     curve: AllanCurve, taus: Array, deviations: Array, white: NoiseParameter | None, longer: str
-) -> tuple[NoiseParameter | None, float, str]:
-    """Return K from the slope +1/2 after subtracting white noise; its upper limit; the reason where it is None."""
+) -> tuple[NoiseParameter | None, str]:
+    """Return K from the slope +1/2 after subtracting white noise, and the reason where it is None."""
     variances = deviations**2
     errors = 2.0 * variances * np.array(curve.relative_errors)
     rest = variances - (white.value**2 / taus if white else 0.0)
-    # at each time K explains at most what white noise does not
-    most = np.maximum(_upper_limit(curve, variances) - (variances - rest), 2.0 * errors)
-    limit = math.sqrt(float(np.min(most * 3.0 / taus)))
     start = int(np.argmin(deviations))
     chosen = np.array([i for i in range(start, len(taus)) if rest[i] > variances[i] / 2.0], dtype=int)
     if chosen.size == 0 or taus[chosen[-1]] < 3.0 * taus[chosen[0]]:
-        return None, limit, f"no rise over a factor of 3 in time up to {curve.taus[-1]:.3g} s; {longer}"
+        return None, f"no rise over a factor of 3 in time up to {curve.taus[-1]:.3g} s; {longer}"
     relative = errors[chosen] / rest[chosen]
     slope, slope_error = _slope(np.log(taus[chosen]), np.log(rest[chosen]) / 2.0, relative / 2.0)
     if slope < RANDOM_WALK_SLOPES[0] - slope_error:
         text = f"the deviation stays flat up to {curve.taus[-1]:.3g} s (slope {slope:.2f}, a walk has 0.5); {longer}"
-        return None, limit, text
+        return None, text
     if slope > RANDOM_WALK_SLOPES[1] + slope_error:
         text = f"the bias ramps (slope {slope:.2f}, a walk has 0.5): let the unit warm up before recording"
-        return None, limit, text
+        return None, text
     squared = float(np.average(rest[chosen] * 3.0 / taus[chosen], weights=relative**-2))
     first = int(np.argmin(relative))
     value = math.sqrt(squared)
     at = int(chosen[first])
-    return NoiseParameter(value, value * float(relative[first]) / 2.0, curve.taus[at], curve.clusters[at]), limit, ""
-
-
-def _upper_limit(curve: AllanCurve, variances: Array) -> Array:
-    """Return upper limits of the variances with 99 % confidence.
-
-    A variance from c clusters is chi-square distributed with c - 1 degrees of freedom; its quantile by E. Wilson and
-    M. Hilferty, "The distribution of chi-square", 1931.
-    """
-    a = 2.0 / (9.0 * (np.array(curve.clusters) - 1.0))
-    upper: Array = variances / np.maximum(1.0 - a - 2.326 * np.sqrt(a), 0.1) ** 3
-    return upper
+    return NoiseParameter(value, value * float(relative[first]) / 2.0, curve.taus[at], curve.clusters[at]), ""
 
 
 def _slopes(taus: Array, deviations: Array) -> Array:

@@ -4,17 +4,17 @@ The unit measures m = W h + b: the earth's field h distorted by soft iron, W, an
 A symmetric A and b are fitted so that |A (m - b)| is the strength of the earth's field in every orientation. A rotation
 common to all samples cannot be determined from lengths; a symmetric A is the choice with the smallest.
 
-A ground vehicle turns about the vertical alone. Then the horizontal part of m moves on an ellipse, and the planar mode
-finds what maps it to a circle; the vertical, which such a turn does not determine, is left as it is. Limit: hard iron
-found so holds for level ground; on a slope, soft iron's share of the vertical field returns.
+A ground vehicle turns about the vertical alone: the horizontal part of m moves on an ellipse, which A maps to a circle;
+the vertical, which such a turn does not determine, is left as it is. Limit: hard iron found so holds for level ground;
+on a slope, soft iron's share of the vertical field returns.
 
 Found are a center b and a symmetric positive definite matrix A, so that |A (p - b)| = 1 for the points p. First
-an algebraic fit: the quadric p'Qp + 2 q'p + c = 0 with trace Q = dimension, which is linear in the unknowns and
-invariant to rotation of the axes; refitted a few times to the nearest points (least trimmed squares). Then Gauss-Newton
-on the lengths |A (p - b)| - 1 with Tukey's weights. Points are weighted so that each direction counts equally.
+an algebraic fit: the conic p'Qp + 2 q'p + c = 0 with trace Q = 2, which is linear in the unknowns and invariant to
+rotation of the axes; refitted a few times to the nearest points (least trimmed squares). Then Gauss-Newton on the
+lengths |A (p - b)| - 1 with Tukey's weights. Points are weighted so that each direction counts equally.
 
 Sources: V. Renaudin, M. Afzal and G. Lachapelle, "Complete triaxis magnetometer calibration in the magnetic domain",
-2010 (the whole; quadric, and A and b from it); J. Vasconcelos et al., "Geometric approach to strapdown magnetometer
+2010 (the whole; A and b from a quadric); J. Vasconcelos et al., "Geometric approach to strapdown magnetometer
 calibration in sensor frame", 2011 (refinement on lengths); P. Rousseeuw and K. Van Driessen, "Computing LTS regression
 for large data sets", 2006 (refitting to the nearest); P. Holland and R. Welsch, "Robust regression using iteratively
 reweighted least-squares", 1977 (Tukey's weights, 4.685; spread from the median, 1.4826).
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -38,11 +38,6 @@ SECTORS = 12
 MIN_SECTORS = 10
 """Sectors that must be covered: elsewhere the ellipse is extrapolated, and disturbances of the field would not show."""
 
-MIN_SPREAD = 0.3
-"""For calibration about all axes: share of the sphere's height that the directions must cover along their least covered
-axis: 17 degrees of elevation to both sides.
-"""
-
 MAX_RESIDUAL = 0.1
 """Largest residual as a share of the strength: beyond, the samples are on no ellipse (6 degrees of heading)."""
 
@@ -53,37 +48,24 @@ percent; beyond, the unit's scale is wrong or the turn was incomplete.
 
 
 @dataclass(frozen=True, slots=True)
-class Coverage:
-    """Directions that the samples cover.
-
-    sectors: SECTORS flags, counter-clockwise about `axis` (unit vector along the sensor's axes). spread: share of the
-    sphere's height covered along `axis`; NaN in planar mode.
-    """
-
-    sectors: tuple[bool, ...]
-    axis: Vector3
-    spread: float
-
-
-@dataclass(frozen=True, slots=True)
 class MagnetometerFit:
     """A magnetometer's calibration: the field is `soft_iron` (m - `hard_iron`).
 
-    hard_iron: along the sensor's axes, tesla. soft_iron: 3 x 3, symmetric, row-major. is_planar: whether only the
-    horizontal was fitted. strength: of the horizontal field in planar mode, else of the whole, tesla;
-    is_strength_known: whether it was given, or is the mean radius. rms: of the residuals of the inliers, tesla;
-    heading_rms: the resulting error of heading, radians, NaN where the horizontal field is unknown. samples: number of
-    finite ones; outliers: those not used.
+    hard_iron: along the sensor's axes, tesla. soft_iron: 3 x 3, symmetric, row-major. strength: of the horizontal
+    field, tesla; is_strength_known: whether it was given, or is the mean radius. rms: of the residuals of the inliers,
+    tesla; heading_rms: the resulting error of heading, radians. sectors: SECTORS flags of the directions that the
+    samples cover, counter-clockwise about the unit vector `up`. samples: number of finite ones; outliers: those not
+    used.
     """
 
     hard_iron: Vector3
     soft_iron: Matrix3
-    is_planar: bool
     strength: float
     is_strength_known: bool
     rms: float
     heading_rms: float
-    coverage: Coverage
+    sectors: tuple[bool, ...]
+    up: Vector3
     samples: int
     outliers: int
 
@@ -92,26 +74,6 @@ class MagnetometerFit:
         away = np.asarray(fields, dtype=float) - np.array(self.hard_iron)
         corrected: Array = away @ np.array(self.soft_iron).reshape(3, 3).T
         return corrected
-
-
-def fit_all_axes(fields: npt.ArrayLike, strength: float = math.nan, horizontal: float = math.nan) -> MagnetometerFit:
-    """Return the calibration of a unit that was turned about all of its axes.
-
-    Parameters
-    ----------
-    fields : (n, 3) along the sensor's axes, tesla; rows that are not finite are ignored
-    strength : of the earth's field at the place, tesla (`magnetism.field_at`); NaN for the mean radius
-    horizontal : its horizontal part, for the error of heading
-
-    Raises
-    ------
-    CalibrationError
-        Where the turn was insufficient, with the directions covered.
-    """
-    points = _select_finite(fields)
-    found = fit_quadric(points)
-    coverage = _sphere_coverage(found.normalize(points[found.is_inlier]))
-    return _make_fit(found, points, np.eye(3), 0.0, strength, horizontal, coverage)
 
 
 def fit_level(
@@ -133,62 +95,44 @@ def fit_level(
     CalibrationError
         Where the turn was insufficient, with the directions covered.
     """
-    points = _select_finite(fields)
+    points = np.asarray(fields, dtype=float).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
     E = _level_axes(up)
     level, height = points @ E[:, :2], points @ E[:, 2]
-    try:
-        found = fit_quadric(level)
-    except CalibrationError as error:
-        raise _add_coverage(error, level) from None
-    unit = found.normalize(level[found.is_inlier])
-    coverage = Coverage(_covered_sectors(unit[:, 0], unit[:, 1]), to_vector3(E[:, 2]), math.nan)
-    offset = 0.0
-    if math.isfinite(vertical):
-        offset = float(np.average(height[found.is_inlier], weights=found.weights[found.is_inlier])) - vertical
-    return _make_fit(found, level, E, offset, horizontal, math.nan, coverage)
-
-
-def _make_fit(
-    found: Quadric,
-    points: Array,
-    E: Array,
-    offset: float,
-    strength: float,
-    horizontal: float,
-    coverage: Coverage,
-) -> MagnetometerFit:
-    """Scale a quadric to the field's strength, NaN for the mean radius, and check it. Raises CalibrationError.
-
-    `points` are along the first columns of `E`, axes along the sensor's; `offset` is the hard iron along the last.
-    """
-    dimension = points.shape[1]
-    known = math.isfinite(strength)
-    target = strength if known else float(np.linalg.det(found.matrix)) ** (-1.0 / dimension)
-    _check_coverage(coverage)
-    scaled = found.matrix * target
-    _check_axis_ratio(scaled, known)
-    off = np.linalg.norm(found.normalize(points[found.is_inlier]), axis=1) - 1.0
-    rms = math.sqrt(float(np.average(off**2, weights=found.weights[found.is_inlier]))) * target
+    found = fit_ellipse(level)
+    used, weights = found.is_inlier, found.weights[found.is_inlier]
+    unit = found.normalize(level[used])
+    sectors = _covered_sectors(unit[:, 0], unit[:, 1])
+    if sum(sectors) < MIN_SECTORS:
+        raise CalibrationError(
+            f"the samples cover {sum(sectors)} of {SECTORS} sectors of 30 degrees, {MIN_SECTORS} are needed: turn the "
+            "vehicle slowly through a full circle twice, on level ground and away from iron, and record again"
+        )
+    known = math.isfinite(horizontal)
+    target = horizontal if known else float(np.linalg.det(found.matrix)) ** -0.5
+    A = np.eye(3)
+    A[:2, :2] = found.matrix * target
+    _check_axis_ratio(A[:2, :2], known)
+    rms = math.sqrt(float(np.average((np.linalg.norm(unit, axis=1) - 1.0) ** 2, weights=weights))) * target
     if rms > MAX_RESIDUAL * target:
         raise CalibrationError(
             f"the samples scatter by {rms / target:.0%} of the field about the fit, {MAX_RESIDUAL:.0%} are "
             "allowed: the vehicle was not turned, or something else moved the field; turn in one place, away from iron"
         )
-    A = np.eye(3)
-    A[:dimension, :dimension] = scaled
+    offset = float(np.average(height[used], weights=weights)) - vertical if math.isfinite(vertical) else 0.0
     A = E @ A @ E.T
     a, b, c, d, e, f, g, h, i = (float(each) for each in ((A + A.T) / 2.0).ravel())
     return MagnetometerFit(
-        hard_iron=to_vector3(E @ np.array([*found.center, offset])[:3]),
+        hard_iron=to_vector3(E @ np.array([*found.center, offset])),
         soft_iron=(a, b, c, d, e, f, g, h, i),
-        is_planar=dimension == 2,
         strength=target,
         is_strength_known=known,
         rms=rms,
-        heading_rms=rms / (target if dimension == 2 else horizontal),
-        coverage=coverage,
+        heading_rms=rms / target,
+        sectors=sectors,
+        up=to_vector3(E[:, 2]),
         samples=len(points),
-        outliers=int((~found.is_inlier).sum()),
+        outliers=int((~used).sum()),
     )
 
 
@@ -196,12 +140,6 @@ def project_to_level(fields: npt.ArrayLike, up: Vector3) -> Array:
     """Return the horizontal parts (n, 2) of vectors (n, 3) along the sensor's axes, as in `fit_level`."""
     plane: Array = np.asarray(fields, dtype=float) @ _level_axes(up)[:, :2]
     return plane
-
-
-def _select_finite(fields: npt.ArrayLike) -> Array:
-    points = np.asarray(fields, dtype=float).reshape(-1, 3)
-    finite: Array = points[np.isfinite(points).all(axis=1)]
-    return finite
 
 
 def _level_axes(up: Vector3) -> Array:
@@ -218,48 +156,11 @@ def _level_axes(up: Vector3) -> Array:
     return np.column_stack((x, np.cross(z, x), z))
 
 
-def _sphere_coverage(unit: Array) -> Coverage:
-    """Return the coverage of directions on the sphere, about the axis along which they spread least."""
-    _, vectors = np.linalg.eigh(np.cov(unit.T))
-    E = _level_axes(to_vector3(vectors[:, 0]))
-    heights = unit @ E[:, 2]
-    low, high = np.quantile(heights, (0.02, 0.98))
-    return Coverage(_covered_sectors(unit @ E[:, 0], unit @ E[:, 1]), to_vector3(E[:, 2]), float(high - low) / 2.0)
-
-
 def _covered_sectors(x: Array, y: Array) -> tuple[bool, ...]:
     sectors = np.floor(np.arctan2(y, x) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
     counts = np.bincount(sectors, minlength=SECTORS)
     # a single outlier does not cover 30 degrees
     return tuple(bool(count >= 3) for count in counts)
-
-
-def _add_coverage(error: CalibrationError, level: Array) -> CalibrationError:
-    """Return the error of a fit that found no ellipse with the coverage, where a circle fits roughly."""
-    center, radius = fit_circle(level)
-    if not radius > 0.0:
-        return error
-    away = level - center
-    off = np.linalg.norm(away, axis=1) / radius - 1.0
-    if not float(np.sqrt(np.mean(off**2))) <= MAX_RESIDUAL:
-        return error
-    seen = sum(_covered_sectors(away[:, 0], away[:, 1]))
-    return CalibrationError(f"{error}; the samples lie on about {seen} of {SECTORS} sectors of 30 degrees")
-
-
-def _check_coverage(coverage: Coverage) -> None:
-    seen = sum(coverage.sectors)
-    if seen < MIN_SECTORS:
-        raise CalibrationError(
-            f"the samples cover {seen} of {SECTORS} sectors of 30 degrees, {MIN_SECTORS} are needed: turn the "
-            "vehicle slowly through a full circle twice, on level ground and away from iron, and record again"
-        )
-    if coverage.spread < MIN_SPREAD:
-        raise CalibrationError(
-            f"the directions reach over {coverage.spread:.0%} of the sphere's height along the sensor's axis "
-            f"({', '.join(f'{each:.2f}' for each in coverage.axis)}), {MIN_SPREAD:.0%} are needed: roll and pitch "
-            "the unit more; use the level mode for a vehicle that stays level"
-        )
 
 
 def _check_axis_ratio(A: Array, known: bool) -> None:
@@ -276,7 +177,7 @@ def _check_axis_ratio(A: Array, known: bool) -> None:
         )
 
 
-# --- robust fit of an ellipse or ellipsoid ------------------------------------------------------------------
+# --- robust fit of an ellipse -------------------------------------------------------------------------------
 
 TUKEY = 4.685
 SPREAD = 1.4826
@@ -286,6 +187,9 @@ TRIM_SHARE = 0.75
 WEIGHT_SECTORS = 36
 """Sectors about the center in which points are counted; a point's weight is inverse to the count of its sector."""
 
+MIN_SAMPLES = 20
+"""Four for each of the five unknowns of an ellipse."""
+
 _ROUNDS = 8
 _STEPS = 50
 _FLOOR = 1e-6
@@ -293,7 +197,7 @@ _FLOOR = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Quadric:
+class Ellipse:
     """|matrix (p - center)| = 1, in the unit of the points.
 
     is_inlier: (n,), the points that are no outliers. weights: (n,), of each point by its sector, without Tukey's
@@ -306,21 +210,25 @@ class Quadric:
     weights: Array
 
     def normalize(self, points: Array) -> Array:
-        """Return A (p - b), (n, d): on the unit circle or sphere except for noise."""
+        """Return A (p - b), (n, 2): on the unit circle except for noise."""
         mapped: Array = (points - self.center) @ self.matrix
         return mapped
 
 
-def fit_quadric(points: Array) -> Quadric:
-    """Return the ellipse (n, 2) or ellipsoid (n, 3) through finite points.
+_NO_ELLIPSE: Final = (
+    "no ellipse goes through the samples: turn the vehicle through a full circle twice, on level ground, away from "
+    "iron, and record again"
+)
 
-    Raises CalibrationError where no ellipse fits: too few points, on a line, or on another curve.
+
+def fit_ellipse(points: Array) -> Ellipse:
+    """Return the ellipse through finite points (n, 2).
+
+    Raises CalibrationError where none fits: too few points, on a line, or on another curve.
     """
-    count, dimension = points.shape
-    unknown = dimension * (dimension + 3) // 2
-    if count < 4 * unknown:
+    if len(points) < MIN_SAMPLES:
         raise CalibrationError(
-            f"{count} samples are too few for a fit; at least {4 * unknown} are needed: record longer"
+            f"{len(points)} samples are too few for a fit; at least {MIN_SAMPLES} are needed: record longer"
         )
     # scaled and centered, for numerical conditioning
     middle = (points.max(axis=0) + points.min(axis=0)) / 2.0
@@ -335,53 +243,33 @@ def fit_quadric(points: Array) -> Quadric:
         weights = _balance_weights(mapped)
         off = np.abs(np.linalg.norm(mapped, axis=1) - 1.0)
         near = off <= _weighted_quantile(off, weights, TRIM_SHARE)
-        if near.sum() < 2 * unknown:
+        if near.sum() < MIN_SAMPLES // 2:
             break
         center, matrix = _fit_algebraic(scaled[near], weights[near])
     center, matrix, is_inlier = _refine(scaled, weights, center, matrix)
-    return Quadric(center * size + middle, matrix / size, is_inlier, weights)
-
-
-def fit_circle(points: Array) -> tuple[Array, float]:
-    """Return center and radius of the circle through points (n, 2), by algebraic fit (I. Kasa, 1976), or radius 0."""
-    middle = points.mean(axis=0) if len(points) else np.zeros(2)
-    away = points - middle
-    design = np.column_stack((2.0 * away, np.ones(len(away))))
-    found, _, rank, _ = np.linalg.lstsq(design, (away**2).sum(axis=1), rcond=None)
-    squared = float(found[2] + found[:2] @ found[:2])
-    return found[:2] + middle, float(np.sqrt(max(squared, 0.0))) if rank == 3 else 0.0
+    return Ellipse(center * size + middle, matrix / size, is_inlier, weights)
 
 
 def _fit_algebraic(points: Array, weights: Array) -> tuple[Array, Array]:
-    dimension = points.shape[1]
-    pairs = [pair for pair in combinations_with_replacement(range(dimension), 2) if pair != (0, 0)]
-    first = points[:, 0] ** 2
-    columns = []
-    for i, j in pairs:
-        # Q00 = d - the other diagonal entries
-        columns.append(points[:, i] ** 2 - first if i == j else 2.0 * points[:, i] * points[:, j])
-    design = np.column_stack((*columns, 2.0 * points, np.ones(len(points))))
+    x, y = points.T
+    # Q = [[1 + a, b], [b, 1 - a]]
+    design = np.column_stack((x * x - y * y, 2.0 * x * y, 2.0 * x, 2.0 * y, np.ones(len(x))))
     root = np.sqrt(weights)
-    found, _, rank, _ = np.linalg.lstsq(design * root[:, None], -dimension * first * root, rcond=1e-10)
-    Q = np.zeros((dimension, dimension))
-    for (i, j), value in zip(pairs, found, strict=False):
-        Q[i, j] = Q[j, i] = value
-    Q[0, 0] = dimension - np.trace(Q)
-    q, c = found[len(pairs) : -1], float(found[-1])
+    found, _, rank, _ = np.linalg.lstsq(design * root[:, None], -(x * x + y * y) * root, rcond=1e-10)
+    a, b, *q, c = found
+    Q = np.array([[1.0 + a, b], [b, 1.0 - a]])
     values, vectors = np.linalg.eigh(Q)
-    if rank < design.shape[1] or values[0] <= 1e-6 * values[-1]:
-        raise _no_ellipse(dimension)
+    if rank < 5 or values[0] <= 1e-6 * values[-1]:
+        raise CalibrationError(_NO_ELLIPSE)
     center = -np.linalg.solve(Q, q)
-    radius = float(center @ Q @ center) - c
+    radius = float(center @ Q @ center - c)
     if radius <= 0.0:
-        raise _no_ellipse(dimension)
+        raise CalibrationError(_NO_ELLIPSE)
     matrix: Array = vectors @ np.diag(np.sqrt(values / radius)) @ vectors.T
     return center, matrix
 
 
 def _refine(points: Array, weights: Array, center: Array, matrix: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    dimension = points.shape[1]
-    pairs = list(combinations_with_replacement(range(dimension), 2))
     is_inlier = np.ones(len(points), dtype=bool)
     for _ in range(_STEPS):
         away = points - center
@@ -394,17 +282,14 @@ def _refine(points: Array, weights: Array, center: Array, matrix: Array) -> tupl
         discount = np.where(is_inlier, (1.0 - share**2) ** 2, 0.0) * weights
         directions = mapped / lengths[:, None]
         # d|A(p-b)| = n' (dA (p-b) - A db)
-        columns = [directions[:, i] * away[:, j] + (directions[:, j] * away[:, i] if i != j else 0.0) for i, j in pairs]
-        jacobian = np.column_stack((*columns, -directions @ matrix))
+        (n, m), (x, y) = directions.T, away.T
+        jacobian = np.column_stack((n * x, n * y + m * x, m * y, -directions @ matrix))
         root = np.sqrt(discount)
         step, *_ = np.linalg.lstsq(jacobian * root[:, None], -residuals * root, rcond=1e-10)
-        for (i, j), value in zip(pairs, step, strict=False):
-            matrix[i, j] += value
-            if i != j:
-                matrix[j, i] += value
-        center = center + step[len(pairs) :]
+        matrix = matrix + step[[0, 1, 1, 2]].reshape(2, 2)
+        center = center + step[3:]
         if not np.isfinite(step).all() or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-            raise _no_ellipse(dimension)
+            raise CalibrationError(_NO_ELLIPSE)
         if float(np.abs(step).max()) < 1e-10:
             break
     return center, matrix, is_inlier
@@ -412,16 +297,9 @@ def _refine(points: Array, weights: Array, center: Array, matrix: Array) -> tupl
 
 def _balance_weights(points: Array) -> Array:
     """Return weights, mean 1, with equal sums in all directions about the origin, however many samples each has."""
-    azimuth = (
-        np.floor((np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5) * WEIGHT_SECTORS).astype(int)
-        % WEIGHT_SECTORS
-    )
-    cells = azimuth
-    if points.shape[1] == 3:
-        # bands of equal area on the sphere
-        height = points[:, 2] / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
-        cells = azimuth + WEIGHT_SECTORS * np.clip(np.floor((height + 1.0) * 6.0).astype(int), 0, 11)
-    weights = 1.0 / np.bincount(cells)[cells]
+    turns = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
+    sectors = np.floor(turns * WEIGHT_SECTORS).astype(int) % WEIGHT_SECTORS
+    weights = 1.0 / np.bincount(sectors)[sectors]
     balanced: Array = weights * (len(weights) / weights.sum())
     return balanced
 
@@ -430,12 +308,3 @@ def _weighted_quantile(values: Array, weights: Array, share: float) -> float:
     order = np.argsort(values, kind="stable")
     running = np.cumsum(weights[order])
     return float(values[order][min(int(np.searchsorted(running, share * running[-1])), len(order) - 1)])
-
-
-def _no_ellipse(dimension: int) -> CalibrationError:
-    shape, turn = (
-        ("ellipse", "turn the vehicle through a full circle twice, on level ground")
-        if dimension == 2
-        else ("ellipsoid", "turn the unit about all of its axes; a vehicle that stays level has its own mode")
-    )
-    return CalibrationError(f"no {shape} goes through the samples: {turn}, away from iron, and record again")

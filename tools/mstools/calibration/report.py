@@ -9,8 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -51,18 +50,14 @@ class MountCheck:
     """Result of the check of the stated mount against gravity.
 
     angle: between the measured and the stated up, radians. measured_up, stated_up: unit vectors along the sensor's
-    axes. strength: of the specific force, m/s2. candidates: mounts that are consistent, nearest to the stated one
-    first; empty where the stated one is. corrected_rpy_deg: the stated mount, rotated the shortest way so that the
-    measured up is up: the remaining tilt is of the mount or of the ground.
+    axes. candidates: mounts that are consistent, nearest to the stated one first; empty where the stated one is.
     """
 
     is_consistent: bool
     angle: float
     measured_up: Vector3
     stated_up: Vector3
-    strength: float
     candidates: tuple[MountCandidate, ...]
-    corrected_rpy_deg: Vector3
 
     @property
     def text(self) -> str:
@@ -79,10 +74,7 @@ class MountCheck:
             f"{degrees:.0f} deg apart"
         )
         if not self.candidates:
-            return (
-                f"{head}; no mount along the vehicle's axes fits: the unit is tilted or the vehicle on a steep slope. "
-                f"On level ground rpy_deg {_format_rpy(self.corrected_rpy_deg)} would fit"
-            )
+            return f"{head}; no mount along the vehicle's axes fits: the unit is tilted or the vehicle on a steep slope"
         mounts = ", ".join(_format_rpy(each.rpy_deg) for each in self.candidates)
         tail = "; drive straight ahead or look at the unit to find which"
         if degrees > 180.0 - math.degrees(MAX_TILT):
@@ -116,10 +108,9 @@ def check_mount(mean_force: Vector3, q_base_sensor: Quaternion) -> MountCheck:
     q_stated = so3.normalize(q_base_sensor)
     stated = so3.rotate(so3.conjugate(q_stated), _UP)
     angle = _angle(measured, stated)
-    corrected = so3.normalize(so3.multiply(_shortest_rotation(so3.rotate(q_stated, measured), _UP), q_stated))
     is_consistent = angle <= MAX_TILT
     candidates = () if is_consistent else _find_candidates(measured, q_stated)
-    return MountCheck(is_consistent, angle, measured, stated, strength, candidates, _rpy_deg(corrected))
+    return MountCheck(is_consistent, angle, measured, stated, candidates)
 
 
 def aligned_rotations() -> tuple[Quaternion, ...]:
@@ -161,14 +152,7 @@ def _format_rpy(rpy_deg: Vector3) -> str:
 
 
 def _rpy_deg(q: Quaternion) -> Vector3:
-    roll, pitch, yaw = so3.to_rpy(q)
-    return (_round_degrees(roll), _round_degrees(pitch), _round_degrees(yaw))
-
-
-def _round_degrees(angle: float) -> float:
-    """Return degrees to a hundredth, -180 as 180, without a negative zero."""
-    degrees = round(math.degrees(angle), 2) + 0.0
-    return 180.0 if degrees == -180.0 else degrees
+    return so3.to_vector3(round(math.degrees(each), 2) + 0.0 for each in so3.to_rpy(q))
 
 
 def _rotation_angle(a: Quaternion, b: Quaternion) -> float:
@@ -177,14 +161,6 @@ def _rotation_angle(a: Quaternion, b: Quaternion) -> float:
 
 def _angle(a: Vector3, b: Vector3) -> float:
     return math.atan2(math.hypot(*so3.cross(a, b)), sum(x * y for x, y in zip(a, b, strict=True)))
-
-
-def _shortest_rotation(a: Vector3, b: Vector3) -> Quaternion:
-    """Return the smallest rotation from unit vector `a` to `b`; about x where they are opposite."""
-    cross = so3.cross(a, b)
-    angle, sine = _angle(a, b), math.hypot(*cross)
-    axis = (1.0, 0.0, 0.0) if sine < 1e-12 else so3.scale(1.0 / sine, cross)
-    return so3.exponential(so3.scale(angle, axis))
 
 
 # --- reports ------------------------------------------------------------------------------------------------
@@ -234,19 +210,10 @@ class _Quantity:
     def of(self, figures: NoiseParameters) -> NoiseParameter | None:
         return getattr(figures, self.figure)  # type: ignore[no-any-return]
 
-    def limit(self, figures: NoiseParameters) -> float:
-        """Return the upper limit for an axis, NaN where it is open."""
-        return float(getattr(figures, f"{self.figure}_limit", math.nan))
-
     def propose(self, noise: ImuNoise) -> float:
         """Return the value of the noisiest axis, NaN where no axis has one."""
         found = [each for axis in self.axes(noise) if (each := self.of(axis.figures)) is not None]
         return max((each.value for each in found), default=math.nan)
-
-    def upper_limit(self, noise: ImuNoise) -> float:
-        """Return the upper limit over all axes, NaN where one is open."""
-        limits = [self.limit(axis.figures) for axis in self.axes(noise)]
-        return max(limits) if all(map(math.isfinite, limits)) else math.nan
 
 
 QUANTITIES = (
@@ -279,8 +246,8 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
         lines.append(f"  {format_count(noise.dropped, 'sample')} without rates or forces dropped")
     for quantity in QUANTITIES:
         value = quantity.propose(noise)
-        words = f"{value:.3g}" if math.isfinite(value) else _format_limit(quantity.upper_limit(noise))
-        lines.append(f"{quantity.name}: {words}" + (f" {quantity.unit}" if words[-1].isdigit() else ""))
+        words = f"{value:.3g} {quantity.unit}" if math.isfinite(value) else "not determined"
+        lines.append(f"{quantity.name}: {words}")
         figures = [_format_figure(quantity, axis) for axis in quantity.axes(noise)]
         lines += [f"  {axis}: {figure}" for axis, figure in zip("xyz", figures, strict=True)]
     for name, axes in (("gyro", noise.gyro), ("accelerometer", noise.accelerometer)):
@@ -298,41 +265,9 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
 def _format_figure(quantity: _Quantity, axis: AxisNoise) -> str:
     figure = quantity.of(axis.figures)
     if figure is None:
-        return _format_limit(quantity.limit(axis.figures))
+        return "not determined"
     where = f"at {figure.tau:.3g} s, {format_count(round(figure.clusters), 'cluster')}"
     return f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
-
-
-def _format_limit(most: float) -> str:
-    return f"not determined; at most {most:.3g}" if math.isfinite(most) else "not determined"
-
-
-def noise_to_dict(noise: ImuNoise, advice: MountCheck | None) -> dict[str, Any]:
-    """Return the report on noise for scripts; what is not determined is null."""
-    mount = None
-    if advice is not None:
-        fitting = [list(each.rpy_deg) for each in advice.candidates]
-        mount = {"agrees": advice.is_consistent, "angle": advice.angle, "fitting_rpy_deg": fitting, "text": advice.text}
-    return {
-        "samples": noise.samples,
-        "dropped": noise.dropped,
-        "from": noise.begin,
-        "to": noise.end,
-        "seconds": noise.seconds,
-        "rate_hz": noise.rate_hz,
-        "proposal": propose_settings(noise),
-        "gyro": [_axis_to_dict(each) for each in noise.gyro],
-        "accelerometer": [_axis_to_dict(each) for each in noise.accelerometer],
-        "mount": mount,
-    }
-
-
-def _axis_to_dict(axis: AxisNoise) -> dict[str, Any]:
-    figures = {
-        name.removeprefix("random_"): _or_none(value) if isinstance(value, float) else value
-        for name, value in asdict(axis.figures).items()
-    }
-    return figures | {"taus": axis.curve.taus, "deviations": axis.curve.deviations}
 
 
 def format_noise_yaml(log: str, noise: ImuNoise) -> str:
@@ -346,9 +281,7 @@ def format_noise_yaml(log: str, noise: ImuNoise) -> str:
             more = f"; {VIBRATION_NOTE}" if each.setting == "accelerometer_noise" else ""
             lines.append(f"    {each.setting}: {value:.3e}   # {each.unit}, {each.name}{more}")
         else:
-            most = each.upper_limit(noise)
-            words = f", at most {most:.1e} {each.unit}" if math.isfinite(most) else ""
-            lines.append(f"    # {each.setting}: not determined from this record{words}")
+            lines.append(f"    # {each.setting}: not determined from this record")
     return _format_proposal(log, f"{noise.seconds:.0f} s stationary", "filter", lines)
 
 
@@ -381,13 +314,11 @@ def _render_allan_chart(name: str, unit: str, axes: Sequence[AxisNoise], white: 
 
 def format_magnetometer(log: str, found: MagnetometerFit, position: Vector3 | None, field: Vector3 | None) -> list[str]:
     """Return the report on a magnetometer as lines."""
-    seen = sum(found.coverage.sectors)
+    seen = sum(found.sectors)
     lines = [
         f"{log}: {format_count(found.samples, 'sample')}, {seen} of {SECTORS} sectors of 30 degrees seen, "
         f"{format_count(found.outliers, 'outlier')} dropped"
     ]
-    if not found.is_planar:
-        lines.append(f"  directions cover {found.coverage.spread:.0%} of the sphere's height")
     if position is not None and field is not None:
         declination = math.degrees(math.atan2(field[0], field[1]))
         lines.append(
@@ -397,44 +328,22 @@ def format_magnetometer(log: str, found: MagnetometerFit, position: Vector3 | No
     else:
         why = "position unknown" if position is None else "no model of the field for that time"
         lines.append(
-            f"{why}: the {'horizontal ' if found.is_planar else ''}field is set to the measured mean, "
+            f"{why}: the horizontal field is set to the measured mean, "
             f"{found.strength * 1e6:.2f} uT" + ("; give it with --place LAT,LON" if position is None else "")
         )
     matrix = found.soft_iron
     lines += [
         f"hard iron, uT: {_format_numbers([each * 1e6 for each in found.hard_iron], 3)}",
         "soft iron: " + "; ".join(_format_numbers(matrix[row : row + 3], 4) for row in (0, 3, 6)),
-        f"residual: {found.rms * 1e6:.3f} uT rms"
-        + (f", {math.degrees(found.heading_rms):.2f} deg of heading" if math.isfinite(found.heading_rms) else ""),
+        f"residual: {found.rms * 1e6:.3f} uT rms, {math.degrees(found.heading_rms):.2f} deg of heading",
     ]
-    if found.is_planar and field is None:
+    if field is None:
         lines.append("Vertical hard iron is not determined without the field at the position: set to 0.")
-    if found.is_planar:
-        lines.append("Determined on level ground only: slopes turn part of the vertical field into the horizontal.")
-    return lines
-
-
-def magnetometer_to_dict(found: MagnetometerFit, position: Vector3 | None, field: Vector3 | None) -> dict[str, Any]:
-    """Return the report on a magnetometer for scripts."""
-    return {
-        "samples": found.samples,
-        "outliers": found.outliers,
-        "planar": found.is_planar,
-        "sectors": list(found.coverage.sectors),
-        "spread": _or_none(found.coverage.spread),
-        "place": None if position is None else list(position),
-        "field": None if field is None else list(field),
-        "strength": found.strength,
-        "strength_known": found.is_strength_known,
-        "rms": found.rms,
-        "heading_rms": _or_none(found.heading_rms),
-        "proposal": {"hard_iron": list(found.hard_iron), "soft_iron": list(found.soft_iron)},
-    }
+    return [*lines, "Determined on level ground only: slopes turn part of the vertical field into the horizontal."]
 
 
 def format_magnetometer_yaml(log: str, found: MagnetometerFit) -> str:
     """Return the proposed settings as part of a vehicle file."""
-    how = "rotated on level ground" if found.is_planar else "rotated about all axes"
     hard = ", ".join(f"{each:.4e}" for each in found.hard_iron)
     soft = ", ".join(f"{each:.6f}" for each in found.soft_iron)
     residual = f"residual {found.rms * 1e6:.3f} uT rms"
@@ -442,14 +351,14 @@ def format_magnetometer_yaml(log: str, found: MagnetometerFit) -> str:
         f"    hard_iron: [{hard}]   # tesla, along the unit's axes",
         f"    soft_iron: [{soft}]   # 3 x 3, row-major",
     ]
-    return _format_proposal(log, f"{how}, {residual}", "magnetometer", lines)
+    return _format_proposal(log, f"rotated on level ground, {residual}", "magnetometer", lines)
 
 
-def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up: Vector3) -> str:
-    """Return an HTML page with the field in the horizontal plane before and after calibration."""
+def render_magnetometer_page(log: str, lines: Sequence[str], found: MagnetometerFit, fields: Array) -> str:
+    """Return an HTML page: `lines` of text, and the field in the horizontal plane before and after calibration."""
     chosen = fields[:: -(-len(fields) // MAX_POINTS)]
-    before = project_to_level(chosen, up) * 1e6
-    after = project_to_level(found.apply(chosen), up) * 1e6
+    before = project_to_level(chosen, found.up) * 1e6
+    after = project_to_level(found.apply(chosen), found.up) * 1e6
     circle = found.strength * 1e6 * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 121))
     drawn = [
         charts.dots("measured", before.tolist(), charts.ORANGE, 3.0),
@@ -461,14 +370,9 @@ def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up
             charts.GRAY,
         ),
     ]
-    plane = "the horizontal plane" if found.is_planar else "the plane of most rotation"
-    words = format_magnetometer(escape(log), found, None, None)[:1] if found.is_strength_known else []
-    words += [f"hard iron, uT: {_format_numbers([each * 1e6 for each in found.hard_iron], 3)}"]
-    words += [f"residual: {found.rms * 1e6:.3f} uT rms"]
-    chart = charts.render_map(
-        "Field during rotation", f"along in {plane}, µT", f"across in {plane}, µT", drawn, heights=(600, 600)
-    )
-    return charts.render_text_page(f"Magnetometer: {escape(log)}", words, [chart])
+    axes = ("along in the horizontal plane, µT", "across in the horizontal plane, µT")
+    chart = charts.render_map("Field during rotation", *axes, drawn, heights=(600, 600))
+    return charts.render_text_page(f"Magnetometer: {escape(log)}", lines, [chart])
 
 
 def _format_proposal(log: str, how: str, section: str, lines: Sequence[str]) -> str:
@@ -483,7 +387,3 @@ def _format_proposal(log: str, how: str, section: str, lines: Sequence[str]) -> 
 
 def _format_numbers(values: Sequence[float], digits: int) -> str:
     return "[" + ", ".join(f"{each:.{digits}f}" for each in values) + "]"
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

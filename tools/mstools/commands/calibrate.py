@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,11 +21,11 @@ from mstools.calibration import (
     read_recording,
 )
 from mstools.calibration import report as calibrate_report
-from mstools.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
-from mstools.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
+from mstools.calibration.allan import allan_deviation, fit_noise_parameters
+from mstools.calibration.ellipsoid import MagnetometerFit, fit_level
 from mstools.calibration.report import AxisNoise, ImuNoise, MountCheck, axis_name, check_mount
 from mstools.report import charts
-from mstools.terminal.options import JsonOption, argument, option
+from mstools.terminal.options import argument, option
 from mstools.terminal.output import check_outputs, escape, format_count, write_file
 
 MIN_STATIONARY_S = 60.0
@@ -60,7 +59,6 @@ def imu(
     begin: FromOption = 0.0,
     end: ToOption = math.inf,
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, to check the IMU's mount.")] = None,
-    as_json: JsonOption = False,
     plot: PlotOption = "",
     output: OutOption = "",
     force: ForceOption = False,
@@ -73,8 +71,8 @@ def imu(
 
     Example: modelserver calibrate imu stationary.lcm --plot allan.html -o imu.yaml
     """
-    _check_options(begin, end, log, plot, output, as_json, force)
-    recorded = read_recording(log, channel, "", begin, end)
+    _check_options(begin, end, log, plot, output, force)
+    recorded = read_recording(log, channel, begin, end)
     good = finite_rows(recorded.rates, recorded.forces)
     if not good.any():
         why = "none with angular velocity and specific force: it is no IMU's channel, or its driver publishes neither"
@@ -83,17 +81,13 @@ def imu(
     valid = dataclasses.replace(recorded, **{name: getattr(recorded, name)[good] for name in columns})
     stretches = find_stationary_ranges(valid.utimes, valid.rates, valid.forces)
     if not stretches:
-        _print_up_axis(config, valid, as_json, output == "-")
+        _print_up_axis(config, valid, output == "-")
         span, fix = valid.times[-1] - valid.times[0], "with the engine off, for 10 minutes or more"
         raise _make_error(log, f"the vehicle is never stationary in {span:.1f} s; record it stationary, {fix}")
     used = max(stretches, key=lambda each: each.seconds)
     noise = _compute_noise(valid, used, good.size)
     advice = None if config is None else _mount_advice(config, valid.forces[used.start : used.stop])
-    if as_json:
-        text = json.dumps(calibrate_report.noise_to_dict(noise, advice), indent=2, allow_nan=False)
-    else:
-        text = "\n".join(calibrate_report.format_noise(escape(str(log)), noise, advice))
-    typer.echo(text, err=output == "-")
+    typer.echo("\n".join(calibrate_report.format_noise(escape(str(log)), noise, advice)), err=output == "-")
     _print_damage(log, recorded)
     if plot:
         write_file(plot, calibrate_report.render_noise_page(str(log), noise), replace=force)
@@ -110,14 +104,9 @@ def imu(
 def magnetometer(
     log: LogArgument,
     channel: ChannelOption = "IMU",
-    gps_channel: Annotated[str, option("--gps-channel NAME", "The receiver's channel, for the location.")] = "GPS",
     place: Annotated[str, option("--place LAT,LON", "The location in degrees, for a log without fixes.")] = "",
-    all_axes: Annotated[
-        bool, option("--all-axes", "The IMU was turned about all axes, not only on level ground.")
-    ] = False,
     begin: FromOption = 0.0,
     end: ToOption = math.inf,
-    as_json: JsonOption = False,
     plot: PlotOption = "",
     output: OutOption = "",
     force: ForceOption = False,
@@ -132,24 +121,21 @@ def magnetometer(
     Example:
       modelserver calibrate magnetometer turned.lcm --plot circle.html -o magnetometer.yaml
     """
-    _check_options(begin, end, log, plot, output, as_json, force)
+    _check_options(begin, end, log, plot, output, force)
     given = _parse_place(place)
-    recorded = read_recording(log, channel, gps_channel, begin, end)
+    recorded = read_recording(log, channel, begin, end)
     good = finite_rows(recorded.fields)
     if not good.any():
         why = "none with a magnetic field: it has no magnetometer, or its driver does not publish it"
         raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
     where = given or recorded.position
     field = None if where is None else _get_field(where, int(np.median(recorded.utimes)))
-    found = _fit(log, recorded, recorded.fields[good], field, all_axes)
-    if as_json:
-        text = json.dumps(calibrate_report.magnetometer_to_dict(found, where, field), indent=2, allow_nan=False)
-    else:
-        text = "\n".join(calibrate_report.format_magnetometer(escape(str(log)), found, where, field))
-    typer.echo(text, err=output == "-")
+    found = _fit(log, recorded, recorded.fields[good], field)
+    lines = calibrate_report.format_magnetometer(escape(str(log)), found, where, field)
+    typer.echo("\n".join(lines), err=output == "-")
     _print_damage(log, recorded)
     if plot:
-        page = calibrate_report.render_magnetometer_page(str(log), found, recorded.fields[good], found.coverage.axis)
+        page = calibrate_report.render_magnetometer_page(str(log), lines, found, recorded.fields[good])
         write_file(plot, page, replace=force)
     write_file(output, calibrate_report.format_magnetometer_yaml(str(log), found), replace=force)
 
@@ -157,7 +143,7 @@ def magnetometer(
 def _compute_noise(recorded: ImuRecording, used: SampleRange, samples: int) -> ImuNoise:
     def compute_axis(values: Any) -> AxisNoise:
         curve = allan_deviation(values, used.rate_hz)
-        return AxisNoise(curve, _drop_bias_figures(fit_noise_parameters(curve), used.seconds))
+        return AxisNoise(curve, fit_noise_parameters(curve))
 
     rows = slice(used.start, used.stop)
     return ImuNoise(
@@ -172,15 +158,6 @@ def _compute_noise(recorded: ImuRecording, used: SampleRange, samples: int) -> I
     )
 
 
-def _drop_bias_figures(figures: NoiseParameters, seconds: float) -> NoiseParameters:
-    """Return the figures without those of the biases if the range is too short: the curve's minimum is then random."""
-    if seconds >= MIN_STATIONARY_S or (figures.instability is None and figures.random_walk is None):
-        return figures
-    others = tuple(each for each in figures.missing if not each.startswith("bias"))
-    why = f"biases: {seconds:.1f} s stationary are too short; record 10 minutes or more"
-    return dataclasses.replace(figures, instability=None, random_walk=None, missing=(*others, why))
-
-
 def _mount_advice(config: Path, forces: Any) -> MountCheck:
     # imported here: without --config no configuration libraries and no geodesy are needed
     from modelserver.config.vehicle_file import load_config
@@ -193,7 +170,7 @@ def _mount_advice(config: Path, forces: Any) -> MountCheck:
     return check_mount((x, y, z), vehicle.rig.pose(vehicle.rig.imu_frame).wxyz)
 
 
-def _print_up_axis(config: Path | None, recorded: ImuRecording, as_json: bool, on_stderr: bool) -> None:
+def _print_up_axis(config: Path | None, recorded: ImuRecording, on_stderr: bool) -> None:
     """Print which axis of the IMU points up, from the mean specific force of a drive, whose accelerations cancel."""
     x, y, z = (float(each) for each in recorded.forces.mean(axis=0))
     up, strength = axis_name((x, y, z)), math.hypot(x, y, z)
@@ -202,25 +179,20 @@ def _print_up_axis(config: Path | None, recorded: ImuRecording, as_json: bool, o
         angle = math.degrees(math.acos(min(max(abs(x), abs(y), abs(z)) / strength, 1.0)))
     direction = f"{angle:.0f} degrees from the IMU's {up} axis, which points up"
     lines = [f"mean specific force of the drive: {strength:.2f} m/s2, {direction}"]
-    advice = ""
     if config is not None:
         try:
-            advice = _mount_advice(config, recorded.forces).text
+            lines.append(f"mount: {_mount_advice(config, recorded.forces).text}")
         except CalibrationError as error:
-            advice = str(error)
-        lines.append(f"mount: {advice}")
-    data = {"up": up, "mount": {"text": advice} if advice else None}
-    typer.echo(json.dumps(data, indent=2) if as_json else "\n".join(lines), err=on_stderr)
+            lines.append(f"mount: {error}")
+    typer.echo("\n".join(lines), err=on_stderr)
 
 
-def _fit(log: Path, recorded: ImuRecording, fields: Any, field: Vector3 | None, all_axes: bool) -> MagnetometerFit:
+def _fit(log: Path, recorded: ImuRecording, fields: Any, field: Vector3 | None) -> MagnetometerFit:
     horizontal = math.nan if field is None else math.hypot(field[0], field[1])
     try:
-        if all_axes:
-            return fit_all_axes(fields, math.nan if field is None else math.hypot(*field), horizontal)
         forces = recorded.forces[finite_rows(recorded.forces)]
         if not len(forces):
-            why = "the IMU has no specific force, so up is unknown; turn it about all axes and give --all-axes"
+            why = "the IMU has no specific force, so up is unknown"
             raise CalibrationError(why)
         # the median is robust against bumps, and hardly tilted in a slow turn
         x, y, z = (float(each) for each in np.median(forces, axis=0))
@@ -254,10 +226,10 @@ def _parse_place(text: str) -> Vector3 | None:
     return (latitude, longitude, 0.0)
 
 
-def _check_options(begin: float, end: float, log: Path, plot: str, output: str, as_json: bool, force: bool) -> None:
+def _check_options(begin: float, end: float, log: Path, plot: str, output: str, force: bool) -> None:
     if not (math.isfinite(begin) and begin >= 0.0 and end > begin):
         raise typer.BadParameter(f"--from {begin:g} --to {end:g} is no range; expected 0 <= from < to, seconds")
-    check_outputs((log,), plot, output, as_json, force)
+    check_outputs((log,), plot, output, force)
     if plot:
         charts.check_installed()
 

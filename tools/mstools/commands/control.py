@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -21,7 +20,6 @@ from modelserver.messages import (
     Health,
     Invalid,
     Mode,
-    NavigationState,
     PoseAnswer,
     PublishDecisions,
     ReloadReply,
@@ -31,13 +29,11 @@ from modelserver.messages import (
 )
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Quaternion
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.status import DaemonListener
+from mstools.commands.status import DaemonListener, HealthListener
 from mstools.terminal.options import (
-    JsonOption,
     KeyOption,
     PrefixOption,
     TimeoutOption,
@@ -46,7 +42,7 @@ from mstools.terminal.options import (
     choose_name,
     option,
 )
-from mstools.terminal.output import escape, make_error, to_json
+from mstools.terminal.output import escape, make_error
 
 if TYPE_CHECKING:
     import lcm
@@ -55,8 +51,8 @@ if TYPE_CHECKING:
 
 MODES = tuple(mode.name.lower() for mode in Mode)
 
-TIMEOUT_S = 2.0
-"""Timeout for the daemon, seconds."""
+TIMEOUT_S = 2.5
+"""Timeout for a health report, seconds: one is published per second."""
 
 
 def mode(
@@ -69,8 +65,8 @@ def mode(
 
     The command is sent once, signed, for the channel in the vehicle file (localization.mode_channel), with which the
     daemon must have been started. The key is that of --key, else of $MODELSERVER_KEY_FILE, else of the vehicle file
-    (commands.key_file). LOCALIZATION_STATE and LOCALIZATION_DECISIONS confirm the mode within two seconds. Exit code 1
-    if no daemon answers, or the mode does not change.
+    (commands.key_file). The next health report confirms the mode. Exit code 1 if no daemon answers, or the mode does
+    not change.
 
     Example: modelserver mode no_gps -c config/husky/vehicle.yaml
     """
@@ -84,7 +80,7 @@ def mode(
         why = "no channel for mode commands is configured, so the daemon receives none"
         fix = "write mode_channel: LOCALIZATION_MODE under localization, and restart the daemon"
         raise make_error(why, Location(str(config), element="localization.mode_channel"), fix)
-    prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
+    prefix = vehicle.lcm.channel_prefix
     channel = f"{prefix}{vehicle.localization.mode_channel}"
     given = str(key or "") or os.environ.get(KEY_FILE_VARIABLE, "") or vehicle.commands.key_file
     signing = load_signer(given, prefix, "modelserver")
@@ -92,100 +88,37 @@ def mode(
         raise ModelServerError(f"the command must be signed; give the daemon's key with --key or ${KEY_FILE_VARIABLE}")
     provider = resolve_url(url or vehicle.lcm.url)
     bus = open_lcm(provider)
-    listener = ModeListener(bus, prefix, vehicle.localization.mode_channel)
-    if state_hz:
-        listener.listen(min(TIMEOUT_S, 2.5 / state_hz), lambda: listener.mode is not None)
-    was = listener.mode
+    listener = HealthListener(bus, prefix)
+    listener.listen(TIMEOUT_S, lambda: listener.health is not None)
+    before, reports = listener.health, listener.reports
     utime = time.time_ns() // 1000
-    listener.reset(utime)
     content = encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted))
     bus.publish(signing.channel, signing.seal(vehicle.localization.mode_channel, content))
     sent = f"sent {channel}: {wanted.name.lower()}"
-    confirmed = listener.listen(TIMEOUT_S, lambda: wanted in (listener.mode, listener.decided_mode))
-    if not listener.has_received:
+    is_confirmed = listener.listen(
+        TIMEOUT_S, lambda: listener.reports > reports and listener.report.localization.mode is wanted
+    )
+    if listener.health is None:
         raise NoServerError(
-            f"{sent}, but no message was received on {provider}: is the daemon running, on this bus and with this "
-            "vehicle file? (modelserver run -c FILE, --url)"
+            f"{sent}, but no health report was received on {provider}: is the daemon running, on this bus and with "
+            "this vehicle file? (modelserver run -c FILE, --url)"
         )
-    now = listener.mode
-    if not confirmed and now is not None and not (wanted is Mode.RAW and listener.is_silent(state_hz)):
-        why = f" ({listener.rejection})" if listener.rejection else "; was it started with this vehicle file?"
-        raise ModelServerError(f"{sent}, but the daemon stays in mode {now.name.lower()}{why}")
-    if confirmed or (wanted is Mode.RAW and was is not None):
-        before = f" (was {was.name.lower()})" if was is not None else ""
-        typer.echo(f"now {wanted.name.lower()}{before}")
-    elif not state_hz:
-        typer.echo(f"{sent}; it cannot be confirmed: the vehicle file has publish.state_hz: 0")
-    else:
-        typer.echo(f"{sent}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
+    if not is_confirmed:
+        now = listener.report.localization.mode
+        why = find_rejection(before, listener.report, (channel, f"{prefix}{SIGNED}", f"command:{OPERATOR}"))
+        stays = f"the daemon stays in mode {now.name.lower()}" if now is not None else "the daemon has no localization"
+        raise ModelServerError(f"{sent}, but {stays}{why or '; was it started with this vehicle file?'}")
+    was = None if before is None else before.localization.mode
+    typer.echo(f"now {wanted.name.lower()}" + ("" if was is None else f" (was {was.name.lower()})"))
 
 
-class ModeListener(DaemonListener):
-    """Receive the mode of a daemon: `mode` from its state, `decided_mode` from its decisions since `since`.
-
-    `rejection`: why a command was rejected, from the health report.
-    """
-
-    def __init__(self, bus: lcm.LCM, prefix: str, mode_channel: str):
-        self.mode: Mode | None = None
-        self.decided_mode: Mode | None = None
-        self.rejection = ""
-        self.since = 0
-        # rejected commands that the daemon had counted before
-        self._sources = (f"{prefix}{mode_channel}", f"{prefix}{SIGNED}")
-        self._counts: dict[tuple[str, str], int] = {}
-        self._state_time = 0.0
-        handlers: dict[str, Callable[[Any], object]] = {
-            "LOCALIZATION_STATE": self._on_state,
-            "LOCALIZATION_DECISIONS": self._on_decisions,
-            "MODELSERVER_HEALTH": self._on_health,
-            "POSE": lambda _: None,
-        }
-        super().__init__(bus, prefix, handlers)
-
-    def reset(self, since: int) -> None:
-        """Drop what was received; decisions count from `since` on."""
-        self.mode = self.decided_mode = None
-        self.has_received, self.since = False, since
-
-    def is_silent(self, state_hz: float) -> bool:
-        """Return whether the last three states are missing: raw mode publishes none."""
-        return time.monotonic() - self._state_time > min(3.0 / state_hz, 0.5 * TIMEOUT_S)
-
-    def _on_state(self, state: NavigationState) -> None:
-        self.mode, self._state_time = state.mode, time.monotonic()
-
-    def _on_decisions(self, published: PublishDecisions) -> None:
-        for each in published.decisions:
-            name = each.reason.removeprefix("mode ").upper()
-            if each.kind == "mode" and published.utime >= self.since > 0 and name in Mode.__members__:
-                self.decided_mode = Mode[name]
-
-    def _on_health(self, health: Health) -> None:
-        before = self._counts
-        self._counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
-        for source, why, _ in health.rejected:
-            if source == f"command:{OPERATOR}":
-                self.rejection = why
-                break
-        if self.since:
-            # without an earlier report, earlier rejections count too: they are the likeliest cause
-            for (name, why), count in self._counts.items():
-                if count > before.get((name, why), 0):
-                    self.rejection = f"{why}: {_REASONS.get(why, 'see its log')}"
-            ahead = (health.utime - time.time_ns() // 1000) * 1e-6
-            if self.rejection.startswith("stale") and abs(ahead) > 1.0:
-                side = "ahead of" if ahead > 0 else "behind"
-                self.rejection += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
-
-
-_REASONS = {
-    "unknown_key": "the daemon has no key of that name: it was started with another key file",
-    "bad_signature": "the daemon has another key of that name, or another channel prefix",
-    "stale": "too old or in the future by the daemon's clock, or the daemon has just started",
-    "replayed": "the daemon has accepted a newer one of this sender; was a clock set back?",
-}
-"""Descriptions of the daemon's reasons to reject a signed message."""
+def find_rejection(before: Health | None, now: Health, sources: Collection[str]) -> str:
+    """Return why the daemon rejected a command of these sources between two reports, in parentheses, empty if not."""
+    counts = {} if before is None else {(source, why): count for source, why, count in before.rejected}
+    for source, why, count in now.rejected:
+        if source in sources and count > counts.get((source, why), 0):
+            return f" ({why}: see docs/words.md)"
+    return ""
 
 
 def parse_mode(text: str) -> Mode:
@@ -201,7 +134,6 @@ PERMISSION_HINT = (
 
 def reload(
     dry_run: Annotated[bool, option("--dry-run", "Only print what would change.")] = False,
-    as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 2.0,
@@ -230,7 +162,7 @@ def reload(
                 typer.echo(escape(line), err=True)
             stays = "the geometry in force stays" if not dry_run else "the daemon would reject it"
             raise ModelServerError(f"{stays}; run modelserver check for details with line numbers") from None
-    typer.echo(json.dumps(reload_as_data(reply, dry_run), indent=2) if as_json else describe_reload(reply, dry_run))
+    typer.echo(describe_reload(reply, dry_run))
 
 
 def describe_reload(reply: ReloadReply, dry_run: bool) -> str:
@@ -239,15 +171,6 @@ def describe_reload(reply: ReloadReply, dry_run: bool) -> str:
     head = "would be" if dry_run else "is now"
     lines = [f"the geometry in force {head} revision {escape(reply.revision)}; changes:"]
     return "\n".join(lines + [f"  {escape(change)}" for change in reply.changes])
-
-
-def reload_as_data(reply: ReloadReply, dry_run: bool) -> dict[str, object]:
-    return {
-        "dry_run": dry_run,
-        "revision": reply.revision,
-        "revision_in_force": reply.header.model_revision,
-        "changes": list(reply.changes),
-    }
 
 
 CONFIRM_S = 4.0
@@ -264,27 +187,7 @@ PROGRAM = "modelserver"
 Triple = tuple[float, float, float]
 
 
-class PoseTarget(NamedTuple):
-    """The pose to set, as the command line states it; exactly one position and one orientation is not None.
-
-    `utm`: grid easting, grid northing, ellipsoidal height, m, absolute. `xyz`: m from the origin. `geodetic`: latitude
-    and longitude, deg, and ellipsoidal height, m; None keeps the height. `yaw`: rad from grid east, `heading`: rad
-    clockwise from true north; both keep roll and pitch. `rpy`: rad.
-    """
-
-    utm: Triple | None = None
-    xyz: Triple | None = None
-    geodetic: tuple[float, float, float | None] | None = None
-    yaw: float | None = None
-    heading: float | None = None
-    rpy: Triple | None = None
-    quaternion: Quaternion | None = None
-
-
 def set_pose(
-    utm: Annotated[
-        Triple | None, option("--utm E N H", "Position: grid easting, northing, ellipsoidal height, meters.")
-    ] = None,
     xyz: Annotated[
         Triple | None, option("--xyz X Y Z", "Position: meters from the origin of World:UTM (initial_utm).")
     ] = None,
@@ -300,13 +203,8 @@ def set_pose(
     heading: Annotated[
         float | None, option("--heading DEG", "Degrees clockwise from true north; roll and pitch stay.")
     ] = None,
-    rpy: Annotated[Triple | None, option("--rpy R P Y", "Roll, pitch and yaw, degrees, yaw from grid east.")] = None,
-    quaternion: Annotated[
-        Quaternion | None, option("--quaternion S X Y Z", "Orientation in World:UTM, scalar first.")
-    ] = None,
     sigma: Annotated[float, option("--sigma M", "Standard deviation of each coordinate, meters.")] = 1.0,
     sigma_deg: Annotated[float, option("--sigma-deg DEG", "Standard deviation about each axis, degrees.")] = 5.0,
-    as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 2.0,
@@ -314,22 +212,17 @@ def set_pose(
 ) -> None:
     """Set the pose of the vehicle in the running daemon, and report what localization did with it.
 
-    Give one position (--utm, --xyz or --latlon) and one orientation (--yaw, --heading, --rpy or --quaternion) of the
-    base frame. Before the heading is known the pose is taken as it is; later it is a measurement like any other, fused
-    by its sigmas, and the gates may reject it. The daemon accepts it where its vehicle file has commands:
-    {set_pose: true, key_file: ...} and the request is signed with that key (--key). It is sent once. Exits 1 where it
-    is denied or rejected.
+    Give one position (--xyz or --latlon) and one orientation (--yaw or --heading) of the base frame. Before the heading
+    is known the pose is taken as it is; later it is a measurement like any other, fused by its sigmas, and the gates
+    may reject it. The daemon accepts it where its vehicle file has commands: {set_pose: true, key_file: ...} and the
+    request is signed with that key (--key). It is sent once. Exits 1 where it is denied or rejected.
 
     \b
     Examples:
       modelserver set-pose --latlon 50.27 -111.1 --heading 90 --sigma 0.05 --sigma-deg 1
-      modelserver set-pose --utm 350283.1 5570712.6 700 --yaw 12.5 --key /etc/modelserver/commands.key
+      modelserver set-pose --xyz 12.5 -3.0 0.2 --yaw 12.5 --key /etc/modelserver/commands.key
     """
-    target = parse_target(
-        {"--utm": utm, "--xyz": xyz, "--latlon": latlon},
-        {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion},
-        height,
-    )
+    check_target({"--xyz": xyz, "--latlon": latlon}, {"--yaw": yaw, "--heading": heading}, height)
     covariance = to_covariance(sigma, sigma_deg)
     from modelserver.client.remote import Platform
     from modelserver.earth.geodesy import Geodesy
@@ -349,7 +242,7 @@ def set_pose(
             "origin in the vehicle file"
         )
     geodesy = Geodesy(before.origin)
-    pose = to_pose(target, geodesy, before.transformation.pose)
+    pose = to_pose(geodesy, before.transformation.pose, xyz, latlon, height, yaw, heading)
     base = before.transformation.frame_of_interest
     request = Transformation(base, names.WORLD_UTM, pose, covariance, origin_id=before.origin.origin_id)
     with Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name=PROGRAM, key_file=key or "") as platform:
@@ -361,8 +254,8 @@ def set_pose(
     decision = listener.decisions.get(accepted.header.utime)
     listener.pose = None
     listener.listen(timeout, lambda: listener.pose is not None)
-    result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
-    typer.echo(json.dumps(set_pose_as_data(result), indent=2) if as_json else describe_set_pose(result))
+    result = SetPoseResult(request, (sigma, sigma_deg), decision, listener.pose)
+    typer.echo(describe_set_pose(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
             f"localization rejected the pose: {escape(decision.reason or 'it contradicts the estimate')}; if the "
@@ -374,34 +267,23 @@ class SetPoseResult(NamedTuple):
     """The pose that was set, `decision` on it if one was received, and the next pose that the daemon published."""
 
     request: Transformation
-    geodesy: Geodesy
     sigmas: tuple[float, float]
     decision: Decision | None
-    has_decisions: bool
     after: PoseAnswer | None
 
 
-def parse_target(positions: dict[str, Any], orientations: dict[str, Any], height: float | None) -> PoseTarget:
-    """Return the pose that the options state. Raises typer.BadParameter where they state none, two or no numbers."""
+def check_target(positions: Mapping[str, Any], orientations: Mapping[str, Any], height: float | None) -> None:
+    """Raise typer.BadParameter where the options state no pose, two, or no numbers."""
     for what, options in (("position", positions), ("orientation", orientations)):
         given = [name for name, value in options.items() if value is not None]
         if len(given) != 1:
             got = f"got {' and '.join(given)}" if given else "got none"
             raise typer.BadParameter(f"give one {what}, {', '.join(options)}; {got}")
-    latlon, quaternion = positions["--latlon"], orientations["--quaternion"]
-    if height is not None and latlon is None:
-        raise typer.BadParameter("it goes with --latlon; --utm and --xyz have a height", param_hint="--height")
+    if height is not None and positions["--latlon"] is None:
+        raise typer.BadParameter("it goes with --latlon; --xyz has a height", param_hint="--height")
     for name, value in {"--height": height, **positions, **orientations}.items():
         if value is not None and not np.isfinite(value).all():
             raise typer.BadParameter("expected finite numbers", param_hint=name)
-    if quaternion is not None and not any(quaternion):
-        raise typer.BadParameter("a quaternion of zeros has no direction", param_hint="--quaternion")
-    yaw, heading, rpy = (
-        None if value is None else np.radians(value).tolist()
-        for value in (orientations[name] for name in ("--yaw", "--heading", "--rpy"))
-    )
-    geodetic = None if latlon is None else (*latlon, height)
-    return PoseTarget(positions["--utm"], positions["--xyz"], geodetic, yaw, heading, rpy, quaternion)
 
 
 def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -415,37 +297,42 @@ def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np
     return np.diag([sigma**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
 
 
-def to_pose(target: PoseTarget, geodesy: Geodesy, current: Pose) -> Pose:
-    """Return the pose in World:UTM, in meters from the origin, that a target states.
+def to_pose(
+    geodesy: Geodesy,
+    current: Pose,
+    xyz: Triple | None,
+    latlon: tuple[float, float] | None,
+    height: float | None,
+    yaw: float | None,
+    heading: float | None,
+) -> Pose:
+    """Return the pose in World:UTM, in meters from the origin, that the options state (angles in degrees).
 
-    `current` is the pose in force: its height, roll and pitch stay where the target has none. Raises GeodesyError for a
-    place out of reach of the zone, ModelServerError for one too far from the origin.
+    `current` is the pose in force: its roll and pitch stay, and its height where none is given. Raises GeodesyError for
+    a place out of reach of the zone, ModelServerError for one too far from the origin.
     """
     origin = geodesy.origin
     east, north, up = origin.initial_utm
-    if target.geodetic is not None:
-        latitude, longitude, height = target.geodetic
+    if latlon is not None:
         here = up + current.xyz[2] if height is None else height
-        position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(latitude, longitude, here))
-    else:
-        position = target.xyz if target.xyz is not None else geodesy.to_relative_utm(target.utm or (0.0, 0.0, 0.0))
-    away = math.hypot(*position)
+        xyz = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*latlon, here))
+    assert xyz is not None
+    away = math.hypot(*xyz)
     if away > MAX_DISTANCE_M:
         side = "north" if origin.north else "south"
         raise ModelServerError(
             f"the position is {away / 1e3:.0f} km from the origin (easting {east:.1f}, northing {north:.1f}, zone "
-            f"{origin.zone} {side}); --utm takes absolute coordinates of that zone, --xyz meters from the origin"
+            f"{origin.zone} {side}); --xyz takes meters from the origin"
         )
-    if target.quaternion is not None:
-        return Pose(position, target.quaternion)
     roll, pitch, _ = so3.to_rpy(current.wxyz)
-    if target.heading is not None:
-        latitude, longitude, _ = geodesy.geodetic_from_utm(east + position[0], north + position[1], up + position[2])
+    if yaw is None:
+        assert heading is not None
+        latitude, longitude, _ = geodesy.geodetic_from_utm(east + xyz[0], north + xyz[1], up + xyz[2])
         # heading counts from true north, yaw from grid east: the convergence lies between
-        yaw = math.pi / 2 - target.heading + geodesy.convergence(latitude, longitude)
+        turn = math.radians(90.0 - heading) + geodesy.convergence(latitude, longitude)
     else:
-        yaw = target.yaw or 0.0
-    return Pose(position, so3.from_rpy(*(target.rpy or (roll, pitch, yaw))))
+        turn = math.radians(yaw)
+    return Pose(xyz, so3.from_rpy(roll, pitch, turn))
 
 
 class SetPoseListener(DaemonListener):
@@ -453,7 +340,6 @@ class SetPoseListener(DaemonListener):
 
     def __init__(self, bus: lcm.LCM, prefix: str):
         self.pose: PoseAnswer | None = None
-        self.has_decisions = False
         self.decisions: dict[int, Decision] = {}
         super().__init__(bus, prefix, {"POSE": self._on_pose, "LOCALIZATION_DECISIONS": self._on_decisions})
 
@@ -461,7 +347,6 @@ class SetPoseListener(DaemonListener):
         self.pose = pose
 
     def _on_decisions(self, published: PublishDecisions) -> None:
-        self.has_decisions = True
         for each in published.decisions:
             if each.source == OPERATOR and each.kind == "absolute_pose":
                 self.decisions[each.utime] = each
@@ -471,60 +356,24 @@ _VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RE
 
 
 def describe_set_pose(result: SetPoseResult) -> str:
-    pose = result.request.pose
-    origin = result.geodesy.origin
-    east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))
-    latitude, longitude, _ = result.geodesy.geodetic_from_utm(east, north, height)
     sigma, sigma_deg = result.sigmas
     lines = [
-        f"{escape(result.request.frame_of_interest)} in World:UTM: {pose}",
-        f"  easting {east:.3f} m, northing {north:.3f} m, height {height:.3f} m, zone {origin.zone} "
-        f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
+        f"{escape(result.request.frame_of_interest)} in World:UTM: {result.request.pose}",
         f"  sigma {sigma:g} m, {sigma_deg:g} deg",
     ]
-    decision, silent = result.decision, "LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
+    decision = result.decision
     if decision is not None:
         text = _VERDICTS[decision.verdict] + (f": {escape(decision.reason)}" if decision.reason else "")
         if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
             text += f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
     else:
-        why = "no decision on it was received" if result.has_decisions else silent
-        text = f"accepted for localization; {why}"
+        text = "accepted for localization; no decision on it was received (publish.decisions: false?)"
     lines.append(f"decision: {text}")
     if result.after is not None:
         now = result.after.transformation
         state = "valid" if now.is_valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"
         lines.append(f"now: {now.pose}; {state}")
     return "\n".join(lines)
-
-
-def set_pose_as_data(result: SetPoseResult) -> dict[str, Any]:
-    """Return the result as JSON data; angles in radians, a pose as its 7-vector."""
-    origin, decision, after = result.geodesy.origin, result.decision, result.after
-    sigma, sigma_deg = result.sigmas
-    return {
-        "frame_of_interest": result.request.frame_of_interest,
-        "frame_of_reference": result.request.frame_of_reference,
-        "state_vector": result.request.state_vector.tolist(),
-        "sigma": [sigma] * 3 + [math.radians(sigma_deg)] * 3,
-        "initial_utm": list(origin.initial_utm),
-        "utm_zone": origin.zone,
-        "utm_north": origin.north,
-        "decision": decision
-        and {
-            "utime": decision.utime,
-            "verdict": _VERDICTS[decision.verdict],
-            "reason": decision.reason,
-            "statistic": to_json(decision.statistic),
-            "limit": to_json(decision.limit),
-        },
-        "pose_after": after
-        and {
-            "utime": after.transformation.utime,
-            "state_vector": after.transformation.state_vector.tolist(),
-            "valid": after.transformation.is_valid,
-        },
-    }
 
 
 key = typer.Typer(

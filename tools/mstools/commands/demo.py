@@ -11,8 +11,7 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import NoServerError, QueryError
-from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, PoseAnswer
+from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.status import HealthListener
@@ -36,8 +35,6 @@ EXTRA_SECONDS = 60.0
 """Time that the devices run beyond the drive; the demo ends them earlier."""
 LATE_SECONDS = 20.0
 """On a busy machine samples are late, and so is the heading."""
-PAST_SECONDS = 2.0
-"""How far back the demo asks for poses: for so long one must have been known."""
 SETTLING_SECONDS = 2.0
 """Time from the start of the drive until a driver's rate is that of a whole second."""
 
@@ -58,34 +55,22 @@ def command(
     """
     with (
         tempfile.TemporaryDirectory(prefix="modelserver-demo-") as scratch,
-        ChildProcesses(print_line if verbose else None) as children,
+        ChildProcesses((lambda name, text: typer.echo(f"{name}: {text}", err=True)) if verbose else None) as children,
     ):
         run_demo(make_connections(find_vehicle_file(), Path(scratch), own_bus=True), seconds, children)
 
 
-def print_line(name: str, text: str) -> None:
-    typer.echo(f"{name}: {text}", err=True)
-
-
-def show_commands(commands: Iterable[str]) -> None:
-    """Print command lines, which may be typed in a shell."""
-    for each in commands:
-        typer.echo(escape(each))
-
-
 def find_vehicle_file() -> Path:
-    """Return the Raptor's vehicle file in the package. Raises LaunchError."""
-    file = get_examples_folder() / "raptor" / "vehicle.yaml"
-    if file.is_file():
-        return file
-    raise LaunchError(f"{file} is missing; reinstall ModelServer")
+    """Return the Raptor's vehicle file in the package."""
+    return get_examples_folder() / "raptor" / "vehicle.yaml"
 
 
 def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesses) -> None:
     """Start all processes, query, and print. Raises LaunchError if something is missing."""
     typer.echo(f"1. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to emulated devices")
     start = time.monotonic()
-    show_commands(start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url)))
+    commands = start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url))
+    typer.echo("\n".join(map(escape, commands)))
     # heavy imports, while the child processes load
     from modelserver.client.remote import Platform
     from modelserver.config.vehicle_file import load_config
@@ -95,20 +80,18 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
     vehicle = load_config(lines.vehicle)
     prefix = vehicle.lcm.channel_prefix
     listener = PoseListener(lines.url, prefix)
-    with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=0.25, retries=0) as platform:
-        bodies = wait_for_answer(platform.get_body_list, children)
-        wait_for_drivers(listener, lines, children)
-        # a dozen processes on a busy machine: a reply may be late
-        platform.timeout, platform.retries = 1.0, 9
+    # a dozen processes on a busy machine: a reply may be late
+    with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=1.0, retries=9) as platform:
+        wait_for_reports(listener, lines.devices, children)
 
         typer.echo("\n2. Emulated devices, a process each, found by their drivers")
         start_utime = get_start_utime(time.monotonic() - start)
         options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
-        show_commands(start_devices(children, lines, start_utime, options))
+        typer.echo("\n".join(map(escape, start_devices(children, lines, start_utime, options))))
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
         typer.echo("\n3. Queries of the geometry")
-        typer.echo(f"bodies            {', '.join(bodies)}")
+        typer.echo(f"bodies            {', '.join(platform.get_body_list())}")
         typer.echo(f"Digiclops has     {', '.join(platform.get_body_frame_list('Digiclops'))}")
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")))
 
@@ -116,7 +99,7 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         typer.echo("   time      easting     northing       up     yaw   error            protection level state")
         valid: list[PoseAnswer] = []
         received, next_row, alive = 0, 0.0, ""
-        for pose in iter_poses(listener, start_utime, seconds, children, lambda: get_span(valid) > PAST_SECONDS):
+        for pose in iter_poses(listener, start_utime, seconds, children, lambda: bool(valid)):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
             is_first = pose.transformation.is_valid and not valid
@@ -138,44 +121,11 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
                 f"the pose never became valid in {seconds + LATE_SECONDS:g} s: {received} poses were received on POSE. "
                 "Run it again with --verbose; a busy machine may need --seconds 20"
             )
-        for text in (
-            f"{received} poses in {max(seconds, since):.0f} s, {len(valid)} of them valid",
-            *format_usage(listener.health),
-        ):
-            typer.echo(f"   {text}")
+        typer.echo(f"   {received} poses in {max(seconds, since):.0f} s, {len(valid)} of them valid")
 
-        typer.echo("\n5. The camera in the world a second ago, from the history")
-        at = valid[-1].transformation.utime - 1_000_000
-        typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
-        history = platform.get_history(at - 1_000_000, at, 10.0)
-        typer.echo(f"get_history returned {len(history)} poses of the second before that")
-        typer.echo("\n6. Pose and motion of the nodding laser")
-        at = valid[-1].transformation.utime - 200_000
-        # the joint's messages may be late on a busy machine
-        moving = platform.get_motion("FrontSICKLaser:Scan", "Raptor:CG", at=at, wait_ms=1000)
-        typer.echo(describe(moving.pose))
-        typer.echo(f"  turns at        {math.degrees(-moving.angular_velocity[1]):.1f} deg/s, upwards positive")
-
-        typer.echo("\n7. A misspelled frame")
-        try:
-            platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
-        except QueryError as error:
-            typer.echo(f"{error}. Nearest: {', '.join(error.nearest)}")
+        typer.echo("\n5. The camera in the world")
+        typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM")))
     typer.echo(f"\nDone. Next: modelserver run -c {find_vehicle_file()}, and in another shell: modelserver tree --live")
-
-
-def format_usage(service: Health | None) -> list[str]:
-    """Format how many measurements of each sensor were used, and the warnings about sensors.
-
-    Raises LaunchError if no wheel measurement was used: the Raptor's front wheels steer, and must be used.
-    """
-    if service is None:
-        raise LaunchError("no health report on MODELSERVER_HEALTH; run the demo with --verbose")
-    used = {each.channel.removeprefix("sensor:"): each for each in service.channels if each.measured}
-    warnings = [f"{subject}: {text}" for subject, text in service.warnings if subject.startswith("sensor")]
-    if "wheels" in used and not used["wheels"].used:
-        raise LaunchError(f"no measurement of the wheels was used: {'; '.join(warnings) or 'see --verbose'}")
-    return [f"{name}: {each.used} of {each.measured} measurements used" for name, each in used.items()] + warnings
 
 
 class PoseListener(HealthListener):
@@ -188,29 +138,15 @@ class PoseListener(HealthListener):
             each.set_queue_capacity(0)
 
 
-def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> list[str]:
-    """Query until the daemon answers. Raises LaunchError if it fails or takes too long."""
-    deadline = time.monotonic() + START_TIMEOUT_S
-    while True:
-        try:
-            return ask()
-        except NoServerError:
-            children.check()
-            if time.monotonic() > deadline:
-                why = f"no reply of the daemon within {START_TIMEOUT_S:g} s"
-                raise LaunchError(f"{why}; run the demo with --verbose") from None
+def wait_for_reports(listener: PoseListener, drivers: Iterable[str], children: ChildProcesses) -> None:
+    """Wait for a health report of the daemon and of every driver. Raises LaunchError if one fails or takes too long."""
 
-
-def wait_for_drivers(listener: PoseListener, lines: EmulatedConnections, children: ChildProcesses) -> None:
-    """Wait for a health report of every driver. Raises LaunchError if one fails or takes too long."""
-
-    def has_all() -> bool:
+    def list_missing() -> list[str]:
         children.check()
-        return lines.devices.keys() <= listener.drivers.keys()
+        return ["daemon"] * (listener.health is None) + [name for name in drivers if name not in listener.drivers]
 
-    if not listener.listen(START_TIMEOUT_S, has_all):
-        missing = ", ".join(name for name in lines.devices if name not in listener.drivers)
-        raise LaunchError(f"no report within {START_TIMEOUT_S:g} s of driver {missing}; see --verbose")
+    if not listener.listen(START_TIMEOUT_S, lambda: not list_missing()):
+        raise LaunchError(f"no report within {START_TIMEOUT_S:g} s of {', '.join(list_missing())}; see --verbose")
 
 
 def list_missing_devices(drivers: dict[str, DriverHealth], lines: EmulatedConnections) -> list[str]:
@@ -223,22 +159,15 @@ def list_missing_devices(drivers: dict[str, DriverHealth], lines: EmulatedConnec
 
 
 def iter_poses(
-    listener: PoseListener, start_utime: int, seconds: float, children: ChildProcesses, has_enough: Callable[[], bool]
+    listener: PoseListener, start_utime: int, seconds: float, children: ChildProcesses, has_valid: Callable[[], bool]
 ) -> Iterator[PoseAnswer]:
-    """Yield the published poses of the drive; until they are enough also those of `LATE_SECONDS` after it."""
+    """Yield the published poses of the drive; until one is valid also those of `LATE_SECONDS` after it."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
-    while (left := end + (0.0 if has_enough() else LATE_SECONDS) - time.monotonic()) > 0.0:
+    while (left := end + (0.0 if has_valid() else LATE_SECONDS) - time.monotonic()) > 0.0:
         listener.listen(left, lambda: bool(listener.poses))
         yield from (pose for pose in listener.poses if pose.transformation.utime >= start_utime)
         listener.poses.clear()
         children.check()
-
-
-def get_span(poses: list[PoseAnswer]) -> float:
-    """Return the seconds from the first pose to the last; 0 of none."""
-    if not poses:
-        return 0.0
-    return (poses[-1].transformation.utime - poses[0].transformation.utime) * 1e-6
 
 
 def format_row(pose: PoseAnswer, since: float, truth: Pose, truth_origin: tuple[float, float, float]) -> str:

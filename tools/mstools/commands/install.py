@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -63,18 +62,18 @@ def command(
     if remove:
         plan = deployment.plan_removal(deployment.read_facts((), root), purge=purge)
     else:
-        plan = make_plan(vehicle, drivers, parse_serial(serial), start, root)
+        plan = make_plan(vehicle, drivers, parse_serial(serial), root, start)
     deployment.execute_plan(plan, root, dry_run)
 
 
 def make_plan(
-    vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path
+    vehicle: Path | None, drivers: str, serial: Mapping[str, str], root: Path, start: bool
 ) -> deployment.Plan:
     """Return the plan of an installation.
 
     Raises ConfigError with all problems; ModelServerError, OSError.
     """
-    from modelserver.config.vehicle_file import KEY_HINT, load_partly
+    from modelserver.config.vehicle_file import KEY_HINT
     from modelserver.server.vehicle import find_unsigned_drive
 
     gathered = ProblemCollector()
@@ -101,19 +100,11 @@ def make_plan(
             inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
             fix = f"copy it to {deployment.CONFIGURATION}"
             deployment.check_visible([(str(inside), "the geometry")], fix, str(found))
-    known: Iterable[str] | None = None
+    names: tuple[str, ...] = ()
     if made is not None:
-        known = made.config.drivers
-    elif vehicle is not None or is_installed:
-        # a wrong vehicle file may name its drivers all the same
-        with suppress(ConfigError, OSError):
-            config = load_partly(vehicle or found)[0]
-            known = None if config is None else config.drivers
-    names = tuple(known or ())
-    if known is not None:
+        names = tuple(made.config.drivers)
         with gathered.collect("--drivers"):
-            names = deployment.check_drivers(drivers, known)
-    if made is not None:
+            names = deployment.check_drivers(drivers, made.config.drivers)
         with gathered.collect("commands.key_file"):
             deployment.render_credential_drop_in(made.installed_key)
         if made.config.commands.drive != "unsigned" and (text := find_unsigned_drive(made.config)):
@@ -122,7 +113,7 @@ def make_plan(
             deployment.check_serial(serial, made.serial_of(names))
     gathered.raise_any()
     assert made is not None
-    return _build_plan(copied, made, names, serial, start, root)
+    return _build_plan(copied, made, names, serial, root, start)
 
 
 def _build_plan(
@@ -130,8 +121,8 @@ def _build_plan(
     made: CheckedVehicle,
     names: tuple[str, ...],
     serial: Mapping[str, str],
-    start: bool,
     root: Path,
+    start: bool,
 ) -> deployment.Plan:
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
@@ -166,11 +157,7 @@ def _build_plan(
             "the vehicle file sets journal.directory, which the unit can write only inside "
             f"{deployment.STATE[0]}; without it (megabytes only) the journal is written there"
         )
-    if facts.is_live and os.geteuid() != 0:
-        notes.append("run as root, this also checks for real-time scheduling and adds the drop-in for it")
-    if not facts.is_live and facts.root == "/":
-        notes.append("systemd does not run this system: the units are enabled, and nothing is started")
-    return deployment.plan_install(writes, started, facts, start=start, notes=notes)
+    return deployment.plan_install(writes, started, facts, notes, start)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import time
 import weakref
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +29,7 @@ from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_patt
 from modelserver.wire.codec import decode
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
-from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
+from mstools.terminal.health_text import as_data, format_report, is_healthy
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
 
@@ -71,7 +71,7 @@ def command(
     """Show the health of the running daemon: pose, filter, loop, sensors, drivers, rejected messages, and warnings.
 
     Waits for its next health report, which is published once a second. With --watch each report replaces the last one;
-    if the output is no terminal, each is one line.
+    if the output is no terminal, they follow one another.
 
     --spy starts lcm-spy with this project's types instead; double-click a channel to see its fields. It needs a display
     and Java (default-jre), and at the first run a Java compiler (default-jdk-headless): the types are compiled once for
@@ -220,9 +220,7 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
         return f"{text}Other reports: {there}. Did you mean {do}?"
     if channels:
         names = ", ".join(quote(each, 64) for each in sorted(channels)[:MAX_SHOWN_NAMES])
-        names += f" and {len(channels) - MAX_SHOWN_NAMES} more" if len(channels) > MAX_SHOWN_NAMES else ""
-        do = "is the daemon running? modelserver run -c FILE, or systemctl status modelserver"
-        return f"{text}The bus has other channels ({names}): {do}"
+        return f"{text}The bus has other channels ({names}): is the daemon running? modelserver run -c FILE"
     return (
         f"{text}The bus has no messages at all: is the daemon running (modelserver run -c FILE, or systemctl status "
         "modelserver), and on this bus (--url, or -c with its vehicle file)? modelserver doctor checks the bus"
@@ -230,33 +228,28 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
 
 
 def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
-    """Show each report until Ctrl-C, and warn when there is none."""
-    if as_json or not sys.stdout.isatty():
-        _print_lines(listener, as_json)
-        return
-    from rich.text import Text
-
+    """Show each report until Ctrl-C, and warn when there is none: in place on a terminal, else one after the other."""
+    is_screen = sys.stdout.isatty() and not as_json
     last = time.monotonic()
-    with catch_signals() as stop, open_screen() as live:
+    with catch_signals() as stop, open_screen() if is_screen else nullcontext() as live:
+        is_new = True
         while not stop.is_set():
             silent = time.monotonic() - last
-            text = format_report(listener.report, listener.drivers.values(), drivers)
+            reports = (listener.report, listener.drivers.values())
+            text = json.dumps(as_data(*reports)) if as_json else replace_unencodable(format_report(*reports, drivers))
             if silent > SILENT_S:
                 text = f"NO REPORT for {silent:.0f} s; the last one:\n\n{text}"
-            live.update(Text(replace_unencodable(text), overflow="crop", no_wrap=True), refresh=True)
-            if listener.wait_for_report(1.0, stop):
-                last = time.monotonic()
+            if live is not None:
+                from rich.text import Text
 
-
-def _print_lines(listener: HealthListener, as_json: bool) -> None:
-    with catch_signals() as stop:
-        while not stop.is_set():
-            data = as_data(listener.report, listener.drivers.values()) if as_json else None
-            typer.echo(json.dumps(data) if as_json else replace_unencodable(format_line(listener.report)))
-            sys.stdout.flush()
-            began = time.monotonic()
-            while not listener.wait_for_report(SILENT_S, stop) and not stop.is_set():
-                typer.echo(f"no report for {time.monotonic() - began:.0f} s", err=True)
+                live.update(Text(text, overflow="crop", no_wrap=True), refresh=True)
+            elif is_new:
+                typer.echo(text)
+                sys.stdout.flush()
+            elif silent > SILENT_S:
+                typer.echo(f"no report for {silent:.0f} s", err=True)
+            is_new = listener.wait_for_report(1.0 if is_screen else SILENT_S, stop)
+            last = time.monotonic() if is_new else last
 
 
 # --- lcm-spy
@@ -276,13 +269,9 @@ def run_spy(url: str) -> NoReturn:
 
 def check_java() -> None:
     """Raise MissingToolError if lcm-spy cannot open its window."""
-    java = shutil.which("java")
-    libraries = Path(java or "").resolve().parent.parent / "lib"
     wrong = ""
-    if java is None:
+    if shutil.which("java") is None:
         wrong = "needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
-    elif (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
-        wrong = "opens a window, but this Java is headless: sudo apt install default-jre"
     elif not os.environ.get("DISPLAY"):
         ways = "Over ssh use ssh -X, or modelserver status --watch"
         wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
@@ -303,13 +292,7 @@ def get_types_jar() -> Path:
 
 def get_cache_folder() -> Path:
     """Return this program's folder in the user's cache."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not cache.is_absolute():
-        try:
-            cache = Path.home() / ".cache"
-        except RuntimeError:
-            raise MissingToolError("no home directory for the compiled types; set XDG_CACHE_HOME") from None
-    return cache / "modelserver"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modelserver"
 
 
 def hash_contract(files: Sequence[Path]) -> str:

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.messages import FixType, GpsSample
-from mstools.report import charts
-from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_outputs, escape, format_count, show_progress, to_json, write_file
+from mstools.terminal.options import argument, option
+from mstools.terminal.output import check_outputs, escape, format_count, show_progress, write_file
 from mstools.tuning import (
     EvaluationJob,
     EvaluationResult,
@@ -70,6 +68,8 @@ TUNABLES = (
 """In search order."""
 
 
+PARTS: tuple[Part, ...] = ("half", "outage")
+
 ROUNDS = 2
 """Rounds over all settings, at most: a second one follows what the first one changed."""
 
@@ -78,30 +78,24 @@ def command(
     log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
-    plot: Annotated[str, option("--plot HTML", "Write a page with the scores of all settings that were tried.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
-    processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
-    as_json: JsonOption = False,
     force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
 ) -> None:
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
 
     Every second fix is withheld, and all fixes in four gaps. A search changes each setting by factors of two while the
     likelihood of the withheld fixes increases, the accuracy does not decrease, and the covariance covers the errors at
-    the ends of the gaps. It is deterministic for a log, a
-    vehicle file and a version. Nothing is changed: the proposal is part of a vehicle file, to be reviewed and merged.
+    the ends of the gaps. It is deterministic for a log, a vehicle file and a version. Nothing is changed: the proposal
+    is part of a vehicle file, to be reviewed and merged.
 
     \b
     Examples:
       modelserver tune drive.lcm -c config/husky/vehicle.yaml --quick
-      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml --plot scores.html
+      modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml
     """
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
-    check_outputs((log, config), plot, output, as_json, force)
-    if plot:
-        charts.check_installed()
-
+    check_outputs((log, config), "", output, force)
     vehicle = load(config)
     gps_channel(vehicle)
     fixes = read_fixes(log, config)
@@ -113,13 +107,12 @@ def command(
         # a floor below the receiver's sigma has no effect: steps upward start there
         if each.name == "gps_sigma_floor":
             chosen[number] = Parameter(each.name, each.low, each.high, sigmas[len(sigmas) // 2])
-    parts: tuple[Part, ...] = ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else ROUNDS
-    bound = len(parts) * (1 + rounds * len(chosen) * 2)
-    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(processes, len(parts)) as runs:
-        trials = Trials(runs, log, config, parts, show)
+    bound = len(PARTS) * (1 + rounds * len(chosen) * 2)
+    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool() as runs:
+        trials = Trials(runs, log, config, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
         if first is None or not before[0].scored or before[0].missing == before[0].scored:
@@ -128,16 +121,8 @@ def command(
                 f"modelserver replay {escape(str(log))} -c {escape(str(config))} --report report.html"
             )
         found = search(begin, first, chosen, trials, rounds, _print_step)
-        after = trials.outcomes(found.settings)
-        attempts = trials.list_attempts()
-    result = TuningResult(begin, first, before, found, after, trials.count)
-    if as_json:
-        typer.echo(json.dumps(as_data(result), indent=2, allow_nan=False))
-    else:
-        typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
-    if plot:
-        lines = format_result(escape(str(log)), result)
-        write_file(plot, render_page(escape(str(log)), lines, begin, attempts, found.settings), replace=force)
+    result = TuningResult(begin, first, before[0].scored, len(before[1].gaps), found, trials.count)
+    typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
     write_file(output, format_proposal(str(log), result), replace=force)
 
 
@@ -159,7 +144,6 @@ class Trials:
     runs: Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]
     log: Path
     config: Path
-    parts: tuple[Part, ...]
     show: Callable[[float], None]
     count: int = 0
     results: dict[tuple[tuple[str, float], ...], list[EvaluationResult | None]] = field(default_factory=dict)
@@ -169,23 +153,19 @@ class Trials:
 
         keys = [tuple(sorted(each.items())) for each in trials]
         new = [key for key in dict.fromkeys(keys) if key not in self.results]
-        outcomes = self.runs([EvaluationJob(self.log, self.config, part, key) for key in new for part in self.parts])
+        outcomes = self.runs([EvaluationJob(self.log, self.config, part, key) for key in new for part in PARTS])
         self.count += len(outcomes)
         self.show(self.count)
         for n, key in enumerate(new):
-            self.results[key] = outcomes[n * len(self.parts) : (n + 1) * len(self.parts)]
+            self.results[key] = outcomes[n * len(PARTS) : (n + 1) * len(PARTS)]
         return [self._score(self.results[key]) for key in keys]
 
     def outcomes(self, settings: Settings) -> list[EvaluationResult]:
         return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
 
-    def list_attempts(self) -> list[Attempt]:
-        """Return all settings that were tried, in order, with their scores."""
-        return [Attempt(dict(key), self._score(found)) for key, found in self.results.items()]
-
     def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]
-        if len(good) < len(self.parts):
+        if len(good) < len(PARTS):
             return None
         likelihood = sum(each.likelihood for each in good) / len(good)
         return Score(likelihood, good[0].rmse, _mean(good[-1].gaps), _mean(good[-1].nees))
@@ -197,21 +177,21 @@ def _mean(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class TuningResult:
-    """Initial settings, scores and results before and after."""
+    """Initial settings and score, numbers of withheld fixes and gaps, what the search found, and number of runs."""
 
     begin: Settings
     first: Score
-    before: Sequence[EvaluationResult]
+    withheld: int
+    gaps: int
     found: SearchResult
-    after: Sequence[EvaluationResult]
     runs: int
 
 
 def format_result(log: str, result: TuningResult) -> list[str]:
     found = result.found
     text = [
-        f"{log}: {format_count(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
-        f"{format_count(len(result.before[-1].gaps), 'gap')}; {format_count(result.runs, 'run')}",
+        f"{log}: {format_count(result.withheld, 'fix', 'fixes')} withheld in turn, "
+        f"{format_count(result.gaps, 'gap')}; {format_count(result.runs, 'run')}",
         f"{'':34}{'before':>10}{'after':>10}",
     ]
     rows = [
@@ -221,40 +201,12 @@ def format_result(log: str, result: TuningResult) -> list[str]:
         ("log-likelihood of a withheld fix", result.first.likelihood, found.score.likelihood),
     ]
     text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
-    later = {each.kind: each for each in result.after[0].consistency}
-    for each in result.before[0].consistency:
-        nis, beyond = f"{each.mean:10.2f}{'':10}", f"{each.beyond:.1%}"
-        if (after := later.get(each.kind)) is not None:
-            nis, beyond = f"{each.mean:10.2f}{after.mean:10.2f}", f"{each.beyond:.1%} -> {after.beyond:.1%}"
-        text.append(f"{'NIS, ' + each.kind:34}{nis}   beyond 95 %: {beyond}")
     text += [f"{name}: {result.begin[name]:g} -> {value:g}" for name, value in found.settings.items()]
     if not found.settings:
         text.append("No step helps enough: the settings fit this recording.")
     if found.insensitive:
         text.append(f"Without effect on this recording: {', '.join(found.insensitive)}.")
     return text
-
-
-def as_data(result: TuningResult) -> dict[str, object]:
-    """Return the report as JSON data; unknown values are null."""
-
-    def format_side(score: Score, outcomes: Sequence[EvaluationResult]) -> dict[str, object]:
-        return {
-            "likelihood": to_json(score.likelihood),
-            "rmse": to_json(score.rmse),
-            "gap_ends": list(outcomes[-1].gaps),
-            "gap_nees": list(outcomes[-1].nees),
-            "nis": {each.kind: {"mean": each.mean, "beyond": each.beyond} for each in outcomes[0].consistency},
-        }
-
-    return {
-        "runs": result.runs,
-        "withheld": result.before[0].scored,
-        "before": format_side(result.first, result.before),
-        "after": format_side(result.found.score, result.after),
-        "proposal": dict(result.found.settings),
-        "unseen": list(result.found.insensitive),
-    }
 
 
 def format_proposal(log: str, result: TuningResult) -> str:
@@ -273,40 +225,22 @@ def format_proposal(log: str, result: TuningResult) -> str:
 
 
 @contextmanager
-def _open_pool(
-    processes: int, parts: int
-) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+def _open_pool() -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
     """Yield a function that runs jobs in parallel processes, and returns their results in order."""
     # at most both steps of a setting run at once
-    count = min(processes or os.cpu_count() or 1, 2 * parts)
-    if count == 1:
-        yield lambda jobs: [_run(job) for job in jobs]
-        return
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+    count = min(os.cpu_count() or 1, 2 * len(PARTS))
+    spawn = multiprocessing.get_context("spawn")
+    # Ctrl-C reaches all processes of a terminal: the workers leave it to the one that started them
+    pool = ProcessPoolExecutor(count, spawn, signal.signal, (signal.SIGINT, signal.SIG_IGN))
     try:
-        yield lambda jobs: [future.result() for future in _submit(pool, jobs)]
+        yield lambda jobs: list(pool.map(_run, jobs))
     except BaseException:
-        # running jobs take seconds and are useless now. Without workers the pool's thread ends at once; it must have
-        # ended before Python wakes the threads of all pools at exit
-        for each in list((getattr(pool, "_processes", None) or {}).values()):
+        # running jobs take seconds and are useless now
+        for each in multiprocessing.active_children():
             each.terminate()
         pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
-
-
-def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Future[EvaluationResult | None]]:
-    """Submit jobs and return their futures. SIGINT is blocked meanwhile, and delivered afterwards.
-
-    Submitting starts workers. One whose start is interrupted would run unknown to the pool, and one that is still
-    importing would print a traceback: Ctrl-C reaches all processes of a terminal. Workers inherit the mask and keep
-    it, so only the process that started them ends by Ctrl-C, and ends them.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        return [pool.submit(_run, job) for job in jobs]
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(job: EvaluationJob) -> EvaluationResult | None:
@@ -338,54 +272,3 @@ def _print_step(step: SearchStep) -> None:
         f"RMSE {step.score.rmse:.3f} m",
         err=True,
     )
-
-
-class Attempt(NamedTuple):
-    """Settings that were tried, and their score; None where the filter rejects them."""
-
-    settings: Settings
-    score: Score | None
-
-
-def render_page(log: str, lines: Sequence[str], begin: Settings, attempts: Sequence[Attempt], best: Settings) -> str:
-    """Return an HTML page: `lines` of the result, and the scores of all attempts.
-
-    `begin` are the settings of the vehicle file, `best` those that are proposed. Raises as `charts.render_page`.
-    """
-    scored = [(number, each.settings, each.score) for number, each in enumerate(attempts) if each.score is not None]
-    texts = [_describe(begin, settings) for _, settings, _ in scored]
-    at = [float(number) for number, _, _ in scored]
-    x = charts.Axis("settings in the order in which they were tried", -0.5, max(len(attempts) - 0.5, 0.5))
-    proposed = next((number for number, settings, _ in scored if dict(settings) == dict(best)), 0)
-    panels = []
-    for title, unit, name, height in (
-        ("Log-likelihood of a withheld fix", "", "likelihood", 200.0),
-        ("RMSE at withheld fixes", "m", "rmse", 120.0),
-        ("Mean error at the ends of gaps", "m", "gaps", 120.0),
-        ("Mean NEES at the ends of gaps", "", "nees", 120.0),
-    ):
-        values = [float(getattr(score, name)) for _, _, score in scored]
-        if not any(map(math.isfinite, values)):
-            continue
-        # settings that are far off would hide the differences between the others
-        axis = charts.Axis(unit, *charts.value_range(values, 0.9))
-        chosen = [n for n, number in enumerate(at) if number == proposed]
-        drawn = [
-            charts.Series("tried", at, values, charts.BLUE, 5.0, "dots", texts=texts),
-            charts.Series(
-                "proposed",
-                [at[n] for n in chosen],
-                [values[n] for n in chosen],
-                charts.ORANGE,
-                9.0,
-                "dots",
-                texts=[texts[n] for n in chosen],
-            ),
-        ]
-        panels.append(charts.Panel(title, axis, drawn, height))
-    return charts.render_text_page(f"Tuning: {log}", lines, [charts.render_panels("Scores", x, panels)])
-
-
-def _describe(begin: Settings, settings: Settings) -> str:
-    changed = [f"{name} {begin[name]:g} -> {value:g}" for name, value in settings.items() if value != begin[name]]
-    return ", ".join(changed) or "the vehicle file's"

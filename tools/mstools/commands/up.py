@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import sys
 import threading
@@ -17,11 +16,9 @@ import typer
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Severity, has_error
 from modelserver.files import check_links
-from modelserver.messages import Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.check import check_vehicle
-from mstools.commands.driver import SCENARIOS, load_driver
-from mstools.commands.run import LEVELS, check_log_options
+from mstools.commands.driver import load_driver
 from mstools.commands.status import HealthListener
 from mstools.commands.view import check_installed
 from mstools.launch.processes import (
@@ -55,18 +52,12 @@ REPORT_TIMEOUT_S: Final = 20.0
 
 POLL_S: Final = 0.5
 
-COLORS: Final = (36, 32, 33, 35, 34, 96, 92, 93, 95, 94)
-"""Colors of the names, as SGR codes of a terminal (ECMA-48)."""
-
 
 def command(
     config: Annotated[
         Path, option("--config -c FILE", f"The vehicle file. Default: {DEFAULT_FILE} in this folder.")
     ] = DEFAULT_FILE,
     emulate: Annotated[bool, option("--emulate", "Emulate each device, all on one simulated drive.")] = False,
-    scenario: Annotated[str, option("--scenario NAME", f"The drive of --emulate: {', '.join(SCENARIOS)}.")] = SCENARIOS[
-        0
-    ],
     faults: Annotated[
         list[str] | None,
         option("--fault NAME:KIND@SECONDS[:AMOUNT]", "Fault of an emulated device, e.g. gps:stall@20:30. Repeatable."),
@@ -74,7 +65,6 @@ def command(
     view: Annotated[bool, option("--view", "Open the viewer in the browser too.")] = False,
     seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
     url: UrlOption = "",
-    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
 ) -> None:
     """Run the service and all drivers of a vehicle file, a process each, with their logs in this terminal.
 
@@ -88,8 +78,6 @@ def command(
       modelserver up -c vehicle.yaml --emulate --view
       modelserver status, in another terminal
     """
-    choose_name(scenario, SCENARIOS, "scenario", "--scenario")
-    check_log_options(log_level, "auto")
     if view:
         check_installed()
     vehicle = load_checked(config)
@@ -103,19 +91,24 @@ def command(
         (SERVICE, SELF, VIEW, *(name for each in vehicle.drivers for name in (each, f"{each} device")))
     )
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
-        more = (*(("--url", url) if url else ()), "--log-level", log_level)
         began = time.monotonic()
-        start_programs(children, lines.vehicle, vehicle.drivers, more)
+        start_programs(children, lines.vehicle, vehicle.drivers, ("--url", url) if url else ())
         if view:
             bus = ("--url", url or vehicle.lcm.url, "--prefix", vehicle.lcm.channel_prefix)
             children.start(VIEW, *MODELSERVER, "view", "--live", *bus)
         listener = HealthListener(open_lcm(resolve_url(url or vehicle.lcm.url)), vehicle.lcm.channel_prefix)
-        supervision = Supervision(children, listener, printer, stop.is_set, began + seconds)
+
+        def is_over() -> bool:
+            return stop.is_set() or time.monotonic() >= began + seconds
+
         if emulate:
-            supervision.run(REPORT_TIMEOUT_S, lambda: listener.has_drivers(tuple(vehicle.drivers)))
-            start_utime = get_start_utime(time.monotonic() - began)
-            start_devices(children, lines, start_utime, ("--scenario", scenario), of_devices)
-        supervision.run(math.inf, lambda: False)
+            deadline, drivers = time.monotonic() + REPORT_TIMEOUT_S, tuple(vehicle.drivers)
+            supervise(
+                *(children, listener, printer),
+                lambda: is_over() or listener.has_drivers(drivers) or time.monotonic() >= deadline,
+            )
+            start_devices(children, lines, get_start_utime(time.monotonic() - began), faults=of_devices)
+        supervise(children, listener, printer, is_over)
         printer.print(SELF, "stopping")
 
 
@@ -162,51 +155,28 @@ def assign_faults(
 
 
 class LinePrinter:
-    """Print lines of several processes with their names, in colors on a terminal. It is used by several threads."""
+    """Print lines of several processes with their names. It is used by several threads."""
 
     def __init__(self, names: Iterable[str]):
         self._lock = threading.Lock()
-        names = tuple(names)
-        width = max(map(len, names))
-        start, end = ("\x1b[{}m", "\x1b[0m") if sys.stdout.isatty() and "NO_COLOR" not in os.environ else ("", "")
-        self._heads = {
-            name: f"{start.format(COLORS[number % len(COLORS)])}{name:>{width}} |{end}"
-            for number, name in enumerate(names)
-        }
+        self._width = max(map(len, names))
 
     def print(self, name: str, text: str) -> None:
         with self._lock:
-            typer.echo(f"{self._heads[name]} {escape(text)}")
+            typer.echo(f"{name:>{self._width}} | {escape(text)}")
             sys.stdout.flush()
 
 
-class Supervision:
-    """Restart processes that end, and print when the pose becomes valid or invalid, until it is stopped."""
-
-    def __init__(
-        self,
-        children: ChildProcesses,
-        listener: HealthListener,
-        printer: LinePrinter,
-        is_stopped: Callable[[], bool],
-        end_s: float,
-    ):
-        self._children, self._listener, self._printer = children, listener, printer
-        self._is_stopped, self._end_s = is_stopped, end_s
-        self._shown: tuple[object, ...] = ()
-
-    def run(self, seconds: float, until: Callable[[], bool]) -> None:
-        """Supervise for up to `seconds`, until a condition holds or all is stopped."""
-        end = min(time.monotonic() + seconds, self._end_s)
-        while not self._is_stopped() and not until() and time.monotonic() < end:
-            self._listener.listen(POLL_S, lambda: self._is_stopped() or until())
-            for name, what in self._children.restart_ended():
-                self._printer.print(SELF, f"{name} {what}")
-            if self._listener.health is not None:
-                self._show(self._listener.health)
-
-    def _show(self, health: Health) -> None:
-        shown = (health.state, health.invalid_reasons, health.pid)
-        if shown != self._shown:
-            self._shown = shown
-            self._printer.print(SELF, describe_pose(health))
+def supervise(
+    children: ChildProcesses, listener: HealthListener, printer: LinePrinter, is_done: Callable[[], bool]
+) -> None:
+    """Restart processes that end, and print when the pose becomes valid or invalid, until `is_done`."""
+    shown: tuple[object, ...] = ()
+    while not is_done():
+        listener.listen(POLL_S, is_done)
+        for name, what in children.restart_ended():
+            printer.print(SELF, f"{name} {what}")
+        health = listener.health
+        if health is not None and shown != (health.state, health.invalid_reasons, health.pid):
+            shown = (health.state, health.invalid_reasons, health.pid)
+            printer.print(SELF, describe_pose(health))

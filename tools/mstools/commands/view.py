@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import sys
-import time
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,7 +49,6 @@ def command(
     ] = None,
     edit: Annotated[bool, option("--edit", "Edit the geometry file too. Its link has a token.")] = False,
     no_browser: Annotated[bool, option("--no-browser", "Only print the link.")] = False,
-    seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 1.0,
@@ -99,9 +96,8 @@ def command(
                 typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
             if not no_browser and bind == LOOPBACK and has_screen():
                 webbrowser.open(page.link)
-            end = time.monotonic() + seconds
             with catch_signals() as stop:
-                viewer.run(lambda: stop.is_set() or time.monotonic() >= end)
+                viewer.run(stop.is_set)
         finally:
             page.close()
     finally:

@@ -10,7 +10,6 @@ import os
 import shlex
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -25,7 +24,6 @@ from typing import Any, Final
 import yaml
 
 from modelserver.errors import ModelServerError
-from modelserver.wire.provider import make_route_command
 from mstools.terminal.output import write_file
 
 STOP_TIMEOUT_S: Final = 3.0
@@ -95,11 +93,8 @@ class ChildProcesses:
     `on_line` gets each line that a child prints, with the child's name; it is called by a thread for each child.
     """
 
-    def __init__(
-        self, on_line: Callable[[str, str], object] | None = None, environment: Mapping[str, str] | None = None
-    ):
+    def __init__(self, on_line: Callable[[str, str], object] | None = None):
         self._on_line = on_line
-        self._environment = dict(environment or {})
         self._started: list[ChildProcess] = []
         self._before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
         self._signal = 0
@@ -172,7 +167,7 @@ class ChildProcesses:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **self._environment},
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
             start_new_session=True,
         )
 
@@ -218,9 +213,6 @@ CAN_GROUP = "239.74.163.2"
 
 STATE_FOLDER = "state"
 """Folder of the state, below that of the copied vehicle file."""
-
-PROBE_TIMEOUT_S = 1.0
-"""Timeout for a datagram over loopback, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +279,7 @@ def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedC
 
     Serial ports become pseudo-terminals, CAN buses one bus over UDP, TCP servers those of loopback. Paths of files that
     are read become absolute; state and journal are below `folder`. `own_bus`: LCM on a free port of loopback, so that a
-    running vehicle is not disturbed. Raises OSError, and LaunchError if multicast does not work.
+    running vehicle is not disturbed. Raises OSError.
     """
     content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
 
@@ -302,11 +294,11 @@ def make_connections(vehicle: Path, folder: Path, *, own_bus: bool) -> EmulatedC
         journal["directory"] = Path(journal["directory"]).name
     devices: dict[str, tuple[str, ...]] = {}
     with contextlib.ExitStack() as held:
-        url = f"udpm://{BUS_GROUP}:{_find_multicast_port(BUS_GROUP, held)}?ttl=0" if own_bus else ""
+        url = f"udpm://{BUS_GROUP}:{_reserve_port(socket.SOCK_DGRAM, held)}?ttl=0" if own_bus else ""
         drivers = content.get("drivers") or {}
         bus = ""
         if any("can" in driver for driver in drivers.values()):
-            bus = f"{CAN_GROUP}:{_find_multicast_port(CAN_GROUP, held)}"
+            bus = f"{CAN_GROUP}:{_reserve_port(socket.SOCK_DGRAM, held)}"
         for name, driver in drivers.items():
             devices[name] = _redirect_driver(driver, (folder / name).resolve(), bus, held)
             make_absolute(driver, "dbc")
@@ -330,42 +322,11 @@ def _redirect_driver(driver: dict[str, Any], port: Path, bus: str, held: context
     return ("--tcp", str(number))
 
 
-def _find_multicast_port(group: str, held: contextlib.ExitStack) -> int:
-    """Return a free UDP port of a working multicast group. Raises LaunchError if it does not work."""
-    port = _reserve_port(socket.SOCK_DGRAM, held)
-    if not has_multicast_loopback(group, port):
-        raise LaunchError(
-            f"multicast does not work on this machine: a datagram to {group} is not received. LCM and CAN over UDP "
-            "need it. Try: sudo ip link set lo up "
-            f"multicast on && sudo {make_route_command(group)}"
-        )
-    return port
-
-
 def _reserve_port(kind: socket.SocketKind, held: contextlib.ExitStack) -> int:
     """Return a free port, so that two demos, or a demo and a vehicle, do not share a bus.
 
     It is reserved until `held` is closed, so that the next call returns another.
     """
     probe = held.enter_context(socket.socket(socket.AF_INET, kind))
-    # the multicast probe must be able to share it meanwhile
-    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     probe.bind(("127.0.0.1", 0))
     return int(probe.getsockname()[1])
-
-
-def has_multicast_loopback(group: str, port: int) -> bool:
-    """Return whether a datagram to a multicast group is received on this machine."""
-    word = b"modelserver demo"
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-            receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            receiver.bind(("", port))
-            membership = struct.pack("=4sl", socket.inet_aton(group), socket.INADDR_ANY)
-            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            receiver.settimeout(PROBE_TIMEOUT_S)
-            receiver.sendto(word, (group, port))
-            return receiver.recv(64) == word
-    except OSError:
-        return False

@@ -61,7 +61,7 @@ class Series:
     """Values over x, named in the legend; non-finite ones interrupt lines and bands.
 
     `high` are the upper values of a band, whose lower ones are `y`. `times` are the seconds of the points of a track on
-    a map, `texts` what is shown on dots. Dots beyond the panel are drawn at its edge.
+    a map. Dots beyond the panel are drawn at its edge.
     """
 
     name: str
@@ -72,7 +72,6 @@ class Series:
     shape: Literal["line", "dashes", "dots", "band"] = "line"
     high: Sequence[float] = ()
     times: Sequence[float] = ()
-    texts: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,8 +244,6 @@ def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
         points = points[chosen]
         points[:, 1] = np.clip(points[:, 1], y.low, y.high)
         style: dict[str, Any] = {"mode": "markers", "marker": {"color": series.color, "size": series.width + 1.0}}
-        if series.texts:
-            name |= {"text": [_to_text(series.texts[n]) for n in chosen]}
         return [_make_trace(points) | name | style]
     if series.shape == "band":
         upper = np.column_stack([points[:, 0], np.asarray(series.high, float)])

@@ -76,7 +76,7 @@ def collect_findings(data: ReplayData) -> list[ReportFinding]:
             checks += STATE_CHECKS
         checks.append(check_rejected_fixes)
     found = causes + [finding for check in (*checks, check_stamps, check_gaps) for finding in check(data)]
-    found += check_validity(data, has_cause=bool(causes))
+    found += check_validity(data)
     return sorted(found, key=lambda each: list(Severity).index(each.level))
 
 
@@ -166,12 +166,6 @@ def check_unused(data: ReplayData) -> Iterable[ReportFinding]:
             advice = "Use the log's names in sensors.wheels.frames, or the vehicle file's names in the driver."
         elif reason == "range":
             advice = RANGE_ADVICE.get(key, "Check the units in the driver: meters, seconds and radians.")
-            if key == "wheels":
-                speeds = [abs(v) for wheel in data.sensor_motion.wheels.values() for v in wheel.values()]
-                observation += (
-                    f" The fastest second is {max(speeds, default=math.nan):.0f} m/s; "
-                    f"localization.filter.maximum_speed is {data.settings.maximum_speed:.0f}."
-                )
         yield error(f"No sample of sensors.{key} is used: {reason}", observation, advice)
 
 
@@ -198,8 +192,7 @@ def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
 
 def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
     raw = data.sensor_motion
-    by_gyro = bool(raw.gyro)
-    reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
+    reference = raw.gyro
     if any(check_gyro_unit(data)):
         reference = {second: math.radians(rate) for second, rate in raw.gyro.items()}
     against, straight = raw.count_opposed(reference)
@@ -208,15 +201,16 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
         names = ", ".join(backward)
         yield error(
             f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
-            f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
+            f"In {against} of {straight} s of straight driving by the gyro the sides rolled against each other.",
             REVERSE_WHEEL,
         )
         return
     course = raw.compare_with_course(raw.wheel_turn_rate)
-    compared = compare_turn_rates(raw.gyro, raw.wheel_turn_rate) if by_gyro else course
+    by_gyro = compare_turn_rates(raw.gyro, raw.wheel_turn_rate)
+    compared, what = (by_gyro, "gyro") if raw.gyro else (course, "fixes' course")
     if compared is None or compared.correlation > -0.6:
         return
-    if by_gyro and course is not None and course.correlation > 0.6:
+    if raw.gyro and course is not None and course.correlation > 0.6:
         yield error(
             "The gyro's rate has the opposite sign of wheels and fixes",
             f"Its correlation with the wheels' turn rate is {compared.correlation:.2f}).",
@@ -420,7 +414,9 @@ def check_latency(data: ReplayData) -> Iterable[ReportFinding]:
     found = estimate_fix_latency(data)
     if found is None:
         return
-    seconds, sigma = found
+    # the residuals have what the filter's own estimate leaves
+    estimated, _ = _get_state(data, "gps_latency")
+    seconds, sigma = found[0] + (0.0 if math.isnan(estimated) else estimated), found[1]
     if abs(seconds) > max(0.1, 4.0 * sigma):
         where = "behind" if seconds > 0.0 else "ahead of"
         yield warning(
@@ -510,16 +506,12 @@ def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
             )
 
 
-def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[ReportFinding]:
-    """Find poses that were invalid for long after the start, and headings that were never found.
-
-    `has_cause`: other findings explain it; then the reasons given with poses are not repeated.
-    """
-    consequence = ("Probably a consequence of the findings above.", "Fix those first.")
+def check_validity(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find poses that were invalid for long after the start, and headings that were never found."""
     if not data.snapshots:
         reason = "No sample of a configured sensor could be used."
         advice = "Compare the channels in the log with those in the vehicle file."
-        yield error("There was never a state", *(consequence if has_cause else (reason, advice)))
+        yield error("There was never a state", reason, advice)
         return
     first = next((n for n, each in enumerate(data.snapshots) if not each.invalid), None)
     if first is None:
@@ -527,7 +519,7 @@ def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[Report
         advice = (
             "Heading alignment takes a few meters of driving with fixes; the strip below shows the reasons over time."
         )
-        yield error("The pose was never valid", *(consequence if has_cause else (reason, advice)))
+        yield error("The pose was never valid", reason, advice)
         return
     after = data.snapshots[first:]
     bad = [each for each in after if each.invalid]

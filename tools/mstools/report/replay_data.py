@@ -124,13 +124,6 @@ class SensorMotion:
                 turns.append((t, u, turn))
         return turns
 
-    def course_turn_rate(self) -> dict[int, float]:
-        """Return the turn rate of the fixes' course, rad/s."""
-        rates: dict[int, float] = {}
-        for t, u, turn in self.course_changes():
-            rates.update(dict.fromkeys(range(math.floor(t), math.floor(u)), turn / (u - t)))
-        return rates
-
     def compare_with_course(self, rates: Mapping[int, float]) -> TurnRateComparison | None:
         """Compare a turn rate with the fixes' course, integrated over the intervals of its changes."""
         found: dict[int, tuple[float, float]] = {}
@@ -173,13 +166,6 @@ class SensorMotion:
                 fixed += math.dist(each[1:], anchor[1:])
                 anchor, distance = each, 0.0
         return DistanceComparison(rolled, fixed)
-
-    def distance_travelled(self) -> float:
-        """Return the distance by the wheels, without them by the fixes, meters; nan without both."""
-        if self.wheels:
-            return sum(self._mean_speed().values())
-        places = _thin_by_distance(self.fixes, COURSE_STEP_M)
-        return sum(math.dist(a[1:], b[1:]) for a, b in pairwise(places)) if places else math.nan
 
     def _mean_speed(self) -> dict[int, float]:
         """Return the mean magnitude of the wheels' speeds."""
@@ -332,7 +318,7 @@ class StateSample:
     velocity : of the rolling frame, true east and north, m/s
     sigma, yaw_sigma : longest axis of the horizontal position, m, and heading
     horizontal_protection_level, heading_protection_level, horizontal_level, heading_level : of the pose
-    speed, lateral_speed, yaw_rate : forward and to the left, m/s; rad/s
+    speed, yaw_rate : forward, m/s; rad/s
     values, sigmas : the filter's states by name
     """
 
@@ -348,7 +334,6 @@ class StateSample:
     horizontal_level: float = math.nan
     heading_level: float = math.nan
     speed: float = math.nan
-    lateral_speed: float = math.nan
     yaw_rate: float = math.nan
     velocity: tuple[float, float] | None = None
     is_stationary: bool = False
@@ -576,7 +561,6 @@ class ReplayCollector:
             variances = np.diagonal(np.array(state.covariance).reshape(len(state.names), -1))
             known |= {
                 "speed": state.linear_velocity[0],
-                "lateral_speed": state.linear_velocity[1],
                 "yaw_rate": state.angular_velocity[2],
                 "velocity": so3.rotate(state.pose.wxyz, state.linear_velocity)[:2],
                 "is_stationary": state.stationary,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import html
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from itertools import chain, cycle, pairwise
+from itertools import cycle, pairwise
 
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
@@ -54,7 +54,6 @@ def render_page(data: ReplayData) -> str:
         ("consistency", "Consistency", _render_consistency(data)),
         ("innovations", "Innovations", _render_innovations(data)),
         ("states", "Biases, wheels and other states", _render_states(data)),
-        ("sensors", "Sensors", _render_sensors(data)),
         ("verdicts", "Verdicts", _render_verdicts(data)),
     ]
     links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
@@ -114,49 +113,24 @@ def _render_key_figures(data: ReplayData) -> str:
     distance = sum(
         abs(b.speed) * (b.t - a.t) for a, b in pairwise(states) if math.isfinite(b.speed) and b.t - a.t < HOLD_S
     )
-    driven = (f"{distance:.0f} m", "driven")
-    if not any(math.isfinite(each.speed) for each in states):
-        raw = data.sensor_motion.distance_travelled()
-        by = "wheels" if data.sensor_motion.wheels else "fixes"
-        driven = (f"{raw:.0f} m", f"driven, by the {by}") if math.isfinite(raw) else ("unknown", "driven")
     sigmas = sorted(each.sigma for each in states if math.isfinite(each.sigma))
     verdicts = Counter(each.verdict for each in data.fixes)
     figures = [
         (f"{data.duration:.0f} s", "recorded"),
-        driven,
-        (f"{_valid_share(data):.1%}", "of the time valid"),
+        (f"{distance:.0f} m", "driven"),
+        (f"{_valid_share(data):.1%}", "of the recorded time valid"),
         (f"{verdicts['used']} of {len(data.fixes)}", "fixes used as positions"),
         (f"{verdicts['rejected']}", "positions rejected"),
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
     ]
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    words = " ".join(_describe_key_figures(data, verdicts))
-    return f'<div class="figures">{cells}</div>\n<p>{_escape(words)}</p>'
+    return f'<div class="figures">{cells}</div>'
 
 
 def _valid_share(data: ReplayData) -> float:
     """Return the share of the recorded time in which the state was valid."""
     held = [min(b.t - a.t, HOLD_S) for a, b in pairwise(data.snapshots) if not a.invalid and b.t > a.t]
     return min(sum(held) / data.duration, 1.0) if data.duration > 0.0 else 0.0
-
-
-def _describe_key_figures(data: ReplayData, verdicts: Mapping[str, int]) -> Iterator[str]:
-    """Yield explanations of the key figures and of the fixes that were not used."""
-    yield "Valid: share of the recorded time, from the log's first event on."
-    rest = [
-        f"{format_count(verdicts[verdict], 'fix', 'fixes')} {what}"
-        for verdict, what in (
-            ("monitored", "monitored (stationary or unused)"),
-            ("reset", "reset the position"),
-            ("", "without a decision (before heading alignment, or pending at the end)"),
-        )
-        if verdicts[verdict]
-    ]
-    if rest:
-        yield f"Of the fixes not used as positions (gps_position): {', '.join(rest)}."
-    heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in data.decisions)
-    if heights:
-        yield f"{format_count(heights, 'height')} (gps_height) of fixes rejected."
 
 
 def _render_findings(found: Sequence[ReportFinding]) -> str:
@@ -239,12 +213,6 @@ def _render_validity(data: ReplayData) -> str:
             for flag in Invalid
         ),
         row("stationary", (each.is_stationary for each in states), charts.SKY),
-        *(
-            row(f"{name} {value.name.lower()}", (getattr(each, name) is value for each in states), color)
-            for name, color in (("phase", charts.GRAY), ("mode", charts.AMBER))
-            for value in dict.fromkeys(getattr(each, name) for each in states)
-            if value is not None
-        ),
     ]
     rows = [each for each in rows if each.intervals or each.name in ("valid", "stationary")]
     events = _events(data)
@@ -456,28 +424,7 @@ def _state_panel(
     return Panel(title, Axis(unit, *value_range(reach)), [level("", x, 0.0), *bands, *lines], 130.0)
 
 
-# --- sensors and verdicts -----------------------------------------------------------------------------------
-
-
-def _render_sensors(data: ReplayData) -> str:
-    rows, table = [], []
-    for sensor in data.sensors:
-        gaps = sensor.find_gaps()
-        ends = [sensor.times[0], *chain.from_iterable(gaps), sensor.times[-1]]
-        present = [(a, b, "") for a, b in zip(ends[::2], ends[1::2], strict=True)]
-        rows.append(StripRow(sensor.name, present, charts.GREEN))
-        lengths = [b - a for a, b in gaps]
-        rate = f"{1.0 / sensor.period:.1f}" if sensor.period > 0.0 else ""
-        of_gaps = (f"{max(lengths):.2f}", f"{sum(lengths):.1f}") if gaps else ("", "")
-        table.append((sensor.name, str(len(sensor.times)), rate, str(len(gaps)), *of_gaps))
-    if data.frozen:
-        rows.append(StripRow("IMU frozen", [(a, b, "repeats one sample") for a, b in data.frozen], charts.RED))
-    if not rows:
-        return "<p>No sample could be used.</p>"
-    head = ("source", "samples", "rate, Hz", "gaps", "longest, s", "total, s")
-    chart = charts.render_strip("Sensors over time", _time_axis(data), rows)
-    figure = _render_figure(chart, "Samples of each source. A gap exceeds three periods and 0.2 s.")
-    return f"{_render_table(head, table, numbers=(1, 2, 3, 4, 5))}\n{figure}"
+# --- verdicts -----------------------------------------------------------------------------------------------
 
 
 def _render_verdicts(data: ReplayData) -> str:

@@ -1,4 +1,4 @@
-"""Formats of the health report: text, one line, and JSON."""
+"""Formats of the health report: text and JSON."""
 
 from __future__ import annotations
 
@@ -27,15 +27,6 @@ MAX_ROWS: Final = 40
 
 SENSOR_PREFIX: Final = "sensor:"
 """Prefix of the sensors' names in a report."""
-
-LARGE_SIGMA_HORIZONTAL: Final = 10.0
-"""Standard deviation of the position beyond which status warns, meters: three times that of an ordinary fix."""
-
-LARGE_SIGMA_UP: Final = 20.0
-"""The same of the height: it is known less well than the position, and without undulation not at all."""
-
-FRESH_S: Final = 1.0
-"""A source without a rate and with a message in this time was first received after the last rate computation."""
 
 
 def is_healthy(health: Health) -> bool:
@@ -78,7 +69,7 @@ def format_body(health: Health) -> str:
         rows = [
             ("pose", f"NOT VALID: {health.invalid_reasons.explain()}" if health.invalid_reasons else "valid"),
             ("", bounds),
-            *_format_place(localization),
+            *([("", place)] if (place := _format_place(localization)) else []),
             ("filter", f"{mode}; {_format_fix_age(localization.fix_age)}"),
             ("", f"epoch {health.pose_epoch}, {origin}, {published} published"),
         ]
@@ -99,20 +90,13 @@ def format_body(health: Health) -> str:
     return "\n".join(f"{name:<9} {escape(text)}".rstrip() for name, text in rows)
 
 
-def _format_place(localization: LocalizationHealth) -> list[tuple[str, str]]:
-    """Return the lines for latitude, longitude, height, heading and their uncertainty."""
+def _format_place(localization: LocalizationHealth) -> str:
+    """Format latitude, longitude, height and heading, empty if unknown."""
     if math.isnan(localization.latitude_deg):
-        return []
+        return ""
     heading = "" if math.isnan(localization.heading_deg) else f", heading {localization.heading_deg:.1f} deg"
     place = f"{localization.latitude_deg:.7f}, {localization.longitude_deg:.7f} deg"
-    lines = [("", f"at {place}, height {localization.height:.1f} m{heading}")]
-    for name, sigma, limit in (
-        ("position", localization.sigma_horizontal, LARGE_SIGMA_HORIZONTAL),
-        ("height", localization.sigma_up, LARGE_SIGMA_UP),
-    ):
-        if sigma > limit:
-            lines.append(("", f"WARNING: the {name} is uncertain, sigma {sigma:.1f} m"))
-    return lines
+    return f"at {place}, height {localization.height:.1f} m{heading}"
 
 
 def _format_stability(stability: StabilityHealth) -> str:
@@ -158,17 +142,13 @@ def _get_sensors(health: Health) -> list[ChannelHealth]:
 def _format_motion(health: Health) -> str:
     """Format the filter's phase and whether the vehicle moves."""
     localization = health.localization
-    phase = "" if localization.phase is None else localization.phase.name.lower()
-    head = f", {phase}" if phase else ", no filter"
+    phase = "no filter" if localization.phase is None else localization.phase.name.lower()
     if not _get_sensors(health):
-        return f"{head}: no sensor sample received yet"
+        return f", {phase}: no sensor sample received yet"
     # during leveling only a stationary vehicle is detected
     motion = "stationary" if localization.stationary else "" if localization.phase is Phase.LEVELING else "moving"
-    if is_current(health):
-        return f"{head}, {motion}" if motion else head
-    last = " and ".join(filter(None, (phase, motion)))
-    when = "last IMU sample" if Invalid.STALE_IMU in health.invalid_reasons else "last sensor sample"
-    return f"{'' if phase else head}; {last} at the {when}"
+    text = ", ".join(filter(None, (phase, motion)))
+    return f", {text}" if is_current(health) else f"; {text} at the last sensor sample"
 
 
 def _format_fix_age(age_s: float) -> str:
@@ -179,17 +159,12 @@ def _format_fix_age(age_s: float) -> str:
     return f"last fix used {format_duration(age_s)} ago"
 
 
-def _is_fresh(each: ChannelHealth) -> bool:
-    """Return whether a source is in its first period, without a rate."""
-    return bool(each.count) and not each.silent and each.rate_hz == 0.0 and each.age < FRESH_S
-
-
 def _format_channels(channels: Iterable[ChannelHealth]) -> str:
     rows = [
         (
             each.channel,
             str(each.count),
-            "-" if _is_fresh(each) else format_number(each.rate_hz, 1),
+            format_number(each.rate_hz, 1),
             format_duration(each.age),
             format_number(each.delay_max * 1e3, 1),
             f"{each.used}/{each.measured}" if each.measured else "",
@@ -233,27 +208,7 @@ def describe_pose(health: Health) -> str:
         return "no pose: no localization sensor is configured"
     if reasons:
         return f"pose not valid: {health.invalid_text or reasons.explain()}"
-    return "; ".join(("pose valid", *(text for _, text in _format_place(localization)), _format_bounds(localization)))
-
-
-def format_line(health: Health) -> str:
-    """Format a report as one line, for logs."""
-    localization = health.localization
-    parts = [format_clock(health.utime), STATE_NAMES.get(health.state, str(health.state))]
-    if localization.mode is not None:
-        reasons = health.invalid_reasons
-        parts.append(f"pose not valid: {reasons.explain()}" if reasons else _format_bounds(localization))
-        parts += [text for _, text in _format_place(localization)]
-    parts += [f"{each.channel} {_format_source(each)}" for each in health.channels[:MAX_ROWS]]
-    parts.append(f"tick latency p99 {health.tick_latency_p99 * 1e3:.2f} ms")
-    parts += [f"{name}: {text}" for name, text in health.warnings]
-    return escape("; ".join(parts))
-
-
-def _format_source(each: ChannelHealth) -> str:
-    if not each.count:
-        return "never received"
-    return "SILENT" if each.silent else "received" if _is_fresh(each) else f"{each.rate_hz:.1f} Hz"
+    return "; ".join(filter(None, ("pose valid", _format_place(localization), _format_bounds(localization))))
 
 
 def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, Any]:

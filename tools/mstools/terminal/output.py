@@ -110,10 +110,8 @@ def check_writable(path: str, replace: bool = True) -> None:
         raise ModelServerError(f"{escape(path)} cannot be written: no write permission for folder {escape(folder)}")
 
 
-def check_outputs(inputs: Sequence[Path], plot: str, output: str, as_json: bool, replace: bool) -> None:
+def check_outputs(inputs: Sequence[Path], plot: str, output: str, replace: bool) -> None:
     """Raise typer.BadParameter or ModelServerError for outputs that cannot be written, before long work."""
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
     named = [each for each in (plot, output) if each and each != "-"]
     files = [*named, *map(str, inputs)]
     if len(set(map(os.path.realpath, files))) < len(files):
