@@ -86,6 +86,8 @@ def test_given_a_geometry_file_when_two_frames_are_chosen_then_the_answer_and_it
     page.get_by_role("button", name="Exchange").click()
     inverse = found.pose.inverse()
     wait_until(page, lambda: read_value(page, "x") == pytest.approx(inverse.xyz[0], abs=1e-4))
+    page.get_by_text("Copy", exact=True).click()
+    page.get_by_text("modelserver query 'Raptor:CG' 'Digiclops:ImagePlane'").wait_for()
 
 
 def test_given_a_geometry_file_when_a_joint_is_moved_then_the_picture_and_the_answer_change(

@@ -124,18 +124,25 @@ def test_given_an_odd_file_then_it_is_one_that_loads() -> None:
             lambda d: d.set_pose(frame("Rover:B"), (0.0, 0.0, 1.0), (0.0, 0.0, 90.0)),
             [
                 "-           B: {rotation: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}   # turned",
-                "+           B: {rotation: [[0, -1, 0], [1, 0, 0], [0, 0, 1]], xyz: [0, 0, 1]}   # turned",
+                "+           B: {xyz: [0, 0, 1], rotation: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}   # turned",
             ],
         ),
         (
             lambda d: d.set_pose(frame("Rover:Hub"), (0.0, 0.2, 0.0), (0.0, 0.0, 0.0)),
-            ["+           Hub: {xyz: [0, 0.2, 0]}"],
+            ["+ ", "+           Hub: {xyz: [0, 0.2, 0]}"],
+        ),
+        (
+            lambda d: d.set_pose(frame("Rover:Hub"), (0.0, 0.2, 0.0), (0.0, 0.0, 0.0), in_template=True),
+            [
+                "-         frames: {Hub: {xyz: [0, 0.10, 0]}, Rim: {}}",
+                "+         frames: {Hub: {xyz: [0, 0.2, 0]}, Rim: {}}",
+            ],
         ),
         (
             lambda d: d.set_sigma(constraint("join"), (0.01, 0.01, 0.01), (0.0, 1.0, 2.0)),
             [
                 f"-   join: {{from: on:12, to: Rover:A, {JOINT}}}",
-                f"+   join: {{from: on:12, to: Rover:A, {JOINT}, sigma: {{xyz: 0.01, rpy_deg: [0, 1, 2]}}}}",
+                f"+   join: {{from: on:12, to: Rover:A, sigma: {{xyz: 0.01, rpy_deg: [0, 1, 2]}}, {JOINT}}}",
             ],
         ),
         (
@@ -166,11 +173,26 @@ def test_given_an_odd_file_then_it_is_one_that_loads() -> None:
             lambda d: d.set_joint(
                 "second",
                 Joint(JointType.PRISMATIC, (1.0, 0.0, 0.0), mimic=Mimic("join", 0.5)),
-                Joint(JointType.PRISMATIC, (0.0, 0.0, 1.0), mimic=Mimic("join", 0.5)),
+                Joint(JointType.PRISMATIC, (1.0, 0.0, 0.0), lower=(-1.0,), upper=(1.0,), mimic=Mimic("join", 0.25)),
             ),
             [
-                "-       axis: [1, 0, 0]",
-                "+       axis: [0, 0, 1]",
+                "-       mimic: {joint: join, multiplier: 0.5}",
+                "+       mimic: {joint: join, multiplier: 0.25}",
+                "+       limits: [-1, 1]",
+            ],
+        ),
+        (
+            lambda d: d.duplicate(frame("Rover:A"), "A2"),
+            [
+                "+ ",
+                "+           A2:",
+                "+               xyz:",
+                "+               - 1.0",
+                "+               - 2",
+                "+               - 0.5",
+                "+               description: >",
+                "+                 folded text",
+                "+                 # no comment",
             ],
         ),
         (lambda d: d.add_frame("on", "New", (0.0, 0.0, 1.5)), ["+             New: {xyz: [0, 0, 1.5]}"]),
@@ -210,19 +232,42 @@ def test_given_a_body_renamed_then_its_constraints_follow() -> None:
         assert new.get_transformation(*pair).pose == before.get_transformation(*pair).pose
 
 
-def test_given_a_frame_of_a_template_then_one_body_changes_or_by_its_text_all() -> None:
+def test_given_a_template_then_all_its_bodies_change_or_only_one() -> None:
     old = GeometryDocument(RAPTOR)
     item = frame("BackNoddingSICK:BottomPlateCorner")
     assert old.find_template(item) == "NoddingSICK"
+    assert old.list_users("NoddingSICK") == ["FrontNoddingSICK", "BackNoddingSICK"]
     one = old.set_pose(item, (0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
-    assert len(describe_changes(load(old), load(one))) == 1
-    both = old.set_yaml(item, "BottomPlateCorner: {xyz: [0, 0, 0.5]}")
-    assert len(describe_changes(load(old), load(both))) >= 2
+    assert (
+        describe_changes(load(old), load(one)) == ("frame BackNoddingSICK:BottomPlateCorner moved by 0.5348 m",)
+        or len(describe_changes(load(old), load(one))) == 1
+    )
+    both = old.set_pose(item, (0.0, 0.0, 0.5), (0.0, 0.0, 0.0), in_template=True)
+    assert len(describe_changes(load(old), load(both))) == 2
     # once it has an entry of its own, the body no longer follows
     assert one.find_template(item) == ""
+    renamed = old.rename(item, "Corner", in_template=True)
+    assert renamed.find_template(frame("FrontNoddingSICK:Corner")) == "NoddingSICK"
+    pose = load(renamed).get_transformation("Digiclops:LeftLens", "Raptor:Origin").pose
+    assert pose == load(old).get_transformation("Digiclops:LeftLens", "Raptor:Origin").pose
     for change in (old.rename, lambda item, name: old.delete(item)):
         with pytest.raises(EditError, match="template NoddingSICK"):
             change(item, "Corner")
+
+
+def test_given_a_line_then_what_stands_on_it_is_found() -> None:
+    document = GeometryDocument(RAPTOR)
+    lines = RAPTOR.split("\n")
+    for text, item in (
+        ("  FLEALateral:", constraint("FLEALateral")),
+        ("    joint: {type: revolute, axis: [0, 0, 1], limits_deg: [-90, 90]", constraint("FLEALateral")),
+        ("      PhaseCenter:", frame("GPSAntenna:PhaseCenter")),
+        ("      BottomPlateCorner:", frame("FrontNoddingSICK:BottomPlateCorner")),
+        ("  Digiclops:", GeometryItem(ItemKind.BODY, "Digiclops")),
+    ):
+        line = next(n for n, each in enumerate(lines, 1) if each.startswith(text))
+        assert document.find_item(line) == item
+    assert document.find_item(1) is None
 
 
 @pytest.mark.parametrize(
@@ -240,6 +285,9 @@ def test_given_a_frame_of_a_template_then_one_body_changes_or_by_its_text_all() 
         (lambda d: d.set_yaml(frame("on:12"), "12: {"), "line"),
         (lambda d: d.set_yaml(frame("on:12"), "[" * 100_000), "nests deeper"),
         (lambda d: d.set_yaml(frame("on:12"), "12: {description: \ud800}"), "no character"),
+        (lambda d: d.set_pose(frame("on:12"), (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0)), "nan is no number"),
+        (lambda d: d.set_pose(frame("on:12"), (0.0, 0.0, 0.0), (0.0, -math.inf, 0.0)), "-inf is no number"),
+        (lambda d: d.set_sigma(frame("on:12"), (0.0, math.inf, 0.0), None), "inf is no number"),
     ],
 )  # fmt: skip
 def test_given_a_change_that_cannot_be_made_then_the_reason_is_given(
@@ -249,12 +297,15 @@ def test_given_a_change_that_cannot_be_made_then_the_reason_is_given(
         change(GeometryDocument(ODD))
 
 
-def test_given_an_alias_then_it_is_not_edited() -> None:
+def test_given_an_alias_then_what_it_shares_is_not_changed_behind_its_back() -> None:
     text = (
         "bodies:\n  A: &a {frames: {Origin: {}, P: {xyz: &p [1, 2, 3]}}}\n  B: *a\n  C:\n    frames: {Q: {xyz: *p}}\n"
     )
-    with pytest.raises(EditError, match=r"line 3: aliases .* are not supported"):
-        GeometryDocument(text)
+    document = GeometryDocument(text)
+    for item in (frame("A:P"), frame("B:P"), frame("C:Q")):
+        with pytest.raises(EditError, match="shared by an alias"):
+            document.set_pose(item, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert load(document.add_body("D")).get_body_list() == ["A", "B", "C", "D"]
 
 
 def test_given_the_entry_of_an_item_then_it_is_written_as_given() -> None:
@@ -300,20 +351,20 @@ def test_given_any_changes_then_the_model_is_what_they_state(data: st.DataObject
     for _ in range(data.draw(st.integers(1, 6))):
         item = data.draw(st.sampled_from(document.list_items()))
         before, old = document, load(document)
-        is_shared = bool(document.find_template(item))
-        kind = data.draw(st.sampled_from(["pose", "sigma", "text", "rename", "yaml"]))
+        in_template = bool(document.find_template(item)) and data.draw(st.booleans())
+        kind = data.draw(st.sampled_from(["pose", "sigma", "text", "rename", "duplicate", "yaml"]))
         changes = []
         if kind == "pose" and item.kind is not ItemKind.BODY:
             xyz, rpy = data.draw(vectors), data.draw(angles)
-            document = document.set_pose(item, xyz, rpy)
+            document = document.set_pose(item, xyz, rpy, in_template)
             model = load(document)
             found = _find(model, item)
             assert found.pose.is_close(Pose.from_rpy(xyz, *map(math.radians, rpy)), 1e-8, 1e-8)
             changes = [each for each in describe_changes(old, model) if "sigma" not in each]
-            assert len(changes) <= 1
+            assert len(changes) <= (len(before.list_users(before.find_template(item))) if in_template else 1)
         elif kind == "sigma" and item.kind is not ItemKind.BODY:
             position, rotation = data.draw(sigmas), data.draw(sigmas)
-            document = document.set_sigma(item, position, rotation)
+            document = document.set_sigma(item, position, rotation, in_template)
             sigma = _find(load(document), item).sigma
             if position is not None:
                 assert sigma.position == pytest.approx(position)
@@ -322,21 +373,26 @@ def test_given_any_changes_then_the_model_is_what_they_state(data: st.DataObject
         elif kind == "text":
             text = data.draw(st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=40)).strip()
             if item.kind is not ItemKind.BODY or not before.find_template(item):
-                document = document.set_description(item, text)
+                document = document.set_description(item, text, in_template)
                 found = load(document).body(item.name) if item.kind is ItemKind.BODY else _find(load(document), item)
                 if text:
                     assert found.description == text
-        elif kind == "rename" and not is_shared:
-            document = document.rename(item, "Renamed#1" if item.kind is ItemKind.BODY else "on")
+        elif kind == "rename" and (in_template or not document.find_template(item)):
+            document = document.rename(item, "Renamed#1" if item.kind is ItemKind.BODY else "on", in_template)
             model = load(document)
             assert len(model.bodies) == len(old.bodies)
             assert len(model.constraints) == len(old.constraints)
             # back again: the text is as before, but for the notation of names
             back = "Renamed#1" if item.kind is ItemKind.BODY else "on"
             new = item._replace(name=f"{item.name.partition(':')[0]}:{back}" if ":" in item.name else back)
-            again = document.rename(new, item.name.rpartition(":")[2])
+            again = document.rename(new, item.name.rpartition(":")[2], in_template)
             assert describe_changes(old, load(again)) == ()
             document = again
+        elif kind == "duplicate" and item.kind is not ItemKind.CONSTRAINT:
+            document = document.duplicate(item, "Copy-1")
+            copy = item._replace(name=f"{item.name.partition(':')[0]}:Copy-1" if ":" in item.name else "Copy-1")
+            document = document.delete(copy)
+            assert describe_changes(old, load(document)) == ()
         elif kind == "yaml":
             assert document.set_yaml(item, document.get_yaml(item)).text == document.text
 

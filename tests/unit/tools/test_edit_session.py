@@ -29,7 +29,7 @@ def open_session(path: Path) -> EditSession:
 
 
 def move(session: EditSession, x: float, item: GeometryItem = LENS) -> bool:
-    return session.change(lambda document: document.set_pose(item, (x, 0.0, 0.06), (0.0, 10.0, 0.0)))
+    return session.change("move", lambda document: document.set_pose(item, (x, 0.0, 0.06), (0.0, 10.0, 0.0)))
 
 
 def test_given_changes_then_they_are_undone_and_made_again(folder: Path) -> None:
@@ -38,20 +38,20 @@ def test_given_changes_then_they_are_undone_and_made_again(folder: Path) -> None
     assert move(session, 0.07)
     assert not move(session, 0.07)
     assert move(session, 0.08)
-    assert session.can_undo
+    assert session.undo_name == "move"
     session.undo()
     assert session.model is not None
     assert session.model.frame(LENS.name).pose.xyz[0] == 0.07
     session.undo()
     session.undo()
-    assert (session.document.text, session.is_changed, session.can_undo) == (before, False, False)
+    assert (session.document.text, session.is_changed, session.undo_name) == (before, False, "")
     session.redo()
     session.redo()
     session.redo()
     assert session.model.frame(LENS.name).pose.xyz[0] == 0.08
     session.undo()
     move(session, 0.09)
-    assert not session.can_redo
+    assert session.redo_name == ""
 
 
 def test_given_a_save_then_the_file_has_the_change_and_nothing_else(folder: Path) -> None:
@@ -80,28 +80,31 @@ def test_given_a_save_then_the_file_has_the_change_and_nothing_else(folder: Path
     )
 
 
-def test_given_a_wrong_change_then_its_item_is_named_and_nothing_is_saved(folder: Path) -> None:
+def test_given_a_wrong_change_then_its_culprit_is_found_and_nothing_is_saved(folder: Path) -> None:
     path = folder / "geometry.yaml"
     session = open_session(path)
-    session.change(lambda document: document.set_sigma(LENS, (-1.0, 0.0, 0.0), None))
+    session.change("sigma", lambda document: document.set_sigma(LENS, (-1.0, 0.0, 0.0), None))
     assert session.has_errors
-    assert session.problems[0].element == "body FLEA, frame Lens, sigma"
+    assert session.find_culprit(session.problems[0]) == LENS
     # the last model without an error stays
     assert session.model is not None
     with pytest.raises(EditError, match="has errors"):
         session.save()
     assert path.read_bytes() == (RAPTOR / "geometry.yaml").read_bytes()
-    session.change(lambda document: document.set_sigma(LENS, (1.0, 0.0, 0.0), None))
+    session.change("sigma", lambda document: document.set_sigma(LENS, (1.0, 0.0, 0.0), None))
     assert not session.has_errors
     session.save()
 
 
 def test_given_a_frame_of_the_vehicle_file_then_its_name_is_checked_there(folder: Path) -> None:
     session = open_session(folder / "vehicle.yaml")
-    session.change(lambda document: document.rename(GeometryItem(ItemKind.FRAME, "GPSAntenna:PhaseCenter"), "Phase"))
+    session.change(
+        "rename", lambda document: document.rename(GeometryItem(ItemKind.FRAME, "GPSAntenna:PhaseCenter"), "Phase")
+    )
     assert session.has_errors
     problem = next(each for each in session.problems if each.severity == "error")
     assert problem.element == "sensors.gps.frame"
+    assert session.find_culprit(problem) is None
     session.undo()
     assert not session.has_errors
 
@@ -115,7 +118,8 @@ def test_given_a_file_that_changed_meanwhile_then_it_is_not_written_over(folder:
     with pytest.raises(EditError, match="changed meanwhile"):
         session.save()
     assert path.read_text() == other
-    session = open_session(path)
+    session.read()
+    assert not session.is_changed
     move(session, 0.07)
     session.save()
     assert load_model(path).name == "other"
@@ -137,23 +141,27 @@ def test_given_a_folder_without_permission_then_the_error_names_the_file_and_the
     assert session.is_changed
 
 
-def test_given_a_file_that_was_broken_meanwhile_then_it_is_not_overwritten(folder: Path) -> None:
+def test_given_a_file_that_was_broken_meanwhile_then_it_is_neither_read_nor_overwritten(folder: Path) -> None:
     path = folder / "geometry.yaml"
     session = open_session(path)
     move(session, 0.07)
     path.write_text("bodies: {")
+    with pytest.raises(EditError, match="not well-formed"):
+        session.read()
+    assert session.is_changed
     with pytest.raises(EditError, match="changed meanwhile"):
         session.save()
     assert path.read_text() == "bodies: {"
 
 
-def test_given_a_byte_order_mark_then_the_file_is_read_and_saved_without_it(folder: Path) -> None:
+@pytest.mark.parametrize("begin", ["", "\ufeff"])
+def test_given_a_byte_order_mark_then_it_stays(folder: Path, begin: str) -> None:
     path = folder / "geometry.yaml"
-    path.write_text("\ufeff" + path.read_text())
+    path.write_text(begin + path.read_text())
     session = open_session(path)
     move(session, 0.07)
     session.save()
-    assert path.read_text().startswith("modelserver:")
+    assert path.read_text().startswith(f"{begin}modelserver:")
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
-from modelserver.errors import GeometryError, Problem, Severity
-from modelserver.geometry import Joint, JointType
+from modelserver.errors import Problem, Severity
+from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
-from mstools.view.editor import Editing, Editor
+from mstools.view.editor import Editing, Editor, Snap
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import VehicleScene
 
@@ -35,7 +35,7 @@ class EditedPage:
         self.actions = Actions()
         self.shown: list[Model] = []
         scene = VehicleScene(server, None, lambda frame, is_reference: None)
-        scene.set_model(self.session.model, "Raptor:CG")
+        scene.set_model(self.session.drawn, "Raptor:CG")
         self.scene = scene
         self.editor = Editor(server, scene, Editing(self.session), self.actions, self.shown.append)
         self.fields = self.editor._fields
@@ -53,6 +53,7 @@ class EditedPage:
 
     @property
     def model(self) -> Model:
+        assert self.session.model is not None
         return self.session.model
 
     def constraint(self, name: str) -> Any:
@@ -68,11 +69,47 @@ def page(tmp_path: Path) -> Iterator[EditedPage]:
     opened.close()
 
 
-def test_given_a_file_with_an_error_then_it_is_not_edited(tmp_path: Path) -> None:
+ERRORS = {
+    "unknown body": ("to: Digiclops:Mount", "to: Digiclopz:Mount", "DigiclopsFixed"),
+    "sigma": ("xyz: [1.15, 0.6, -0.017]", "xyz: [1.15, 0.6]", "Raptor:CG"),
+}
+
+
+@pytest.fixture(params=ERRORS)
+def wrong_page(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[EditedPage, str]]:
+    right, wrong, culprit = ERRORS[request.param]
+    for each in ("vehicle.yaml", "raptor.dbc"):
+        shutil.copy(RAPTOR / each, tmp_path)
     text = (RAPTOR / "geometry.yaml").read_text()
-    (tmp_path / "geometry.yaml").write_text(text.replace("to: Digiclops:Mount", "to: Digiclopz:Mount", 1))
-    with pytest.raises(GeometryError, match="Digiclopz"):
-        EditSession(EditedFile.open(tmp_path / "geometry.yaml"))
+    assert right in text
+    (tmp_path / "geometry.yaml").write_text(text.replace(right, wrong, 1))
+    opened = open_page(port=0)
+    yield EditedPage(tmp_path / "vehicle.yaml", opened.server), culprit
+    opened.close()
+
+
+def test_given_a_file_with_an_error_then_it_opens_with_its_problems_and_can_be_fixed(
+    wrong_page: tuple[EditedPage, str],
+) -> None:
+    page, culprit = wrong_page
+    session, editor = page.session, page.editor
+    assert session.model is None
+    assert "not joined" in editor._status.content
+    assert "**error**" in editor._problem_texts.content
+    (button,) = [each for each in editor._buttons if each.label == f"1: {culprit}"]
+    assert button is not None
+    item = session.find_culprit(next(each for each in session.problems if each.severity == "error"))
+    assert item is not None
+    editor.select(item)
+    text = session.document.get_yaml(item)
+    for right, wrong, _ in ERRORS.values():
+        text = text.replace(wrong, right)
+    editor._text.value = text
+    editor._write_text()
+    assert not session.has_errors
+    assert page.shown == [session.model]
+    session.save()
+    assert (session.file.path).read_text() == (RAPTOR / "geometry.yaml").read_text()
 
 
 @pytest.mark.slow
@@ -82,7 +119,7 @@ def test_given_all_items_then_their_fields_without_a_change_change_nothing(page:
         page.editor.select(item)
         assert page.set() == ""
         assert page.session.document.text == before, item
-    assert not page.session.can_undo
+    assert page.session.undo_name == ""
 
 
 def test_given_numbers_then_the_frame_moves_and_undo_brings_it_back(page: EditedPage) -> None:
@@ -114,6 +151,7 @@ def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: E
     assert "not negative" in page.editor._problem_texts.content
     assert "cannot be saved" in page.editor._status.content
     assert page.editor._save.disabled
+    assert page.editor._buttons[0].label == "1: FLEA:Lens"
     page.editor.select(NOD)
     page.editor.select(LENS)
     page.set(sigma_xyz=(0.01, 0.0, 0.0))
@@ -125,7 +163,16 @@ def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: E
 @pytest.mark.parametrize(
     ("values", "joint"),
     [
+        ({"limits": "-25, 15"}, {"lower": (math.radians(-25),), "upper": (math.radians(15),)}),
+        ({"limits": "-.inf, 15"}, {"lower": (), "upper": (math.radians(15),)}),
+        ({"limits": ""}, {"lower": (), "upper": ()}),
+        ({"rate_limit": "45", "sigma": ""}, {"rate_limit": (math.radians(45),), "sigma": ()}),
+        ({"default": "-5"}, {"default": (math.radians(-5),)}),
         ({"axis": (0.0, 0.0, 2.0)}, {"axis": (0.0, 0.0, 1.0)}),
+        (
+            {"leader": "BackNoddingSICKAxis", "multiplier": "-1"},
+            {"mimic": Mimic("BackNoddingSICKAxis", -1.0, 0.0), "default": (0.0,)},
+        ),
     ],
 )
 def test_given_fields_of_a_joint_then_the_joint_has_them(
@@ -139,11 +186,21 @@ def test_given_fields_of_a_joint_then_the_joint_has_them(
         assert getattr(new, key) == pytest.approx(joint.get(key, getattr(old, key))), key
 
 
+def test_given_one_number_of_a_joint_then_the_others_stay_as_they_are_written(page: EditedPage) -> None:
+    page.editor.select(NOD)
+    page.set(limits="-25, 20", rate_limit="35.3")
+    old = "limits_deg: [-30, 20], rate_limit_deg: 90, sigma_deg: 0.021}"
+    new = "limits_deg: [-25, 20], rate_limit_deg: 35.3, sigma_deg: 0.021}"
+    text = (RAPTOR / "geometry.yaml").read_text()
+    first = text.index(old, text.index(f"{NOD.name}:"))
+    assert page.session.document.text == text[:first] + new + text[first + len(old) :]
+
+
 def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> None:
     page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "SpeedLanFixed"))
     page.set(joint=JointType.PRISMATIC)
-    page.set(axis=(0.0, 0.0, 1.0))
-    assert page.constraint("SpeedLanFixed").joint == Joint(JointType.PRISMATIC, (0.0, 0.0, 1.0))
+    page.set(axis=(0.0, 0.0, 1.0), limits="0, 0.5")
+    assert page.constraint("SpeedLanFixed").joint == Joint(JointType.PRISMATIC, (0.0, 0.0, 1.0), (0.0,), (0.5,))
     page.set(joint=JointType.REVOLUTE)
     assert page.constraint("SpeedLanFixed").joint == Joint(JointType.REVOLUTE, (0.0, 0.0, 1.0))
     page.set(joint=JointType.FLOATING)
@@ -156,6 +213,11 @@ def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> No
 @pytest.mark.parametrize(
     ("values", "words"),
     [
+        ({"limits": "5"}, "two numbers, lower and upper"),
+        ({"limits": "20, -20"}, "lower one first, got '20, -20'"),
+        ({"limits": "a, b"}, "'a' is not a number"),
+        ({"default": "70"}, "out of"),
+        ({"sigma": "-1"}, "not negative"),
         ({"axis": (0.0, 0.0, 0.0)}, "axis"),
         ({"name": "FLEALateral"}, "already"),
         ({"name": "a b"}, "white space"),
@@ -177,15 +239,13 @@ def test_given_another_name_then_what_refers_to_it_follows_and_it_stays_selected
     assert page.editor._item == GeometryItem(ItemKind.BODY, "Camera")
 
 
-def test_given_the_frame_of_a_template_then_its_body_alone_changes_and_its_text_is_of_all(page: EditedPage) -> None:
+def test_given_the_frame_of_a_template_then_one_or_all_bodies_change(page: EditedPage) -> None:
     item = GeometryItem(ItemKind.FRAME, "FrontNoddingSICK:NoddingAxis")
     page.editor.select(item)
-    page.editor._text.value = "NoddingAxis: {xyz: [0.25, 0, 0.18]}"
-    page.editor._write_text()
-    before = page.model.frame("BackNoddingSICK:NoddingAxis").pose
-    assert before.xyz[0] == page.model.frame(item.name).pose.xyz[0] == 0.25
+    page.set(xyz=(0.25, 0.0, 0.18), template=True)
+    assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
     page.set(xyz=(0.26, 0.0, 0.18))
-    assert page.model.frame("BackNoddingSICK:NoddingAxis").pose == before
+    assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
     assert page.model.frame(item.name).pose.xyz[0] == 0.26
 
 
@@ -195,20 +255,20 @@ def test_given_a_drag_then_the_fields_follow_and_its_end_is_one_change(page: Edi
     assert body == "Raptor"
     assert parent == page.model.frame("Raptor:CabFrontRailCenter").pose
     dragged = Pose((0.0123456, 0.0, 0.0)) @ pose
-    page.fields.set_dragged(dragged, is_end=False)
+    page.fields.set_dragged(dragged, Snap.NONE, is_end=False)
     assert page.fields._fields["xyz"].value == (0.0123, 0.0, 0.0)
     assert not page.session.is_changed
-    page.fields.set_dragged(dragged, is_end=True)
-    assert page.constraint("FrontNoddingSICKFixed").pose == Pose((0.0123, 0.0, 0.0))
-    turned = Pose.from_rpy((0.0123, 0.0, 0.0), 0.0, 0.0, math.radians(44.996))
-    page.fields.set_dragged(turned, is_end=True)
+    page.fields.set_dragged(dragged, Snap.FINE, is_end=True)
+    assert page.constraint("FrontNoddingSICKFixed").pose == Pose((0.012, 0.0, 0.0))
+    turned = Pose.from_rpy((0.012, 0.0, 0.0), 0.0, 0.0, math.radians(44.0))
+    page.fields.set_dragged(turned, Snap.MEDIUM, is_end=True)
     assert np.degrees(page.constraint("FrontNoddingSICKFixed").pose.rpy) == pytest.approx([0.0, 0.0, 45.0])
     page.editor._step(page.session.undo)
     page.editor._step(page.session.undo)
     assert not page.session.is_changed
 
 
-def test_given_names_then_items_are_added_and_deleted(page: EditedPage) -> None:
+def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -> None:
     editor = page.editor
     editor._new.value = "Beacon"
     editor._add(ItemKind.BODY)
@@ -221,6 +281,10 @@ def test_given_names_then_items_are_added_and_deleted(page: EditedPage) -> None:
     editor._add(ItemKind.CONSTRAINT)
     page.set(to="Beacon:Origin")
     assert page.model.get_transformation("Beacon:Lamp", "Raptor:CabRearRailCenter").pose == Pose.identity()
+    editor.select(GeometryItem(ItemKind.FRAME, "Beacon:Lamp"))
+    editor._new.value = ""
+    editor._duplicate()
+    assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp2")
     editor.select(GeometryItem(ItemKind.BODY, "Beacon"))
     editor._delete()
     assert page.session.document.text == (RAPTOR / "geometry.yaml").read_text()
@@ -248,6 +312,9 @@ def test_given_text_then_it_is_written_and_a_wrong_one_is_not(page: EditedPage) 
         ("-0.2", -0.2),
         ("1e-1", 0.1),
         ("-2.5E+0", -2.5),
+        ("0,25", 0.25),
+        ("\u22120.3", -0.3),
+        ("\u20130.4", -0.4),
         (" +0.5 ", 0.5),
         (".5", 0.5),
     ],
@@ -260,14 +327,17 @@ def test_given_a_number_in_any_notation_then_it_is_what_was_typed(page: EditedPa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1", "0,1,2", "1.000,5", "--1", "nan", "inf"])
-def test_given_what_is_no_number_then_it_is_named_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
+@pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1,2", "1.000,5", "--1", "nan", "inf"])
+def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
     page.editor.select(LENS)
     before, field = page.session.document.text, page.fields._fields["xyz"]
     field.texts = (typed, "0", "0.06")
+    assert "color" in field._problem.content
     assert "x (m)" in page.set()
     assert page.session.document.text == before
     assert field.texts[0] == typed
+    field.texts = ("0.1", "0", "0.06")
+    assert field._problem.content == ""
 
 
 def test_given_a_typed_number_when_another_item_is_selected_then_it_is_set(page: EditedPage) -> None:
@@ -294,13 +364,35 @@ def test_given_frames_that_coincide_then_the_constraint_is_placed(page: EditedPa
     page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "FLEALateral"))
     place = page.editor._place
     place._frame.value, place._target.value = "FLEA:Lens", "Digiclops:RightLens"
-    place._place()
+    place._place(place._coincide)
     assert page.message == ""
     assert page.model.get_transformation("FLEA:Lens", "Digiclops:RightLens").pose.is_close(Pose.identity(), 2e-6, 1e-7)
     place._target.value = "Raptor:CG"
     place._frame.value = "Raptor:Origin"
-    place._place()
+    place._place(place._coincide)
     assert "one side" in page.message
+
+
+def test_given_distances_then_the_frame_is_placed_with_residuals_and_sigma(page: EditedPage) -> None:
+    item = GeometryItem(ItemKind.FRAME, "Raptor:CG")
+    page.editor.select(item)
+    true = np.array((1.2, 0.55, 0.1))
+    place = page.editor._place
+    others = ["Raptor:FrontLeftCorner", "Raptor:FrontRightCorner", "Raptor:RearLeftCorner", "Raptor:CabFrontRailCenter"]
+    for (frame, distance), name in zip(place._rows, others, strict=False):
+        frame.value = name
+        distance.value = [float(np.linalg.norm(true - page.model.frame(name).pose.xyz))]
+    place._place(place._measure)
+    assert page.message == ""
+    frame = page.model.frame(item.name)
+    assert frame.pose.xyz == pytest.approx(true, abs=1e-5)
+    assert frame.sigma is not None
+    assert 0.0 < max(frame.sigma.position) < 0.5
+    assert "+0.0 mm" in place._result.content.replace("-0.0", "+0.0")
+    for row, _ in place._rows[2:]:
+        row.value = "-"
+    place._place(place._measure)
+    assert "three frames" in page.message
 
 
 def test_given_an_error_elsewhere_then_an_item_keeps_its_notation(page: EditedPage) -> None:
@@ -327,6 +419,23 @@ def test_given_a_wrong_number_then_its_old_value_typed_again_is_set(page: Edited
     assert page.model.frame(LENS.name).pose.xyz == (0.05, 0.0, 0.06)
     assert "description: >-" in page.session.document.text
     assert page.session.document.text.count("\n") == before.count("\n") + 1
+
+
+def test_given_a_file_that_changes_on_disk_then_that_is_shown_until_it_is_read(page: EditedPage) -> None:
+    path = page.session.file.path
+    page.editor.update(1.0)
+    assert "meanwhile" not in page.editor._status.content
+    path.write_text(path.read_text().replace("name: raptor", "name: other"))
+    page.editor.update(1.1)
+    assert "meanwhile" not in page.editor._status.content
+    page.editor.update(10.0)
+    assert "changed meanwhile on disk" in page.editor._status.content
+    page.editor._ask_read()
+    page.editor.update(10.1)
+    assert "meanwhile" not in page.editor._status.content
+    path.unlink()
+    page.editor.update(20.0)
+    assert "changed meanwhile on disk" in page.editor._status.content
 
 
 def test_given_an_edit_after_the_difference_was_shown_then_it_is_not_saved(page: EditedPage) -> None:
@@ -356,6 +465,6 @@ def test_given_a_service_that_does_not_answer_then_the_reason_is_shown(page: Edi
     page.editor._start_reload(dry_run=True)
     assert page.editor._reloading is not None
     page.editor._reloading[1].exception(10.0)
-    page.editor.update()
+    page.editor.update(0.0)
     assert page.message.startswith("not applied: ")
     page.editor.close()

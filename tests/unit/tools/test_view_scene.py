@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
 
@@ -18,7 +22,7 @@ from mstools.recordings.drive import Picture
 from mstools.view.page import Page, escape_markdown, open_page
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid, read_mesh
 from mstools.view.sources import Source, list_coordinates, open_geometry
-from mstools.view.viewer import describe_answer
+from mstools.view.viewer import describe_answer, format_code
 
 TETRAHEDRON = """\
 v 0 0 0
@@ -117,9 +121,10 @@ def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_err
     root = generator.normal(size=(3, 3))
     covariance = root @ root.T
     errors = generator.multivariate_normal(np.zeros(3), covariance, 20_000)
-    radii, pose = compute_ellipsoid(covariance, CHI_SQUARE_3)
-    inside = np.sum((pose.inverse().transform(errors) / np.array(radii)) ** 2, axis=1) <= 1.0
-    assert abs(float(np.mean(inside)) - 0.95) < 0.012
+    for percent, quantile in CHI_SQUARE_3.items():
+        radii, pose = compute_ellipsoid(covariance, quantile)
+        inside = np.sum((pose.inverse().transform(errors) / np.array(radii)) ** 2, axis=1) <= 1.0
+        assert abs(float(np.mean(inside)) - 0.01 * percent) < 0.012
 
 
 def test_given_a_picture_with_nan_and_without_covariance_then_nothing_is_drawn_of_them(page: Page) -> None:
@@ -130,7 +135,7 @@ def test_given_a_picture_with_nan_and_without_covariance_then_nothing_is_drawn_o
         Picture(1, Pose.identity(), covariance=np.zeros((3, 3)), horizontal_protection_level=math.inf),
     ):
         scene.show(picture)
-        scene.show_uncertainty(picture, True)
+        scene.show_uncertainty(picture, 95, True)
         scene.show_trail(np.zeros(0, np.int64), np.zeros((0, 3)))
         scene.show_fixes(np.zeros((0, 3)), np.zeros(0, np.int64))
 
@@ -151,13 +156,33 @@ def test_given_a_trail_that_grows_then_both_its_parts_together_are_the_whole_tra
     assert not scene._trail_end.visible
 
 
-def test_given_an_answer_then_the_panel_shows_its_numbers() -> None:
+def test_given_an_answer_then_the_panel_shows_its_numbers_and_how_to_ask_for_them() -> None:
     source = open_geometry(find_vehicle_file(), {})
     explanation = source.answers.explain("FrontSICKLaser:Scan", "Raptor:CG")
     text = describe_answer(explanation, None)
     found = explanation.answer.transformation
     assert f"| x | {found.pose.xyz[0]:.4f} m |" in text
     assert "FrontNoddingSICKAxis" in text
+    code = format_code("FrontSICKLaser:Scan", "Raptor:CG", 5, explanation.answer)
+    assert 'platform.get_pose("FrontSICKLaser:Scan", "Raptor:CG", at=5)' in code
+    assert "modelserver query 'FrontSICKLaser:Scan' 'Raptor:CG' --at 5" in code
+
+
+def test_given_quotes_in_names_then_what_is_copied_is_python_shell_and_yaml() -> None:
+    interest, reference = """B:'"$(id)`""", r"C:\n"
+    python, shell = re.findall(r"```\w+\n(.*)\n```", format_code(interest, reference, 0, None))
+    assert [each.value for each in ast.parse(python).body[0].value.args] == [interest, reference]  # type: ignore[attr-defined]
+    assert shlex.split(shell) == ["modelserver", "query", interest, reference]
+    source = open_geometry(find_vehicle_file(), {})
+    answer = source.answers.explain("FrontSICKLaser:Scan", "Raptor:CG").answer
+    code = re.findall(r"```yaml\n(.*)\n```", format_code(interest, reference, 0, answer), re.DOTALL)[0]
+    found = answer.transformation
+    assert found.covariance is not None
+    stated = yaml.safe_load(code)
+    assert stated["xyz"] == pytest.approx(found.pose.xyz, rel=1e-5)
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert stated["sigma"]["xyz"] == pytest.approx(sigmas[:3], rel=1e-3)
+    assert stated["sigma"]["rpy_deg"] == pytest.approx(np.degrees(sigmas[3:]), rel=1e-3)
 
 
 def test_given_two_frames_that_are_queried_then_their_names_are_in_the_scene(page: Page) -> None:

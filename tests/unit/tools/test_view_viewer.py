@@ -66,6 +66,7 @@ def test_given_no_service_then_the_page_reports_it_and_shows_no_time(page: Page)
     source = make_live()
     viewer = Viewer(page, source)
     viewer.draw(0.0, 0.0)
+    assert viewer._title == "ModelServer: live - no message"
     assert viewer._state is not None
     assert viewer._time is not None
     assert "no message of a service yet" in viewer._state._validity.content
@@ -98,17 +99,19 @@ def make_health(seconds: float, *channels: ChannelHealth) -> Health:
     return Health(utime, 1.0, "", "", "", 0, VALID, 0, 0, 0, 0, 0, 0, 0, channels=channels)
 
 
-def test_given_sensors_then_a_silent_one_shows() -> None:
+def test_given_sensors_then_their_rates_are_means_and_a_silent_one_shows() -> None:
+    earlier = make_health(1.0, ChannelHealth("sensor:gps", 100, 0.0, 0.1), ChannelHealth("sensor:imu", 500, 0.0, 0.1))
     health = make_health(
         4.0,
-        ChannelHealth("sensor:gps", 112, 4.0, 0.2, measured=30, used=29),
-        ChannelHealth("sensor:imu", 3, 0.0, 7.0, silent=True),
+        # a report of a tenth of a second has none of a receiver at 4 Hz
+        ChannelHealth("sensor:gps", 112, 0.0, 0.2, measured=30, used=29),
+        ChannelHealth("sensor:imu", 3, 99.0, 7.0, silent=True),
         ChannelHealth("v_WHEELS", 0, 0.0, math.nan, silent=True),
         ChannelHealth("command:view", 3, 99.0, 0.0),
     )
-    rows = [tuple(line.strip("| ").split(" | ")) for line in _format_sensors(health).splitlines()[2:]]
+    rows = [tuple(line.strip("| ").split(" | ")) for line in _format_sensors(health, earlier).splitlines()[2:]]
     assert rows == [
         ("gps", "4.0", "200 ms", "29 of 30"),
-        ("imu", "0.0", "7.0 s, silent", "-"),
+        ("imu", "99.0", "7.0 s, silent", "-"),
         (r"v\_WHEELS", "0.0", "never", "-"),
     ]

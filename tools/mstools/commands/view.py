@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import sys
+import time
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,6 +51,7 @@ def command(
     ] = None,
     edit: Annotated[bool, option("--edit", "Edit the geometry file too. Its link has a token.")] = False,
     no_browser: Annotated[bool, option("--no-browser", "Only print the link.")] = False,
+    seconds: Annotated[float, option("--seconds N", "Stop after this time. Default: never.", min=0.1)] = math.inf,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 1.0,
@@ -96,8 +99,9 @@ def command(
                 typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
             if not no_browser and bind == LOOPBACK and has_screen():
                 webbrowser.open(page.link)
+            end = time.monotonic() + seconds
             with catch_signals() as stop:
-                viewer.run(stop.is_set)
+                viewer.run(lambda: stop.is_set() or time.monotonic() >= end)
         finally:
             page.close()
     finally:

@@ -1,7 +1,7 @@
 """A geometry file as bodies, frames and constraints that are changed in its text.
 
 A frame of a template is on each body that names the template. Changed on one body, it gets an entry of its own there;
-its entry as text is that of the template, for all bodies that use it.
+with `in_template` the template is changed, and with it all bodies that use it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
-from modelserver.errors import GeometryError, Problem, has_error, quote
+from modelserver.errors import ModelServerError, Problem, SyntaxProblemError, has_error, quote
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from modelserver.formats import parse_content, read_content
 from modelserver.formats.common import format_number, parse_number
@@ -39,7 +39,7 @@ SAME_METERS: Final = 1e-9
 SAME_RADIANS: Final = 1e-9
 """A position or rotation that differs by less stays as it is written."""
 
-ENTRY_KEYS: Final = ("template", "from", "to", *POSE_KEYS, "sigma", "joint", "description")
+WRITTEN_ORDER: Final = ("template", "from", "to", *POSE_KEYS, "sigma", "joint", "description")
 
 _PLAIN_NAME = re.compile(r"[A-Za-z][\w.-]*")
 _PLAIN_TEXT = re.compile(r"[A-Za-z][\w .;/()-]*[\w.)]")
@@ -83,6 +83,27 @@ class GeometryDocument:
             found += [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for frame in self._list_frames(body)]
         return found + [GeometryItem(ItemKind.CONSTRAINT, name) for name in self._yaml.keys(("constraints",))]
 
+    def find_item(self, line: int) -> GeometryItem | None:
+        """Return what stands on a line: the last item that begins on it or before."""
+        before = [(at, item) for at, item in self._list_places() if at <= line]
+        return max(before, key=lambda each: each[0])[1] if before else None
+
+    def _list_places(self) -> Iterator[tuple[int, GeometryItem]]:
+        """Yield each item with its line; a frame of a template is that of the first body that names it."""
+        for at, constraint in self._yaml.list_lines(("constraints",)):
+            yield at, GeometryItem(ItemKind.CONSTRAINT, constraint)
+        seen: set[str] = set()
+        for at, body in self._yaml.list_lines(("bodies",)):
+            yield at, GeometryItem(ItemKind.BODY, body)
+            template = self._get_template(body)
+            paths: list[KeyPath] = [("bodies", body, "frames")]
+            if template and template not in seen:
+                seen.add(template)
+                paths.append(("templates", template, "frames"))
+            for path in paths:
+                for of_frame, frame in self._yaml.list_lines(path):
+                    yield of_frame, GeometryItem(ItemKind.FRAME, names.join(body, frame))
+
     def find_template(self, item: GeometryItem) -> str:
         """Return the template from which a frame of a body comes, empty if it is the body's own."""
         if item.kind is not ItemKind.FRAME:
@@ -91,6 +112,9 @@ class GeometryDocument:
         template = self._get_template(body)
         own = self._yaml.has(("bodies", body, "frames", frame))
         return template if not own and self._yaml.has(("templates", template, "frames", frame)) else ""
+
+    def list_users(self, template: str) -> list[str]:
+        return [body for body in self._yaml.keys(("bodies",)) if self._get_template(body) == template]
 
     def get_yaml(self, item: GeometryItem) -> str:
         """Return the entry of an item as it is written, without indentation."""
@@ -117,48 +141,48 @@ class GeometryDocument:
             raise EditError(f"there is no {item.kind} {quote(item.name)}")
         return path
 
-    def _find_own_path(self, item: GeometryItem) -> KeyPath:
-        """Return where an item is written. Raises EditError if that is a template, whose other bodies have it too."""
-        if template := self.find_template(item):
-            raise EditError(f"{item.name} is a frame of template {template}; change the template in the file")
-        return self._find_path(item)
-
     # --- numbers and texts
 
-    def set_pose(self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3) -> GeometryDocument:
+    def set_pose(
+        self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3, in_template: bool = False
+    ) -> GeometryDocument:
         """Set the pose of a frame on its body, or of a constraint. Only what differs is written."""
-        text, path = self._open(item)
+        _check_finite((*xyz, *rpy_deg))
+        text, path = self._open(item, in_template)
         old, new = _read_pose(text, path), Pose.from_rpy(xyz, *map(math.radians, rpy_deg))
         is_turned = old.distance(new)[1] > SAME_RADIANS
         has_matrix = text.has((*path, "matrix"))
-        if has_matrix or max(abs(a - b) for a, b in zip(old.xyz, xyz, strict=True)) > SAME_METERS:
-            text = _set_numbers(text, path, "xyz", xyz)
         if is_turned or has_matrix:
             for key in ("rpy", "quaternion", "rotation", "matrix"):
                 if text.has((*path, key)):
                     text = text.remove((*path, key))
             text = _set_numbers(text, path, "rpy_deg", rpy_deg)
+        if has_matrix or max(abs(a - b) for a, b in zip(old.xyz, xyz, strict=True)) > SAME_METERS:
+            text = _set_numbers(text, path, "xyz", xyz)
         return GeometryDocument(text)
 
-    def set_sigma(self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None) -> GeometryDocument:
+    def set_sigma(
+        self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None, in_template: bool = False
+    ) -> GeometryDocument:
         """Set the standard deviations of a frame or constraint; a part that is None is not stated."""
-        text, path = self._open(item)
+        _check_finite([*(xyz or ()), *(rpy_deg or ())])
+        text, path = self._open(item, in_template)
         stated = [
             f"{key}: {format_scalar_or_list(tuple([round(each, DECIMALS) for each in values]))}"
             for key, values in (("xyz", xyz), ("rpy_deg", rpy_deg))
             if values is not None
         ]
         if stated:
-            return GeometryDocument(text.set((*path, "sigma"), f"{{{', '.join(stated)}}}"))
+            return GeometryDocument(_set(text, path, "sigma", f"{{{', '.join(stated)}}}"))
         return GeometryDocument(text.remove((*path, "sigma")) if text.has((*path, "sigma")) else text)
 
-    def set_description(self, item: GeometryItem, description: str) -> GeometryDocument:
+    def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> GeometryDocument:
         """Set the description of an item, or remove it where it is empty."""
-        text, path = self._open(item)
+        text, path = self._open(item, in_template)
         if description == text.get_text((*path, "description")):
             return GeometryDocument(text)
         if description:
-            return GeometryDocument(text.set((*path, "description"), _format_word(description)))
+            return GeometryDocument(_set(text, path, "description", _format_word(description)))
         return GeometryDocument(text.remove((*path, "description")) if text.has((*path, "description")) else text)
 
     def set_ends(self, constraint: str, from_: str, to: str) -> GeometryDocument:
@@ -166,20 +190,28 @@ class GeometryDocument:
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         for key, frame in (("from", from_), ("to", to)):
             if _normalize(text.get_text((*path, key))) != frame:
-                text = text.set((*path, key), _format_full_name(frame))
+                text = _set(text, path, key, _format_full_name(frame))
         return GeometryDocument(text)
 
     def set_joint(self, constraint: str, old: Joint, new: Joint) -> GeometryDocument:
-        """Set the type and axis of the joint of a constraint, `old` before."""
+        """Set the joint of a constraint, `old` before; keys whose value is the same stay as they are written."""
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         inside = (*path, "joint")
         if not new.is_movable:
             return GeometryDocument(text.remove(inside) if text.has(inside) else text)
-        now = dict(each.split(": ", 1) for each in format_joint_fields(new))
-        if old.type is new.type and text.keys(inside):
-            return GeometryDocument(text.set((*inside, "axis"), now["axis"]) if old.axis != new.axis else text)
-        value = f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}"
-        return GeometryDocument(text.set(inside, value))
+        was, now = (dict(each.split(": ", 1) for each in format_joint_fields(joint)) for joint in (old, new))
+        if not text.keys(inside):
+            value = f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}"
+            return GeometryDocument(_set(text, path, "joint", value))
+        for key in [*was, *(each for each in now if each not in was)]:
+            if was.get(key) == now.get(key):
+                continue
+            for written in (key, key.removesuffix("_deg")):
+                if text.has((*inside, written)) and (written != key or key not in now):
+                    text = text.remove((*inside, written))
+            if key in now:
+                text = text.set((*inside, key), now[key])
+        return GeometryDocument(text)
 
     # --- items
 
@@ -203,31 +235,56 @@ class GeometryDocument:
         entry = f"{_format_key(name)}:\n  from: {_format_full_name(from_)}\n  to: {_format_full_name(to)}"
         return GeometryDocument(self._yaml.add(("constraints",), entry, in_block=True))
 
-    def rename(self, item: GeometryItem, name: str) -> GeometryDocument:
+    def duplicate(self, item: GeometryItem, name: str) -> GeometryDocument:
+        """Add a copy of an item directly after it; a frame's copy is on the same body, `name` without the body."""
+        path = self._find_path(item)
+        body = names.split(item.name)[0] if item.kind is ItemKind.FRAME else ""
+        self._make_new(item.kind, name, body)
+        entry = YamlText(self._yaml.get_entry(path))
+        copy = entry.rename((path[-1],), _format_key(name)).text
+        place = ("bodies", body, "frames") if body else path[:-1]
+        return GeometryDocument(self._yaml.add(place, copy, after=path[-1], in_block=True))
+
+    def rename(self, item: GeometryItem, name: str, in_template: bool = False) -> GeometryDocument:
         """Rename an item, a frame without its body, and what refers to it in this file."""
         body, frame = names.split(item.name) if item.kind is ItemKind.FRAME else (item.name, "")
         new = self._make_new(item.kind, name, body if frame else "")
-        path = self._find_own_path(item)
+        template = self.find_template(item)
+        if template and not in_template:
+            raise EditError(f"{item.name} is a frame of template {template}; change the template to rename it")
+        path = self._find_path(item)
         text = self._yaml.rename(path, _format_key(name))
         if item.kind is ItemKind.CONSTRAINT:
             return GeometryDocument(_rename_leader(text, item.name, name))
+        renamed = {item.name: new.name}
+        if template:
+            users = [
+                each for each in self.list_users(template) if not self._yaml.has(("bodies", each, "frames", frame))
+            ]
+            renamed = {names.join(user, frame): names.join(user, name) for user in users}
         for constraint, end, joined in self._list_ends():
-            other = new.name if joined == item.name else joined
+            other = renamed.get(joined, joined)
             if item.kind is ItemKind.BODY and joined.partition(":")[0] == body:
                 other = names.join(name, joined.partition(":")[2])
             if other != joined:
                 text = text.set(("constraints", constraint, end), _format_full_name(other))
         return GeometryDocument(text)
 
-    def delete(self, item: GeometryItem) -> GeometryDocument:
+    def delete(self, item: GeometryItem, in_template: bool = False) -> GeometryDocument:
         """Delete an item, and the constraints at a body or frame."""
-        text = self._yaml.remove(self._find_own_path(item))
+        template = self.find_template(item)
+        if template and not in_template:
+            raise EditError(f"{item.name} is a frame of template {template}; change the template to delete it")
+        text = self._yaml.remove(self._find_path(item))
+        gone = {item.name}
+        if template:
+            gone = set(self._list_copies(template, names.split(item.name)[1]))
         if item.kind is not ItemKind.CONSTRAINT:
             # several ends of one constraint may be gone
             lost = {
                 constraint: None
                 for constraint, _, joined in self._list_ends()
-                if joined == item.name or (item.kind is ItemKind.BODY and joined.partition(":")[0] == item.name)
+                if joined in gone or (item.kind is ItemKind.BODY and joined.partition(":")[0] == item.name)
             }
             for constraint in lost:
                 text = text.remove(("constraints", constraint))
@@ -243,10 +300,10 @@ class GeometryDocument:
 
     # --- inside
 
-    def _open(self, item: GeometryItem) -> tuple[YamlText, KeyPath]:
+    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[YamlText, KeyPath]:
         """Return the text, in which a frame of a template has an entry on its body if that alone is changed."""
         path = self._find_path(item)
-        if path[0] != "templates":
+        if path[0] != "templates" or in_template:
             return self._yaml, path
         body, _ = names.split(item.name)
         text = self._yaml.add(("bodies", body, "frames"), self._yaml.get_entry(path), in_block=True)
@@ -261,6 +318,11 @@ class GeometryDocument:
         if item in self.list_items():
             raise EditError(f"there is a {kind} {quote(item.name)} already")
         return item
+
+    def _list_copies(self, template: str, frame: str) -> list[str]:
+        """Return the full names of a template's frame on the bodies that have it from there."""
+        found = [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for body in self.list_users(template)]
+        return [item.name for item in found if self.find_template(item)]
 
     def _list_ends(self) -> Iterator[tuple[str, str, str]]:
         """Yield each end of each constraint: constraint, key, frame."""
@@ -282,8 +344,22 @@ def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
 
 def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
-    root = parse_yaml(text.get_entry(path).encode())
-    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", ENTRY_KEYS)) or Pose.identity()
+    try:
+        root = parse_yaml(text.get_entry(path).encode())
+    except SyntaxProblemError:
+        raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first") from None
+    return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
+
+
+def _set(text: YamlText, path: KeyPath, key: str, value: str) -> YamlText:
+    """Set a key of an entry; a new one stands after those that usually precede it."""
+    if text.has((*path, key)):
+        return text.set((*path, key), value)
+    usual = WRITTEN_ORDER[: WRITTEN_ORDER.index(key)]
+    before = [each for each in text.keys(path) if each in usual]
+    if before or not text.keys(path):
+        return text.add(path, f"{key}: {value}", before[-1] if before else "")
+    return text.insert_first(path, f"{key}: {value}")
 
 
 def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float]) -> YamlText:
@@ -295,7 +371,14 @@ def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float
         return text
     same = [a == b for a, b in zip(old, new, strict=True)]
     shown = [written[n] if same[n] else format_number(value) for n, value in enumerate(new)]
-    return text.set((*path, key), f"[{', '.join(shown)}]")
+    return _set(text, path, key, f"[{', '.join(shown)}]")
+
+
+def _check_finite(values: Sequence[float]) -> None:
+    """Raise EditError for a number that is not finite."""
+    for value in values:
+        if not math.isfinite(value):
+            raise EditError(f"{value} is no number of a pose or sigma; enter a finite one")
 
 
 def _parse(text: str) -> float:
@@ -331,6 +414,23 @@ def _normalize(name: str) -> str:
 MAX_STEPS = 500
 """Changes that can be undone."""
 
+_BOM = "\ufeff"
+
+
+class Step(NamedTuple):
+    """A document with the name of the change that led to it."""
+
+    document: GeometryDocument
+    change: str
+
+
+class CheckedText(NamedTuple):
+    """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
+
+    model: Model | None
+    drawn: Model | None
+    problems: tuple[Problem, ...]
+
 
 @dataclass(frozen=True)
 class EditedFile:
@@ -354,52 +454,67 @@ class EditedFile:
         if content.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
             raise EditError(f"{self.path} is XML; only YAML is edited: modelserver convert {self.path} geometry.yaml")
         try:
-            return content.decode("utf-8-sig")
+            return content.decode()
         except UnicodeDecodeError:
             raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
 
-    def check(self, text: str, variables: Mapping[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
-        """Return the model in a text, None if it has an error, and all problems, also of frames in the vehicle file."""
-        model, problems = parse_content(text.encode(), str(self.path), variables).check()
-        if self.config is not None and model is not None:
+    def check(self, text: str, variables: Mapping[str, str]) -> CheckedText:
+        """Return what a text has, with all problems, also of frames in the vehicle file."""
+        builder = parse_content(text.encode(), str(self.path), variables)
+        model, problems = builder.check()
+        partial = model or builder.build_bodies()
+        if self.config is not None and partial is not None:
             from modelserver.server.vehicle import find_frame_problems
 
-            problems += tuple(find_frame_problems(self.config, model, str(self.vehicle), True))
-        return model, problems
+            problems += tuple(find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
+        return CheckedText(model, partial, problems)
 
 
 class EditSession:
-    """Edit a file. `model` is the last one without an error.
-
-    Raises EditError for a file that cannot be edited, GeometryError for one with an error, OSError.
-    """
+    """Edit a file. Raises EditError for a file that cannot be edited, OSError."""
 
     def __init__(self, file: EditedFile, variables: Mapping[str, str] | None = None):
         self.file = file
         self._variables = variables or {}
-        self._saved = file.read()
-        self._steps = [GeometryDocument(self._saved)]
-        self._undone: list[GeometryDocument] = []
-        if not self.document.list_items():
-            raise EditError(f"{file.path} has no bodies in YAML: modelserver convert {file.path} geometry.yaml")
-        model, self.problems = file.check(self._saved, self._variables)
-        if model is None:
-            raise GeometryError(self.problems)
-        self.model, self._loaded = model, self.document
+        self.read()
+
+    def read(self) -> None:
+        """Read the file again; all changes are dropped. Raises as `EditSession`, with all as before."""
+        saved = self.file.read()
+        document = GeometryDocument(saved.removeprefix(_BOM))
+        if not document.list_items():
+            path = self.file.path
+            raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
+        drawn = self.file.check(document.text, self._variables).drawn
+        if drawn is None:
+            raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
+        self._saved = saved
+        self._steps = [Step(document, "")]
+        self._undone: list[Step] = []
+        self.drawn: Model = drawn
+        """The last model without an error; before there is one, the bodies of the file alone."""
+        self.model: Model | None = None
+        """The last model without an error."""
+        self._loaded: GeometryDocument | None = None
+        self._check()
 
     def _check(self) -> None:
-        model, self.problems = self.file.check(self.document.text, self._variables)
-        if model is not None:
-            self.model, self._loaded = model, self.document
+        found = self.file.check(self.document.text, self._variables)
+        self.problems = found.problems
+        if found.model is not None:
+            self.model = self.drawn = found.model
+            self._loaded = self.document
+        elif self.model is None and found.drawn is not None:
+            self.drawn = found.drawn
 
     @property
     def document(self) -> GeometryDocument:
-        return self._steps[-1]
+        return self._steps[-1].document
 
     @property
     def is_changed(self) -> bool:
         """Whether there is something to save."""
-        return self.document.text != self._saved
+        return self.document.text != self._saved.removeprefix(_BOM)
 
     @property
     def has_errors(self) -> bool:
@@ -407,26 +522,28 @@ class EditSession:
         return has_error(self.problems)
 
     @property
-    def can_undo(self) -> bool:
-        return len(self._steps) > 1
+    def undo_name(self) -> str:
+        """The change that `undo` undoes, empty for none."""
+        return self._steps[-1].change if len(self._steps) > 1 else ""
 
     @property
-    def can_redo(self) -> bool:
-        return bool(self._undone)
+    def redo_name(self) -> str:
+        """The change that `redo` makes again, empty for none."""
+        return self._undone[-1].change if self._undone else ""
 
-    def change(self, change: Callable[[GeometryDocument], GeometryDocument]) -> bool:
+    def change(self, name: str, change: Callable[[GeometryDocument], GeometryDocument]) -> bool:
         """Make a change; return whether it changed anything. Raises EditError, with all as before."""
         document = change(self.document)
         if document.text == self.document.text:
             return False
-        self._steps.append(document)
+        self._steps.append(Step(document, name))
         del self._steps[1:-MAX_STEPS]
         self._undone.clear()
         self._check()
         return True
 
     def undo(self) -> None:
-        if self.can_undo:
+        if len(self._steps) > 1:
             self._undone.append(self._steps.pop())
             self._check()
 
@@ -439,13 +556,23 @@ class EditSession:
     def is_as_loaded(self, item: GeometryItem) -> bool:
         """Return whether the entry of an item is written as in the document of `model`."""
         try:
-            return self._loaded.get_yaml(item) == self.document.get_yaml(item)
+            return self._loaded is not None and self._loaded.get_yaml(item) == self.document.get_yaml(item)
         except EditError:
             return False
 
+    def has_changed_on_disk(self) -> bool:
+        """Return whether the file is no longer what was read or saved."""
+        try:
+            return self.file.read() != self._saved
+        except (ModelServerError, OSError):
+            return True
+
+    def find_culprit(self, problem: Problem) -> GeometryItem | None:
+        return self.document.find_item(problem.line) if problem.file == str(self.file.path) else None
+
     def make_diff(self) -> str:
         """Return what saving changes, as a unified diff."""
-        old, new = (text.splitlines() for text in (self._saved, self.document.text))
+        old, new = (text.splitlines() for text in (self._saved.removeprefix(_BOM), self.document.text))
         name = self.file.path.name
         return "\n".join(difflib.unified_diff(old, new, name, f"{name} (edited)", lineterm=""))
 
@@ -458,7 +585,8 @@ class EditSession:
         except FileNotFoundError:
             raise EditError(f"{self.file.path} was removed meanwhile; nothing is saved") from None
         if current != self._saved:
-            raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Open it again")
+            raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Read it again first")
+        text = (_BOM if self._saved.startswith(_BOM) else "") + self.document.text
         with open_atomic(str(self.file.path), replace=True) as stream:
-            stream.write(self.document.text)
-        self._saved = self.document.text
+            stream.write(text)
+        self._saved = text

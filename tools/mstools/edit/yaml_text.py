@@ -9,12 +9,13 @@ replaced. A path is a sequence of keys: ("bodies", "Rover", "frames", "GPS").
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import yaml
 
-from modelserver.errors import ModelServerError, SyntaxProblemError
+from modelserver.errors import ModelServerError, SyntaxProblemError, quote
 from modelserver.yaml_tree import LOADER, parse_yaml
 
 KeyPath = Sequence[str]
@@ -55,12 +56,14 @@ class YamlText:
         except UnicodeEncodeError as error:
             raise EditError(f"{text[error.start : error.end]!r} is no character of a text file; remove it") from None
         try:
-            # bounds depth and size, as the parser below is recursive; an alias would change more than what is edited
-            parse_yaml(content, has_aliases=False)
+            # bounds depth and size: the parser below is recursive
+            parse_yaml(content)
         except SyntaxProblemError as error:
             raise EditError(f"line {error.line}: {error}; {error.fix}") from None
         self._root = yaml.compose(text, Loader=LOADER)
         self._newline = "\r\n" if "\r\n" in text else "\n"
+        uses = Counter(id(node) for node in _walk(self._root))
+        self._shared = {node for node, count in uses.items() if count > 1}
 
     # --- reading
 
@@ -95,6 +98,10 @@ class YamlText:
         text = self.text[begin : found.end].replace("\r\n", "\n")
         return text if found.is_flow else textwrap.dedent(" " * found.key.start_mark.column + text)
 
+    def list_lines(self, path: KeyPath) -> list[tuple[int, str]]:
+        """Return the keys of a mapping with their lines, counted from 1."""
+        return [(each.key.start_mark.line + 1, each.name) for each in self.entries(path)]
+
     # --- changes
 
     def set(self, path: KeyPath, value: str) -> YamlText:
@@ -102,38 +109,42 @@ class YamlText:
         found = self._find(path)
         if found is None:
             return self.add(path[:-1], f"{path[-1]}: {value}")
+        self._check_own(path)
         begin = found.value.start_mark.index
         if found.end <= found.colon or "\n" in self.text[found.colon : begin]:
             # no value yet, or a block
             return self._set_value(found, f" {value}")
         return self._replace(begin, found.end, value)
 
-    def add(self, path: KeyPath, entry: str, *, in_block: bool = False) -> YamlText:
+    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> YamlText:
         """Add an entry `key: value`, of one or more lines without indentation, to a mapping.
 
-        An empty mapping gets braces, or with `in_block` lines of its own; one that is absent is added.
+        It stands after the key `after`, else last. An empty mapping gets braces, or with `in_block` lines of its own;
+        one that is absent is added.
         """
         node: Any = self._root if not path else self._get(path)
         if path and not self.has(path):
             block = f"{path[-1]}:\n{textwrap.indent(entry, '  ')}"
             return self.add(path[:-1], block if in_block else f"{path[-1]}: {{{entry}}}", in_block=in_block)
+        self._check_own(path, is_whole=False)
         entries = self.entries(path)
         if not entries:
             return self._fill(path, entry, in_block)
-        last = entries[-1]
+        last = next((each for each in entries if each.name == after), entries[-1])
         if node.flow_style:
             if "\n" in entry:
                 raise EditError(f"{' '.join(path)} is written in braces; write it on lines of its own first")
             return self._replace(last.end, last.end, f", {entry}")
         indent = " " * entries[0].key.start_mark.column
         end = self._find_line_end(last.end)
-        return self._replace(end, end, self._newline + self._indent(entry, indent))
+        gap = self._newline if self._has_gaps(entries) else ""
+        return self._replace(end, end, self._newline + gap + self._indent(entry, indent))
 
     def _fill(self, path: KeyPath, entry: str, in_block: bool) -> YamlText:
         """Add the first entry of a mapping that is empty or has no value."""
         found = self._require(path)
         if in_block and not found.is_flow:
-            indent = " " * (found.key.start_mark.column + 2)
+            indent = " " * (found.key.start_mark.column + self._get_step())
             return self._set_value(found, self._newline + self._indent(entry, indent))
         return self._set_value(found, f" {{{entry}}}")
 
@@ -143,9 +154,22 @@ class YamlText:
             return self._replace(entry.colon, entry.end, value)
         return self._replace(entry.end, entry.end, f":{value}")
 
+    def insert_first(self, path: KeyPath, entry: str) -> YamlText:
+        """Add an entry on one line before the others of a mapping."""
+        entries = self.entries(path)
+        if not entries:
+            return self.add(path, entry)
+        self._check_own(path, is_whole=False)
+        first = entries[0]
+        at = first.key.start_mark.index
+        if first.is_flow:
+            return self._replace(at, at, f"{entry}, ")
+        return self._replace(at, at, entry + self._newline + " " * first.key.start_mark.column)
+
     def remove(self, path: KeyPath) -> YamlText:
         """Remove a key with its value, and the comment on the lines directly before it."""
         found = self._require(path)
+        self._check_own(path)
         entries = self.entries(path[:-1])
         if len(entries) == 1 and len(path) > 1:
             return self._empty(path[:-1], found)
@@ -156,6 +180,11 @@ class YamlText:
             return self._replace(entries[number - 1].end if number else found.key.start_mark.index, found.end, "")
         begin = self._find_comment_begin(found)
         end = self._find_next_line(found.end)
+        is_after_gap = begin == 0 or self.text[:begin].endswith(self._newline * 2)
+        if is_after_gap and self.text.startswith(self._newline, end):
+            end += len(self._newline)
+        elif end >= len(self.text) and is_after_gap:
+            begin = max(begin - len(self._newline), 0)
         return self._replace(begin, end, "")
 
     def _empty(self, path: KeyPath, last: TextEntry) -> YamlText:
@@ -167,11 +196,13 @@ class YamlText:
     def rename(self, path: KeyPath, key: str) -> YamlText:
         """Write another key, as YAML, in the place of one."""
         found = self._require(path)
+        self._check_own(path[:-1], is_whole=False)
         return self._replace(found.key.start_mark.index, found.key.end_mark.index, key)
 
     def replace_entry(self, path: KeyPath, entry: str) -> YamlText:
         """Write another entry, `key: value` of one or more lines without indentation, in the place of one."""
         found = self._require(path)
+        self._check_own(path)
         if found.is_flow and "\n" in entry.strip():
             raise EditError("this entry is written within braces; write it on one line")
         indent = "" if found.is_flow else " " * found.key.start_mark.column
@@ -203,6 +234,17 @@ class YamlText:
         if found is None:
             raise EditError(f"there is no {' '.join(path)} in the file")
         return found
+
+    def _check_own(self, path: KeyPath, is_whole: bool = True) -> None:
+        """Raise EditError if what a path leads to, or with `is_whole` a part of it, is shared by an alias."""
+        for length in range(1, len(path) + 1):
+            found = self._find(path[:length])
+            if found is not None and id(found.value) in self._shared:
+                line = found.value.start_mark.line + 1
+                raise EditError(f"{quote(path[length - 1])} is shared by an alias (line {line}); write it out first")
+        found = self._find(path)
+        if is_whole and found is not None and any(id(each) in self._shared for each in _walk(found.value)):
+            raise EditError(f"{quote(path[-1])} has a part that is shared by an alias; write it out first")
 
     def _list_entries(self, node: Any) -> Iterator[TextEntry]:
         if isinstance(node, yaml.MappingNode):
@@ -276,6 +318,33 @@ class YamlText:
             begin = previous
         return begin
 
+    def _has_gaps(self, entries: list[TextEntry]) -> bool:
+        """Return whether a blank line stands between the entries of a block, by its first two."""
+        if len(entries) < 2:
+            return False
+        return self._newline * 2 in self.text[entries[0].end : entries[1].line + 1]
+
+    def _get_step(self) -> int:
+        """Return by how much the file indents: as its first nested block does."""
+        for entry in self.entries():
+            for inner in self._list_entries(entry.value):
+                if not inner.is_flow:
+                    return int(inner.key.start_mark.column)
+        return 2
+
     def _indent(self, entry: str, indent: str) -> str:
         lines = [indent + line if line.strip() else "" for line in entry.splitlines()]
         return self._newline.join(lines)
+
+
+def _walk(node: Any) -> Iterator[Any]:
+    """Yield all nodes, one that several aliases name once for each."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield from _walk(key)
+            yield from _walk(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for each in node.value:
+            yield from _walk(each)
+    if node is not None:
+        yield node

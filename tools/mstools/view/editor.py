@@ -3,28 +3,38 @@
 All changes go through an `EditSession`. Callbacks of the page only queue an action, which the viewer executes between
 two pictures. `ItemFields` sets the numbers and texts of an item together: each number has a text field, so that what is
 typed stays as it is typed, and a number that was not changed in its field is as exact as it was given. `PlacePanel`
-computes a pose from a frame with which it coincides.
+computes a pose from a frame with which it coincides, or from distances to others.
 """
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
 import viser
 
 from modelserver.client.remote import Platform
-from modelserver.errors import ModelServerError, Problem, QueryError, Severity
+from modelserver.errors import ModelServerError, Problem, QueryError, Severity, quote
 from modelserver.formats.common import format_number, parse_number
 from modelserver.geometry import names
-from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType
+from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
-from modelserver.geometry.placement import Placement, PlacementError, place_constraint, place_frame
+from modelserver.geometry.placement import (
+    DistanceFit,
+    Placement,
+    PlacementError,
+    list_measured_points,
+    locate_by_distances,
+    place_constraint,
+    place_frame,
+)
 from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -32,10 +42,15 @@ from modelserver.transforms.so3 import Vector3
 from mstools.edit.document import SAME_RADIANS, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError
 from mstools.terminal.output import format_count
-from mstools.view.page import Actions, escape_markdown
+from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
+MAX_LABEL: Final = 60
+LOOK_PERIOD_S: Final = 2.0
+"""Period at which the file is compared with what was read, seconds."""
+
+MAX_DISTANCES: Final = 6
 NO_CHOICE: Final = "-"
 
 PRECISION: Final = 6
@@ -44,9 +59,16 @@ PRECISION: Final = 6
 SAME: Final = 10.0**-PRECISION
 """A drag by less has not moved, or turned, what is dragged."""
 
+_INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
+
+_MINUS: Final = str.maketrans(dict.fromkeys("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d", "-"))
+"""Minus signs and dashes that keyboards and other programs write."""
+
+_RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
+
 Change = Callable[[GeometryDocument], GeometryDocument]
-ChangeItem = Callable[..., bool]
-"""Makes a `Change` and selects an item, if one is given; returns whether it could be made."""
+ChangeItem = Callable[[Change, GeometryItem | None], bool]
+"""Makes a change and selects an item; returns whether it could be made."""
 
 
 @dataclass(frozen=True)
@@ -90,34 +112,41 @@ class Editor:
         self._editing = editing
         self._actions = actions
         self._show = show
-        self._shown = session.model
+        self._shown = session.drawn
         self._item = self._find_first(ItemKind.FRAME)
         self._executor = ThreadPoolExecutor(1, "reload")
         self._reloading: tuple[bool, Future[ReloadReply]] | None = None
+        self._next_look = 0.0
+        self._is_outdated = False
+        self._buttons: list[Any] = []
         self._status = gui.add_markdown("")
         self._message = gui.add_markdown("")
         self._undo = self._add_button("Undo", lambda: self._step(session.undo))
         self._redo = self._add_button("Redo", lambda: self._step(session.redo))
         self._save = self._add_button("Save ...", self._ask_save)
         self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
-        with gui.add_folder("Problems"):
+        self._add_button("Read the file again", self._ask_read)
+        self._problems = gui.add_folder("Problems")
+        with self._problems:
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
-        actions.on_update(self._kind, lambda: self.select(self._find_first(ItemKind(self._kind.value))))
+        actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
         actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
-        self._fields = ItemFields(server, session, self._item, self._change, actions)
+        self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
+            self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
             actions.on_update(self._gizmo, self.show_gizmo)
-        with gui.add_folder("Add, delete", expand_by_default=False):
+        with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
             self._add_button("Add body", lambda: self._add(ItemKind.BODY))
             self._add_button("Add frame to the body", lambda: self._add(ItemKind.FRAME))
             self._add_button("Add constraint", lambda: self._add(ItemKind.CONSTRAINT))
+            self._add_button("Duplicate", self._duplicate)
             self._add_button("Delete", self._delete)
-        with gui.add_folder("Frames that coincide", expand_by_default=False):
-            self._place = PlacePanel(gui, session, self._item, self._change, actions)
+        with gui.add_folder("Place by measurement", expand_by_default=False):
+            self._place = PlacePanel(gui, session, self._item, self._change_item, actions)
         with gui.add_folder("As text", expand_by_default=False):
             self._text: Any = gui.add_text("YAML", "", multiline=True)
             self._add_button("Write text", self._write_text)
@@ -158,6 +187,14 @@ class Editor:
         self._text.value = self._session.document.get_yaml(item)
         self.show_gizmo()
 
+    def _select_first(self, kind: ItemKind) -> None:
+        found = self._find_first(kind)
+        if found.kind is not kind:
+            self._report(f"there is no {kind} yet; add one below")
+            self._kind.value = self._item.kind
+        else:
+            self.select(found)
+
     def _find_first(self, kind: ItemKind) -> GeometryItem:
         """Return the first item of a kind, without one the first of all."""
         items = self._session.document.list_items()
@@ -165,32 +202,57 @@ class Editor:
 
     def _refresh(self) -> None:
         session = self._session
-        errors = sum(each.severity is Severity.ERROR for each in session.problems)
-        state = "not saved" if session.is_changed else "saved"
-        if errors:
-            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows the last model"
-        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
-        self._undo.disabled, self._redo.disabled = not session.can_undo, not session.can_redo
+        self._next_look = 0.0
+        self._show_status()
+        for button, name, change in (
+            (self._undo, "Undo", session.undo_name),
+            (self._redo, "Redo", session.redo_name),
+        ):
+            button.label = f"{name}: {change}"[:MAX_LABEL] if change else name
+            button.disabled = not change
         self._save.disabled = not session.is_changed or session.has_errors
         self._apply.disabled = session.is_changed
         self._show_problems()
         if self._item not in session.document.list_items():
             self._item = self._find_first(self._item.kind)
         self.select(self._item)
-        if session.model is not self._shown:
-            self._shown = session.model
+        if session.model is not None and session.model is not self._shown:
+            self._shown = session.drawn
             self._show(session.model)
 
+    def _show_status(self) -> None:
+        """Show whether there is something to save, and what is against it."""
+        session = self._session
+        errors = sum(each.severity is Severity.ERROR for each in session.problems)
+        state = "not saved" if session.is_changed else "saved"
+        if errors:
+            state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
+                "the last model" if session.model is not None else "the bodies, not joined"
+            )
+        if self._is_outdated:
+            state += ". **The file changed meanwhile on disk:** read it again before you go on"
+        self._status.content = f"**{escape_markdown(session.file.path.name)}**: {state}"
+
     def _show_problems(self) -> None:
+        for button in self._buttons:
+            button.remove()
+        self._buttons = []
         found = sorted(self._session.problems, key=lambda each: list(Severity).index(each.severity))
         shown = [each for each in found if each.severity is not Severity.NOTE][:SHOWN_PROBLEMS]
         notes = sum(each.severity is Severity.NOTE for each in found)
         more = len(found) - len(shown) - notes
         lines = [f"- {_describe_problem(each)}" for each in shown] + [f"- and {more} more"] * bool(more)
         text = "\n".join(lines) or "none"
-        self._problem_texts.content = text + (
-            f"\n\n{format_count(notes, 'note')}: modelserver check --notes" if notes else ""
-        )
+        if notes:
+            text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
+        self._problem_texts.content = text
+        with self._problems:
+            for number, problem in enumerate(shown, 1):
+                culprit = self._session.find_culprit(problem)
+                if culprit is not None:
+                    self._buttons.append(
+                        self._add_button(f"{number}: {culprit.name}", lambda item=culprit: self.select(item))  # type: ignore[misc]
+                    )
 
     def _report(self, text: str) -> None:
         self._message.content = escape_markdown(text) if text else ""
@@ -212,25 +274,29 @@ class Editor:
         self._do(action)
         self._refresh()
 
-    def _change(self, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change, after which `new` is selected; return whether it could be made."""
-        if not self._do(lambda: self._session.change(change)):
+    def _change(self, name: str, change: Change, new: GeometryItem | None = None) -> bool:
+        """Make a change, after which `new` is selected."""
+        if not self._do(lambda: self._session.change(name, change)):
             return False
         if new is not None:
             self._item = new
         self._refresh()
         return True
 
+    def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
+        """Make a change of what is selected; return whether it could be made."""
+        return self._change(f"edit {self._item.name}", change, new)
+
     def _add(self, kind: ItemKind) -> None:
         name = self._new.value.strip()
         item = self._item
         frames = list_frames(self._session.document)
         if kind is ItemKind.BODY:
-            self._change(lambda document: document.add_body(name), GeometryItem(kind, name))
+            self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
         elif kind is ItemKind.FRAME:
             body = item.name.partition(":")[0] if item.kind is not ItemKind.CONSTRAINT else frames[0].partition(":")[0]
             new = GeometryItem(kind, names.join(body, name))
-            self._change(lambda document: document.add_frame(body, name), new)
+            self._change(f"add {new.name}", lambda document: document.add_frame(body, name), new)
         else:
             from_ = item.name if item.kind is ItemKind.FRAME else frames[0]
             others = [each for each in frames if each.partition(":")[0] != from_.partition(":")[0]]
@@ -238,15 +304,25 @@ class Editor:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
             to = others[-1]
-            self._change(lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name))
+            self._change(
+                f"add {name}", lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name)
+            )
+
+    def _duplicate(self) -> None:
+        item = self._item
+        plain = item.name.rpartition(":")[2]
+        name = self._new.value.strip() or _find_free_name(self._session.document, item)
+        new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
+        self._change(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
 
     def _delete(self) -> None:
         item = self._item
-        self._change(lambda document: document.delete(item))
+        in_template = self._fields.in_template
+        self._change(f"delete {item.name}", lambda document: document.delete(item, in_template))
 
     def _write_text(self) -> None:
         item, text = self._item, self._text.value
-        self._change(lambda document: document.set_yaml(item, text))
+        self._change(f"write {item.name}", lambda document: document.set_yaml(item, text))
 
     # --- gizmo
 
@@ -261,7 +337,7 @@ class Editor:
 
     def _drag(self, pose: Pose, is_end: bool) -> None:
         """Follow the gizmo: the fields while it moves, a change when it is released. Called in the page's thread."""
-        self._actions.put(lambda: self._fields.set_dragged(pose, is_end))
+        self._actions.put(lambda: self._fields.set_dragged(pose, Snap(self._snap.value), is_end))
 
     # --- saving and applying
 
@@ -274,13 +350,23 @@ class Editor:
         text = f"{fence}diff\n{diff}\n{fence}"
         self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
 
+    def _ask_read(self) -> None:
+        """Read the file again, after a question if changes would be lost."""
+        if not self._session.is_changed:
+            self._step(self._session.read)
+            return
+        text = "The changes that are not saved are dropped."
+        self._ask("Read the file again", text, "Drop them", lambda: self._step(self._session.read))
+
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
             # in another tab
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
         elif self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
+        message = self._message.content
         self._refresh()
+        self._message.content = message
 
     def _start_reload(self, dry_run: bool) -> None:
         """Ask the service what a reload would change, or reload."""
@@ -288,8 +374,13 @@ class Editor:
             self._report("asking the service ...")
             self._reloading = dry_run, self._executor.submit(self._editing.reload, dry_run)
 
-    def update(self) -> None:
-        """Show the reply of the service, once it is there."""
+    def update(self, now: float) -> None:
+        """Show the reply of the service, once it is there, and that the file has changed on disk."""
+        if now >= self._next_look:
+            self._next_look = now + LOOK_PERIOD_S
+            if self._session.has_changed_on_disk() != self._is_outdated:
+                self._is_outdated = not self._is_outdated
+                self._show_status()
         if self._reloading is None or not self._reloading[1].done():
             return
         (dry_run, future), self._reloading = self._reloading, None
@@ -301,7 +392,7 @@ class Editor:
         if not dry_run:
             self._report(f"applied: the service has geometry revision {reply.revision}")
             return
-        own = self._session.model.revision
+        own = self._session.model.revision if self._session.model is not None else ""
         if reply.revision != own:
             self._report(
                 f"not applied: the service reads another geometry (revision {reply.revision}, this file {own}); "
@@ -324,13 +415,24 @@ def _describe_problem(problem: Problem) -> str:
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
 
 
+def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
+    """Return a name for a copy of an item: its own with the first free number."""
+    taken = {each.name for each in document.list_items() if each.kind is item.kind}
+    plain = item.name.rpartition(":")[2]
+    numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
+    return next(name for name in numbers if item.name.removesuffix(plain) + name not in taken)
+
+
 # --- fields of an item ---------------------------------------------------------------------------------------
 
 
 def parse_typed(label: str, text: str) -> float:
-    """Return the number that was typed. Raises EditError."""
+    """Return the number that was typed: with a sign, an exponent, a decimal comma. Raises EditError."""
+    plain = text.strip().translate(_MINUS)
+    if plain.count(",") == 1 and "." not in plain:
+        plain = plain.replace(",", ".")
     try:
-        return parse_number(text.strip())
+        return parse_number(plain)
     except ValueError as error:
         raise EditError(f"{label}: {error}") from None
 
@@ -340,14 +442,17 @@ def _format_field(value: float) -> str:
 
 
 class NumberFields:
-    """Fields of numbers with a label each."""
+    """Fields of numbers with a label each. What is no number is marked in red, and stays."""
 
-    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float]):
+    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float], actions: Actions):
         self._labels = tuple(labels)
         self._given = tuple(map(float, values))
         self._texts: list[Any] = [
             gui.add_text(label, _format_field(value)) for label, value in zip(labels, values, strict=True)
         ]
+        self._problem: Any = gui.add_html("")
+        for each in self._texts:
+            actions.on_update(each, self.mark)
 
     @property
     def value(self) -> tuple[float, ...]:
@@ -374,15 +479,39 @@ class NumberFields:
     def texts(self, words: Sequence[str]) -> None:
         for each, word in zip(self._texts, words, strict=True):
             each.value = word
+        self.mark()
+
+    def mark(self) -> None:
+        """Show why the numbers cannot be read, if so."""
+        problem = ""
+        try:
+            _ = self.value
+        except EditError as error:
+            problem = _RED.format(html.escape(str(error)))
+        self._problem.content = problem
+
+
+class Snap(StrEnum):
+    """Steps to which the gizmo rounds."""
+
+    NONE = "none"
+    FINE = "1 mm, 1 deg"
+    MEDIUM = "1 cm, 5 deg"
+    COARSE = "5 cm, 15 deg"
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Meters and degrees; without snap what a hand can place."""
+        return {Snap.NONE: (1e-4, 0.01), Snap.FINE: (1e-3, 1.0), Snap.MEDIUM: (0.01, 5.0)}.get(self, (0.05, 15.0))
 
 
 def list_frames(document: GeometryDocument) -> list[str]:
     return [each.name for each in document.list_items() if each.kind is ItemKind.FRAME]
 
 
-def find_part(model: Model, item: GeometryItem) -> BodyFrame | Constraint | None:
+def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint | None:
     """Return the frame or constraint of a model that an item is; None for a body, and for one that is not there."""
-    if item.kind is ItemKind.BODY:
+    if model is None or item.kind is ItemKind.BODY:
         return None
     if item.kind is ItemKind.CONSTRAINT:
         return next((each for each in model.constraints if each.name == item.name), None)
@@ -408,14 +537,15 @@ class ItemFields:
         self._part: BodyFrame | Constraint | None = None
         self._fields: dict[str, Any] = {}
         self._given: dict[str, Any] = {}
+        self._exact: dict[str, tuple[float, ...]] = {}
         self._place = gui.add_folder("Values")
 
     # --- what is shown
 
     def show(self, item: GeometryItem) -> None:
         self._item = item
-        self._fields, self._given = {}, {}
-        self._part = find_part(self._session.model, item)
+        self._fields, self._given, self._exact = {}, {}, {}
+        self._part = find_part(self._session.drawn, item)
         old = self._form
         with self._server.atomic():
             with self._place:
@@ -428,7 +558,13 @@ class ItemFields:
         self._form.on_submit(lambda _: self._actions.put(self.set))
 
     def _add_fields(self, item: GeometryItem) -> None:
+        document = self._session.document
         self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
+        template = document.find_template(item)
+        if template:
+            users = ", ".join(document.list_users(template))
+            hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
+            self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
         if isinstance(self._part, Constraint):
             self._add_ends(self._part)
         if self._part is not None:
@@ -441,14 +577,14 @@ class ItemFields:
     def _get_description(self, item: GeometryItem) -> str:
         if self._part is not None:
             return self._part.description
-        bodies = {each.name: each for each in self._session.model.bodies}
+        bodies = {each.name: each for each in self._session.drawn.bodies}
         return bodies[item.name].description if item.name in bodies else ""
 
     def _add(self, key: str, field: Any) -> None:
         self._fields[key], self._given[key] = field, field.value
 
     def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
-        self._fields[key] = NumberFields(self._gui, labels, values)
+        self._fields[key] = NumberFields(self._gui, labels, values, self._actions)
 
     def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
         degrees = [math.degrees(each) for each in pose.rpy]
@@ -474,7 +610,36 @@ class ItemFields:
             return
         if joint.type in TYPES_WITH_AXIS:
             self._add_vector("axis", [f"axis {axis}" for axis in "xyz"], joint.axis)
-        gui.add_markdown("Limits and more of a joint: under *As text*.")
+        if joint.count > 1:
+            gui.add_markdown("Limits and more of a joint with several coordinates: under *As text*.")
+            return
+        unit = "deg" if joint.type is JointType.REVOLUTE else "m"
+        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        limits: tuple[float, ...] = ()
+        if joint.lower or joint.upper:
+            limits = (joint.lower or (-math.inf,)) + (joint.upper or (math.inf,))
+        for key, label, values in (
+            ("limits", f"limits ({unit})", limits),
+            ("rate_limit", f"rate limit ({unit}/s)", joint.rate_limit),
+            ("default", f"default ({unit})", joint.default),
+            ("sigma", f"joint sigma ({unit})", joint.sigma),
+        ):
+            self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
+            self._exact[key] = values
+        others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
+        leaders = (NO_CHOICE, *(each for each in others if each != self._item.name))
+        mimic = joint.mimic
+        leader = mimic.joint if mimic is not None and mimic.joint in leaders else NO_CHOICE
+        self._add("leader", gui.add_dropdown("follows", leaders, initial_value=leader))
+        known = mimic or Mimic("")
+        self._add("multiplier", gui.add_text("multiplier", format_number(known.multiplier)))
+        self._add("offset", gui.add_text(f"offset ({unit})", _format_values([known.offset], scale)))
+        self._exact |= {"multiplier": (known.multiplier,), "offset": (known.offset,)}
+
+    @property
+    def in_template(self) -> bool:
+        """Whether all bodies of the template are to change."""
+        return "template" in self._fields and bool(self._fields["template"].value)
 
     # --- what is set
 
@@ -484,7 +649,7 @@ class ItemFields:
 
     def _is_typed(self) -> bool:
         try:
-            return any(self._differs(key) for key in self._fields)
+            return any(self._differs(key) for key in self._fields if key != "template")
         except EditError:
             return True
 
@@ -497,24 +662,25 @@ class ItemFields:
         return self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
 
     def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
+        in_template = self.in_template
         if self._is_changed("xyz", "rpy"):
             xyz, rpy = (so3.to_vector3(self._fields[key].value) for key in ("xyz", "rpy"))
-            document = document.set_pose(item, xyz, rpy)
+            document = document.set_pose(item, xyz, rpy, in_template)
         if self._is_changed("has_sigma", "sigma_xyz", "sigma_rpy"):
             # numbers that are typed are meant, whatever the checkbox has
             is_stated = self._fields["has_sigma"].value or self._is_changed("sigma_xyz", "sigma_rpy")
             fields = (self._fields["sigma_xyz"], self._fields["sigma_rpy"])
             stated = [so3.to_vector3(each.value) if is_stated else None for each in fields]
-            document = document.set_sigma(item, stated[0], stated[1])
+            document = document.set_sigma(item, stated[0], stated[1], in_template)
         if self._is_changed("description"):
-            document = document.set_description(item, self._fields["description"].value.strip())
+            document = document.set_description(item, self._fields["description"].value.strip(), in_template)
         if isinstance(self._part, Constraint):
             if self._is_changed("from", "to"):
                 document = document.set_ends(item.name, self._fields["from"].value, self._fields["to"].value)
             joint = self._read_joint(self._part.joint)
             if joint != self._part.joint:
                 document = document.set_joint(item.name, self._part.joint, joint)
-        return document.rename(item, name) if name else document
+        return document.rename(item, name, in_template) if name else document
 
     def _is_changed(self, *keys: str) -> bool:
         """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
@@ -528,50 +694,92 @@ class ItemFields:
         return field.is_changed if isinstance(field, NumberFields) else bool(field.value != self._given[key])
 
     def _read_joint(self, old: Joint) -> Joint:
-        if not any(key in self._fields and self._differs(key) for key in ("joint", "axis")):
+        keys = ("joint", "axis", "limits", "rate_limit", "default", "sigma", "leader", "multiplier", "offset")
+        if not any(key in self._fields and self._differs(key) for key in keys):
             return old
         kind = JointType(self._fields["joint"].value)
         axis = so3.to_vector3(self._fields["axis"].value) if "axis" in self._fields else (0.0, 0.0, 1.0)
-        if kind is JointType.FIXED:
-            return Joint()
         try:
-            # the numbers of another type had other units
-            return replace(old, axis=axis) if kind is old.type else Joint(kind, axis)
+            if kind is JointType.FIXED:
+                return Joint()
+            if kind is not old.type:
+                # its numbers had other units
+                return Joint(kind, axis)
+            if "limits" not in self._fields:
+                return replace(old, axis=axis)
+            is_angle = kind is JointType.REVOLUTE
+            limits = self._read_values("limits", 2, is_angle)
+            if limits and limits[0] > limits[1]:
+                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
+            mimic = None
+            if self._fields["leader"].value != NO_CHOICE:
+                (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)
+                (offset,) = self._read_values("offset", 1, is_angle) or (0.0,)
+                mimic = Mimic(self._fields["leader"].value, multiplier, offset)
+            return Joint(
+                kind,
+                axis,
+                limits[:1],
+                limits[1:],
+                self._read_values("rate_limit", 1, is_angle),
+                self._read_values("default", 1, is_angle) if mimic is None else (),
+                self._read_values("sigma", 1, is_angle),
+                mimic,
+            )
         except ValueError as error:
             raise EditError(str(error)) from None
+
+    def _read_values(self, key: str, count: int, is_angle: bool) -> tuple[float, ...]:
+        """Return the numbers in a text, none for an empty one, radians and meters."""
+        if not self._differs(key):
+            return self._exact[key]
+        text = self._fields[key].value.strip()
+        if not text:
+            return ()
+        label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
+        if len(parts) != count:
+            what = "two numbers, lower and upper" if count == 2 else "one number"
+            raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
+        numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
+        return tuple([math.radians(each) if is_angle else each for each in numbers])
 
     # --- gizmo
 
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
-        model, part = self._session.model, self._part
+        model, part = self._session.drawn, self._part
         if part is None:
             return None
         if isinstance(part, BodyFrame):
             return names.split(self._item.name)[0], Pose.identity(), part.pose
         return names.split(part.from_)[0], model.frame(part.from_).pose, part.pose
 
-    def set_dragged(self, pose: Pose, is_end: bool) -> None:
-        """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact.
-
-        It is rounded to what a hand can place: 0.1 mm and 0.01 degrees.
-        """
+    def set_dragged(self, pose: Pose, snap: Snap, is_end: bool) -> None:
+        """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
         if self._part is None:
             return
+        meters, degrees = snap.steps
         moved, turned = self._part.pose.distance(pose)
         if moved > SAME:
-            self._fields["xyz"].value = tuple([round(each, 4) for each in pose.xyz])
+            self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])
         if turned > SAME:
-            self._fields["rpy"].value = tuple([round(math.degrees(each), 2) for each in so3.to_rpy(pose.wxyz)])
+            rpy = [math.degrees(each) for each in so3.to_rpy(pose.wxyz)]
+            self._fields["rpy"].value = tuple([round(round(each / degrees) * degrees, PRECISION) for each in rpy])
         if is_end:
             self.set()
+
+
+def _format_values(values: Sequence[float], scale: float) -> str:
+    """Return numbers as a text, angles in degrees."""
+    known = {math.inf: ".inf", -math.inf: "-.inf"}
+    return ", ".join(known.get(each) or format_number(round(each * scale, 9) + 0.0) for each in values)
 
 
 # --- placing -------------------------------------------------------------------------------------------------
 
 
 class PlacePanel:
-    """Place what is selected where frames coincide."""
+    """Two folders: frames that coincide, and distances."""
 
     def __init__(
         self, gui: viser.GuiApi, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
@@ -579,45 +787,82 @@ class PlacePanel:
         self._session = session
         self._change = change
         self._item = item
-        gui.add_markdown(
-            "Moves a frame on its body to where another one is, or a constraint so that two frames, one on each side, "
-            "are the same place."
-        )
-        self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
-        self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
-        actions.add_button(gui, "Place there", self._place)
+        with gui.add_folder("Frames that coincide"):
+            self._hint = gui.add_markdown("")
+            self._frame: Any = gui.add_dropdown("Frame", (NO_CHOICE,))
+            self._target: Any = gui.add_dropdown("is at", (NO_CHOICE,))
+            self._position_only: Any = gui.add_checkbox("Position only", False)
+            actions.add_button(gui, "Place there", lambda: self._place(self._coincide))
+        with gui.add_folder("Distances from frames"):
+            self._rows: list[tuple[Any, NumberFields]] = []
+            for number in range(1, MAX_DISTANCES + 1):
+                frame = gui.add_dropdown(f"From {number}", (NO_CHOICE,))
+                self._rows.append((frame, NumberFields(gui, (f"distance {number} (m)",), (0.0,), actions)))
+            self._sigma = NumberFields(gui, ("sigma (m)",), (0.002,), actions)
+            self._mirrored: Any = gui.add_checkbox("On the other side", False, hint="Three distances fit two positions")
+            actions.add_button(gui, "Place by distances", lambda: self._place(self._measure))
+            self._result = gui.add_markdown("")
 
     def show(self, item: GeometryItem) -> None:
         """Offer the frames for an item."""
+        if item != self._item:
+            self._result.content = ""
         self._item = item
         frames = (NO_CHOICE, *list_frames(self._session.document))
-        self._frame.visible = item.kind is ItemKind.CONSTRAINT
-        for dropdown in (self._frame, self._target):
+        is_constraint = item.kind is ItemKind.CONSTRAINT
+        self._frame.visible = is_constraint
+        self._hint.content = {
+            ItemKind.CONSTRAINT: "Moves the constraint so that two frames, one on each side, are the same place.",
+            ItemKind.FRAME: "Moves the frame on its body to where another frame is.",
+        }.get(item.kind, "Select a frame or a constraint.")
+        for dropdown in (self._frame, self._target, *(frame for frame, _ in self._rows)):
             # a frame that is not among them gives way to the first
             dropdown.options = frames
 
-    def _place(self) -> None:
+    def _place(self, compute: Callable[[Model, GeometryItem], tuple[Placement, Pose]]) -> None:
+        """Place the item where a function of the model computes it; that returns its old pose too."""
         item = self._item
 
         def change(document: GeometryDocument) -> GeometryDocument:
-            if self._session.has_errors:
+            model = self._session.model
+            if model is None or self._session.has_errors:
                 raise EditError("fix the errors first; a pose is computed from a geometry without any")
-            return _write_placement(document, item, *self._coincide(self._session.model, item))
+            return _write_placement(document, item, *compute(model, item))
 
-        self._change(change)
+        self._change(change, None)
 
     def _coincide(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
-        target = self._target.value
+        target, position_only = self._target.value, self._position_only.value
         if target == NO_CHOICE:
             raise EditError("choose the frame with which it coincides")
         part = find_part(model, item)
         if part is None:
             raise EditError("select a frame or a constraint")
         if item.kind is ItemKind.FRAME:
-            return place_frame(model, item.name, target), part.pose
+            return place_frame(model, item.name, target, position_only), part.pose
         if self._frame.value == NO_CHOICE:
             raise EditError("choose the two frames that coincide")
-        return place_constraint(model, item.name, self._frame.value, target), part.pose
+        return place_constraint(model, item.name, self._frame.value, target, position_only), part.pose
+
+    def _measure(self, model: Model, item: GeometryItem) -> tuple[Placement, Pose]:
+        """Place a frame by its distances from others."""
+        if item.kind is not ItemKind.FRAME:
+            raise EditError("select the frame to which the distances were measured")
+        given = [(frame.value, distance.value[0]) for frame, distance in self._rows if frame.value != NO_CHOICE]
+        points, P = list_measured_points(model, item.name, [name for name, _ in given])
+        distances = np.array([distance for _, distance in given], float)
+        (sigma_m,) = self._sigma.value
+        sigmas = np.full(len(given), sigma_m)
+        frame = model.frame(item.name)
+        fit = locate_by_distances(points, distances, sigmas, frame.pose.xyz, P)
+        if self._mirrored.value:
+            if fit.mirrored is None:
+                raise EditError("the distances fit on one side only")
+            fit = locate_by_distances(points, distances, sigmas, fit.mirrored, P)
+        self._result.content = _describe_fit(fit, [name for name, _ in given], sigma_m)
+        rotation = (frame.sigma or Sigma()).rotation
+        sigma = Sigma(so3.to_vector3(np.sqrt(np.diag(fit.covariance))), rotation)
+        return Placement(Pose(fit.position, frame.pose.wxyz), sigma), frame.pose
 
 
 def _write_placement(document: GeometryDocument, item: GeometryItem, found: Placement, old: Pose) -> GeometryDocument:
@@ -632,3 +877,17 @@ def _write_placement(document: GeometryDocument, item: GeometryItem, found: Plac
 
 def _round(values: Any) -> Vector3:
     return so3.to_vector3(round(float(each), PRECISION) + 0.0 for each in values)
+
+
+def _describe_fit(fit: DistanceFit, frames: list[str], sigma: float) -> str:
+    deviations = np.sqrt(np.diag(fit.covariance)).tolist()
+    rows = [
+        (frame, f"{1000.0 * residual:+.1f} mm", "too large" if abs(residual) > 3.0 * sigma else "")
+        for frame, residual in zip(frames, fit.residuals.tolist(), strict=True)
+    ]
+    parts = [format_table(("from", "residual", ""), rows)]
+    parts.append("Sigma x, y, z: " + ", ".join(f"{1000.0 * each:.1f} mm" for each in deviations))
+    if fit.mirrored is not None:
+        place = ", ".join(f"{each:.4f}" for each in fit.mirrored)
+        parts.append(escape_markdown(f"They fit at {place} m too, on the other side of the plane of the frames."))
+    return "\n\n".join(parts)

@@ -59,8 +59,8 @@ COLOR_OF_FIX: Final[Mapping[FixColor, Rgb]] = {
 }
 _PALETTE: Final = np.array([COLOR_OF_FIX[each] for each in FIX_COLORS], np.uint8)
 
-CHI_SQUARE_3: Final = 7.815
-"""95 % quantile of chi-square with three degrees of freedom (NIST e-Handbook, 1.3.6.7.4)."""
+CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
+"""Quantiles of chi-square with three degrees of freedom by confidence in percent (NIST e-Handbook, 1.3.6.7.4)."""
 
 GRID_LABELS: Final = 1
 """Labeled grid crossings on each side of the vehicle, at `LABEL_SPACING`."""
@@ -356,8 +356,8 @@ class VehicleScene:
             self._fixes.points = points[-MAX_FIXES:].astype(np.float32)
             self._fixes.colors = _PALETTE[colors[-MAX_FIXES:]].reshape(-1, 3)
 
-    def show_uncertainty(self, picture: Picture, is_shown: bool) -> None:
-        """Draw the 95 % ellipsoid of the position, and the protection levels of position and heading."""
+    def show_uncertainty(self, picture: Picture, confidence: int, is_shown: bool) -> None:
+        """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
         pose, color = picture.pose, INVALID_COLOR if picture.invalid else VALID_COLOR
         radius, heading = picture.horizontal_protection_level, picture.heading_protection_level
         self._ellipsoid.visible = is_shown and picture.covariance is not None and pose is not None
@@ -365,7 +365,7 @@ class VehicleScene:
         if pose is None or not is_shown:
             return
         if picture.covariance is not None:
-            self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3)
+            self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
             self._ellipsoid.position, self._ellipsoid.wxyz, self._ellipsoid.color = pose.xyz, axes.wxyz, color
         if self._level.visible:
             self._level.position, self._circle.scale = pose.xyz, round(radius, 2)

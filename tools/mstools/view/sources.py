@@ -94,13 +94,13 @@ def list_coordinates(model: Model) -> list[tuple[str, Joint, int]]:
 
 
 def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession | None = None) -> Source:
-    """Open a geometry file, or that of a vehicle file.
+    """Open a geometry file, or that of a vehicle file; one that is edited may have errors.
 
     Raises GeometryError, ConfigError, OSError.
     """
     file = EditedFile.open(path)
     geometry, base_frame = file.path, file.config.base_frame if file.config is not None else ""
-    model = load_given_model(geometry, variables) if session is None else session.model
+    model = load_given_model(geometry, variables) if session is None else session.drawn
     drive = Drive(keep_geometry=True)
     answers = FilePlatform(model, next(frame.full_name for body in model.bodies for frame in body), f"in {path}")
     source = Source(f"{model.name or path.name}", drive, answers, geometry.resolve().parent)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shlex
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -18,14 +20,14 @@ from modelserver.errors import ModelServerError, QueryError
 from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
-from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, Quality
+from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
 from modelserver.transforms.so3 import Array
 from mstools.edit.document import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.terminal.health_text import format_body, format_duration
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
-from mstools.view.scene import NameLabels, VehicleScene
+from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
 from mstools.view.sources import Source, list_coordinates
 
 WORLDS: Final = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
@@ -38,6 +40,12 @@ SHOWN_STATES: Final = 40
 POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 TRAILS: Final = {"10 s": 10.0, "60 s": 60.0, "10 min": 600.0, "all": math.inf}
 """Lengths of the trail, seconds."""
+
+NO_STATE: Final = "-"
+VALUE_COLOR: Final = "#228be6"
+SIGMA_COLOR: Final = "#9ab8d4"
+RATE_PERIOD_US: Final = 3_000_000
+"""Rates of sensors are means over this time: a report alone may be of a tenth of a second."""
 
 PICTURE_S: Final = 1.0 / 30.0
 """Period of pictures, seconds."""
@@ -62,7 +70,8 @@ class Viewer:
         gui = page.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
-        gui.set_panel_label(f"ModelServer: {source.title}")
+        self._title = ""
+        self._show_title("")
         self._scene = VehicleScene(page.server, source.folder, self._pick)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Query"):
@@ -118,7 +127,7 @@ class Viewer:
         while not self._actions.empty():
             self._execute(self._actions.get())
         if self._editor is not None:
-            self._editor.update()
+            self._editor.update(now)
         source, display = self._source, self._display
         with source.lock:
             drive = source.drive
@@ -127,13 +136,13 @@ class Viewer:
                 self._time.advance(drive, seconds)
                 utime = self._time.utime
             picture = drive.get_picture(utime)
-            utimes, track = drive.get_track(picture.utime, TRAILS[display.trail.value])
+            utimes, track = drive.get_track(picture.utime, display.trail_s)
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
             origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
             if model is not None and model is not self._model:
                 self._set_model(model, base_frame)
-            if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
+            if (named := (display.labels, self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
             self._scene.show(picture, display.follow.value)
@@ -141,7 +150,7 @@ class Viewer:
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
                 self._scene.show_fixes(*fixes)
-            self._scene.show_uncertainty(picture, display.uncertainty.value)
+            self._scene.show_uncertainty(picture, display.confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
         if now >= self._next_slider and self._time is not None:
             self._next_slider = now + SLIDER_PERIOD_S
@@ -151,8 +160,16 @@ class Viewer:
             clock = time.time_ns() // 1000 if source.is_live else 0
             with source.lock:
                 self._state.show(drive, picture, utime, clock)
+                is_silent = source.is_live and bool(drive.find_silence(clock))
+            self._show_title("no message" if is_silent else "")
         if self._query.update(utime, now, picture.utime):
             self._scene.highlight_path(self._query.path)
+
+    def _show_title(self, note: str) -> None:
+        title = f"ModelServer: {self._source.title}{f' - {note}' if note else ''}"
+        if title != self._title:
+            self._title = title
+            self._server.gui.set_panel_label(title)
 
     def _set_model(self, model: Model, base_frame: str) -> None:
         size = self._scene.set_model(model, base_frame)
@@ -182,7 +199,7 @@ class QueryPanel:
     def __init__(self, gui: viser.GuiApi, source: Source):
         self._source = source
         self._executor = ThreadPoolExecutor(1, "query")
-        self._running: Future[tuple[str, tuple[str, ...]]] | None = None
+        self._running: Future[tuple[str, str, tuple[str, ...]]] | None = None
         self._last_query: tuple[object, ...] = ()
         self._queried_at = -math.inf
         self.path: tuple[str, ...] = ()
@@ -193,6 +210,8 @@ class QueryPanel:
         exchange = gui.add_button("Exchange")
         exchange.on_click(lambda _: self.set_frames(self._reference.value, self._interest.value))
         self._answer = gui.add_markdown("")
+        with gui.add_folder("Copy", expand_by_default=False):
+            self._code = gui.add_markdown("")
 
     def set_model(self, model: Model, base_frame: str) -> None:
         """Offer the frames of a model."""
@@ -221,8 +240,9 @@ class QueryPanel:
         if self._running is not None:
             if not self._running.done():
                 return False
-            self._answer.content, self.path = self._running.result()
+            text, code, self.path = self._running.result()
             self._running = None
+            self._answer.content, self._code.content = text, code
             return True
         query = (self._interest.value, self._reference.value, utime, state)
         if query == self._last_query or now - self._queried_at < QUERY_PERIOD_S or not self._interest.value:
@@ -231,14 +251,15 @@ class QueryPanel:
         self._running = self._executor.submit(self._run_query, self._interest.value, self._reference.value, utime)
         return False
 
-    def _run_query(self, interest: str, reference: str, utime: int) -> tuple[str, tuple[str, ...]]:
-        """Return the answer, and the frames of the path."""
+    def _run_query(self, interest: str, reference: str, utime: int) -> tuple[str, str, tuple[str, ...]]:
+        """Return the answer, the code of the query, and the frames of the path."""
         answers = self._source.answers
+        code = format_code(interest, reference, utime, None)
         try:
             explanation = answers.explain(interest, reference, at=utime, policy=Policy.INTERPOLATED)
         except (ModelServerError, OSError) as error:
             near = f" Nearest: {', '.join(error.nearest)}" if isinstance(error, QueryError) and error.nearest else ""
-            return f"**No answer:** {escape_markdown(str(error))}.{escape_markdown(near)}", ()
+            return f"**No answer:** {escape_markdown(str(error))}.{escape_markdown(near)}", code, ()
         motion = None
         try:
             if self._source.set_joints is None:
@@ -249,7 +270,8 @@ class QueryPanel:
         frames = [reference]
         for edge in explanation.edges:
             frames += edge.ends if edge.forward else edge.ends[::-1]
-        return describe_answer(explanation, motion), (*frames, interest)
+        text = describe_answer(explanation, motion)
+        return text, format_code(interest, reference, utime, explanation.answer), (*frames, interest)
 
     def close(self) -> None:
         self._executor.shutdown(wait=False, cancel_futures=True)
@@ -311,6 +333,38 @@ def _list_sigmas(covariance: Array) -> list[float]:
 
 def _format_known(value: float, unit: str = "") -> str:
     return "-" if math.isnan(value) else f"{value:.1f}{unit}"
+
+
+def format_code(interest: str, reference: str, utime: int, answer: PoseAnswer | None) -> str:
+    """Return the query in Python and for the command line, and the answer in YAML, as code blocks."""
+    at = f", at={utime}" if utime else ""
+    blocks = [
+        ("python", f"platform.get_pose({_quote(interest)}, {_quote(reference)}{at})"),
+        (
+            "shell",
+            f"modelserver query {_quote_shell(interest)} {_quote_shell(reference)}{f' --at {utime}' if utime else ''}",
+        ),
+    ]
+    if answer is not None:
+        found = answer.transformation
+        xyz, rpy = (
+            ", ".join(f"{value + 0.0:.6g}" for value in each) for each in (found.pose.xyz, map(math.degrees, found.rpy))
+        )
+        lines = [f"xyz: [{xyz}]", f"rpy_deg: [{rpy}]"]
+        if found.covariance is not None:
+            sigmas = _list_sigmas(found.covariance)
+            meters, degrees = (", ".join(f"{each:.4g}" for each in part) for part in (sigmas[:3], sigmas[3:]))
+            lines.append(f"sigma: {{xyz: [{meters}], rpy_deg: [{degrees}]}}")
+        blocks.append(("yaml", "\n".join(lines)))
+    return "\n\n".join(f"```{language}\n{text}\n```" for language, text in blocks)
+
+
+def _quote(name: str) -> str:
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _quote_shell(name: str) -> str:
+    return f"'{name}'" if "'" not in name else shlex.quote(name)
 
 
 class TimePanel:
@@ -424,7 +478,33 @@ class StatePanel:
         with gui.add_folder("Findings"):
             self._findings = gui.add_markdown("")
         with gui.add_folder("Filter", expand_by_default=False):
+            self._state: Any = gui.add_dropdown(
+                "State", (NO_STATE,), hint="Its last minute, with one sigma to each side"
+            )
+            self._course = gui.add_uplot(
+                (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
+                (
+                    {"label": "s"},
+                    {"label": "value", "stroke": VALUE_COLOR, "width": 2},
+                    {"label": "+ sigma", "stroke": SIGMA_COLOR},
+                    {"label": "- sigma", "stroke": SIGMA_COLOR},
+                ),
+                scales={"x": {"time": False}},
+                legend={"show": False},
+                height=180,
+                visible=False,
+            )
             self._states = gui.add_markdown("")
+
+    def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
+        options = (NO_STATE, *states)
+        if self._state.options != options:
+            # a state that is not among them gives way to the first
+            self._state.options = options
+        self._course.visible = self._state.value != NO_STATE
+        if self._course.visible:
+            times, values, sigmas = drive.get_state_course(self._state.value, utime)
+            self._course.data = (times, values, values + sigmas, values - sigmas)
 
     def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
         """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
@@ -438,7 +518,8 @@ class StatePanel:
             rows = [(line[:9].strip(), line[9:].strip()) for line in format_body(health).splitlines()]
             text += f"\n\n{format_table(('', ''), rows)}"
         self._validity.content = text
-        parts = [] if health is None else [_format_sensors(health)]
+        earlier = drive.get_report("MODELSERVER_HEALTH", health.utime - RATE_PERIOD_US) if health is not None else None
+        parts = [] if health is None else [_format_sensors(health, earlier)]
         self._channels.content = "\n\n".join([*parts, _format_channels(drive, now)])
         findings = [(subject, text) for subject, text in health.warnings] if health is not None else []
         rejected = [(what, f"{reason}: {count}") for what, reason, count in health.rejected] if health else []
@@ -448,18 +529,25 @@ class StatePanel:
         self._findings.content = "\n\n".join(parts)
         navigation = drive.get_report("LOCALIZATION_STATE", utime)
         self._states.content = "no state published" if navigation is None else _format_states(navigation)
+        self._show_course(drive, utime, navigation.names if navigation is not None else ())
 
 
-def _format_sensors(health: Health) -> str:
+def _format_sensors(health: Health, earlier: Health | None) -> str:
+    """Format the sensors of a report, with rates since an earlier one, as of the report alone where there is none."""
+    before = {each.channel: each.count for each in earlier.channels} if earlier is not None else {}
+    seconds = (health.utime - earlier.utime) * 1e-6 if earlier is not None else 0.0
     rows = []
     for each in health.channels:
         if each.channel.startswith("command:"):
             continue
+        # less after a restart of the service
+        has_rate = seconds > 0.0 and each.count >= before.get(each.channel, each.count + 1)
+        rate = (each.count - before[each.channel]) / seconds if has_rate else each.rate_hz
         age = "never" if math.isnan(each.age) else format_duration(each.age)
         rows.append(
             (
                 each.channel.removeprefix("sensor:"),
-                f"{each.rate_hz:.1f}",
+                f"{rate:.1f}",
                 f"{age}, silent" if each.silent and each.count else age,
                 f"{each.used} of {each.measured}" if each.measured else "-",
             )
@@ -499,10 +587,24 @@ class DisplayPanel:
     """What the scene shows."""
 
     def __init__(self, gui: viser.GuiApi):
-        self.labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
+        self._labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
         self.follow = gui.add_checkbox("Follow the vehicle", True)
-        self.uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid (95 %) and protection levels")
-        self.trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
+        self.uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid of the position; protection levels")
+        confidences = tuple(f"{each} %" for each in CHI_SQUARE_3)
+        self._confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
+        self._trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
+
+    @property
+    def labels(self) -> NameLabels:
+        return NameLabels(self._labels.value)
+
+    @property
+    def confidence(self) -> int:
+        return int(self._confidence.value.split()[0])
+
+    @property
+    def trail_s(self) -> float:
+        return TRAILS[self._trail.value]
 
 
 class JointsPanel:
@@ -513,26 +615,35 @@ class JointsPanel:
         self._source = source
         self._actions = actions
         self._sliders: dict[str, tuple[Any, float]] = {}
+        self._defaults: dict[str, float] = {}
         self._folder = gui.add_folder("Positions")
 
     def set_model(self, model: Model) -> None:
-        """Offer the coordinates of a model, at their defaults."""
-        old, self._sliders = self._sliders, {}
+        """Offer the coordinates of a model; those that were moved stay where they are."""
+        moved = {
+            name: slider.value
+            for name, (slider, _) in self._sliders.items()
+            if not math.isclose(slider.value, self._defaults[name], abs_tol=1e-6)
+        }
+        old, self._sliders, self._defaults = self._sliders, {}, {}
         with self._folder:
             for name, joint, number in list_coordinates(model):
-                self._add_slider(name, joint, number)
+                self._add_slider(name, joint, number, moved.get(name))
         for slider, _ in old.values():
             # last: a page hides a folder that was empty for a moment, and may never show it again
             slider.remove()
+        if moved.keys() & self._sliders.keys():
+            self._apply()
 
-    def _add_slider(self, name: str, joint: Joint, number: int) -> None:
+    def _add_slider(self, name: str, joint: Joint, number: int, moved: float | None) -> None:
         is_angle = joint.angle_flags[number]
         scale = math.degrees(1.0) if is_angle else 1.0
         free = math.pi if is_angle else 1.0
         low = max(joint.lower[number], -free) if joint.lower else -free
         high = min(joint.upper[number], free) if joint.upper else free
         lower, upper = low * scale, max(high, low + 1e-6) * scale
-        value = min(max(joint.default_position[number] * scale, lower), upper)
+        self._defaults[name] = default = min(max(joint.default_position[number] * scale, lower), upper)
+        value = default if moved is None else min(max(moved, lower), upper)
         unit, step = ("deg", 0.1) if is_angle else ("m", 0.001)
         slider = self._gui.add_slider(f"{name} ({unit})", lower, upper, step, value)
         self._actions.on_update(slider, self._apply)
