@@ -97,15 +97,6 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     bus = LcmBus(resolve_url(url or config.lcm.url))
     notifier.notify_starting("probing the bus")
     findings = probe_bus(bus.url)
-    settings = LoopSettings(
-        period_ns=round(1e9 / vehicle.tick_hz()),
-        sensors=vehicle.sensor_channels(),
-        channel_prefix=config.lcm.channel_prefix,
-        limits=config.limits,
-        publisher_conflict=config.sensors.publisher_conflict,
-        publishers=vehicle.list_publishers(),
-        shared_channels=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
-    )
     reader = GeometryReader(vehicle, file)
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))
     journal = make_writer(config, file, clock, next(iter(vehicle.read_keys(file)), None))
@@ -113,7 +104,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         bus,
         clock,
         vehicle.start_core(clock.now(), origin, restored),
-        settings,
+        LoopSettings.of(vehicle),
         Hooks(
             on_origin=lambda output: origins.save(output.origin) if origins is not None else None,
             on_mode_switch=log_mode_switch,

@@ -20,7 +20,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
@@ -48,6 +48,9 @@ from modelserver.wire.codec import encode, fingerprint_of, split_snapshot
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
+
+if TYPE_CHECKING:
+    from modelserver.server.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +133,20 @@ class LoopSettings:
     publisher_conflict: Literal["", "ignore", "use"] = ""
     shared_channels: frozenset[str] = frozenset()
     publishers: Mapping[str, frozenset[str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> LoopSettings:
+        """Return the settings of the loop that serves a vehicle."""
+        config, prefix = vehicle.config, vehicle.config.lcm.channel_prefix
+        return cls(
+            round(1e9 / vehicle.tick_hz()),
+            vehicle.sensor_channels(),
+            prefix,
+            config.limits,
+            config.sensors.publisher_conflict,
+            frozenset({f"{prefix}{config.sensors.joints.channel}"}),
+            vehicle.list_publishers(),
+        )
 
 
 class Loop:

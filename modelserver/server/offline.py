@@ -20,12 +20,15 @@ from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.estimation.history import Localizer
 from modelserver.geometry import names
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
+from modelserver.server.bus import FakeBus, Inboxes
+from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import MODE_TYPE, SensorChannel
+from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.recordings import StampAxis, align
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms.so3 import Quaternion
 from modelserver.wire.channels import SIGNED
-from modelserver.wire.codec import decode
+from modelserver.wire.codec import decode, is_of_service
 from modelserver.wire.eventlog import LogEvent
 
 CSV_HEADER: Final = (
@@ -198,6 +201,56 @@ class OfflineRun:
             _NO_PLACE if geodetic is None else (geodetic.latitude_deg, geodetic.longitude_deg, geodetic.heading_deg),
             (answer.horizontal_level, answer.heading_level, answer.limit_risk),
         )
+
+
+class _OfflineBus(FakeBus):
+    """A bus whose clock goes no further than the next event of a recording, at `limit_ns`."""
+
+    limit_ns = 0
+
+    def wait(self, seconds: float, inboxes: Inboxes = "both") -> None:
+        super().wait(min(seconds, (self.limit_ns - self._clock.monotonic_ns()) * 1e-9), inboxes)
+
+
+def serve(vehicle: Vehicle, log: Iterable[LogEvent], axis: StampAxis) -> Iterator[LogEvent]:
+    """Yield what would be on the bus if the service ran while a recording is played: its messages, and the service's.
+
+    The loop is the daemon's, on a fake bus and clock. What a service published in the recording is left out. `axis`
+    gets how the stamps are off the log's times.
+    """
+    channels = vehicle.sensor_channels()
+    clock = FakeClock()
+    bus = _OfflineBus(clock)
+    loop: Loop | None = None
+    count = 0
+
+    def pop_published(end: int) -> Iterator[LogEvent]:
+        nonlocal count
+        for channel, data in bus.published:
+            yield LogEvent(count, clock.utime(), channel, data, end)
+            count += 1
+        bus.published.clear()
+
+    for event in align(log, channels, axis):
+        if is_of_service(event.data) and not event.channel.endswith(SIGNED):
+            continue
+        now = _instant(event.utime)
+        if loop is None:
+            clock.set(now)
+            hooks = Hooks(snapshot=vehicle.encode_snapshot, channels=lambda state: vehicle.sensor_channels(state.model))
+            loop = Loop(bus, clock, vehicle.start_core(now), LoopSettings.of(vehicle), hooks)
+        bus.limit_ns = now.monotonic_ns
+        while clock.monotonic_ns() < now.monotonic_ns:
+            loop.run_once()
+            yield from pop_published(event.end)
+        clock.set(now)
+        yield event._replace(number=count)
+        count += 1
+        if event.channel.endswith(SIGNED):
+            event = _unwrap_mode_command(event, channels)
+        bus.sensors.put(event.channel, event.data)
+        loop.run_once()
+        yield from pop_published(event.end)
 
 
 def _unwrap_mode_command(event: LogEvent, channels: Mapping[str, SensorChannel]) -> LogEvent:
