@@ -68,24 +68,12 @@ def test_given_another_model_then_each_change_has_its_line(new: Model, expected:
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"axis": (0.0, 0.0, 1.0)}, "the axis 0 0 1, it was 0 1 0"),
-        ({"lower": (math.radians(-30.0),)}, "the lower limit -30 deg, it was none"),
-        ({"sigma": (math.radians(0.5),)}, "sigma 0.5 deg, it was none"),
-        ({"default": (math.radians(5.0),)}, "the default 5 deg, it was none"),
-        ({"default": (1e-12,)}, "the default 5.72958e-11 deg, it was none"),
-        (
-            {"rate_limit": (math.radians(40.0),), "upper": (math.radians(20.0),)},
-            "the upper limit 20 deg, it was none; the rate limit 40 deg, it was none",
-        ),
-    ],
+    "change",
+    [{"axis": (0.0, 0.0, 1.0)}, {"lower": (-0.5,)}, {"sigma": (0.01,)}, {"default": (1e-12,)}, {"rate_limit": (0.7,)}],
 )
-def test_given_a_joint_that_states_otherwise_then_each_number_is_reported(
-    change: dict[str, Any], expected: str
-) -> None:
+def test_given_a_joint_that_states_otherwise_then_it_is_reported(change: dict[str, Any]) -> None:
     found = describe_changes(cart(joint=NOD), cart(joint=replace(NOD, **change)))
-    assert found == (f"the joint of constraint Mounted has {expected}",)
+    assert found == ("the joint of constraint Mounted has other numbers",)
 
 
 def test_given_constraints_that_come_and_go_and_another_root_then_it_is_reported() -> None:
