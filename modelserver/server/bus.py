@@ -87,7 +87,6 @@ class MulticastMembership:
 
 
 SENSOR_QUEUE_BYTES: Final = 4 << 20
-REQUEST_QUEUE_BYTES: Final = 1 << 20
 """Bytes that wait on a channel at most: 20,000 samples of wheels. Requests wait in the receive buffer, or in liblcm."""
 
 MAX_SAMPLE_BYTES: Final = 1 << 20
@@ -208,8 +207,8 @@ class LcmBus:
     def __init__(self, url: str = ""):
         self.url = resolve_url(url)
         self.publish = open_lcm(self.url).publish
-        self.sensors = ReceiverInbox(open_receiver(self.url, SENSOR_QUEUE_BYTES, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
-        self.requests = ReceiverInbox(open_receiver(self.url, REQUEST_QUEUE_BYTES, MAX_REQUEST_BYTES))
+        self.sensors = ReceiverInbox(open_receiver(self.url, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
+        self.requests = ReceiverInbox(open_receiver(self.url, MAX_REQUEST_BYTES))
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)

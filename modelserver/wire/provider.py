@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qsl, urlsplit
 
-from modelserver.errors import BusError, find_nearest_names, quote
+from modelserver.errors import BusError, quote
 from modelserver.wire.channels import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -121,59 +121,40 @@ _NUMBER: Final = re.compile(r"\s*[+-]?(0[xX][0-9a-fA-F]+|\d+)")
 def find_url_problem(url: str) -> str:
     """Return what is wrong with an LCM URL and what to write instead, empty for a valid one."""
     scheme, found, rest = url.partition("://")
-    if not found:
-        return f"it has no scheme; write it like {EXAMPLE}"
-    if scheme not in SCHEMES:
-        near = find_nearest_names(scheme, SCHEMES, 1)
-        known = ", ".join(f"{each}://" for each in SCHEMES if each != "memq")
-        offer = f"did you mean {near[0]}://? There are" if near else "there are"
-        return f"{quote(scheme, 40)} is no scheme of LCM's; {offer} {known}; for a start: {EXAMPLE}"
+    place, _, options = rest.partition("?")
+    if not found or scheme not in SCHEMES:
+        return f"{quote(url, 40)} is no URL of LCM's, which has {', '.join(SCHEMES)}; write it like {EXAMPLE}"
     if scheme == "memq":
         return f"memq:// does not leave the process, so no other program receives it; write {EXAMPLE}"
-    place, _, options = rest.partition("?")
-    if scheme == "file":
-        return "" if place else "it names no log; write file:///path/of/log"
-    if scheme not in _MULTICAST:
-        return ""
-    return (place and _find_address_problem(place, scheme)) or _find_ttl_problem(options)
+    if scheme == "file" and not place:
+        return "it names no log; write file:///path/of/log"
+    if scheme in _MULTICAST and not (_is_multicast(place, scheme) and all(map(_is_valid_ttl, options.split("&")))):
+        return (
+            f"{quote(rest, 60)} is no multicast address: a group between 224.0.0.0 and 239.255.255.255, a port from 1 "
+            f"to 65535, and a ttl from 0 (this machine) to 255; write it like {EXAMPLE}"
+        )
+    return ""
 
 
-def _find_address_problem(place: str, scheme: str) -> str:
+def _is_multicast(place: str, scheme: str) -> bool:
+    """Return whether liblcm joins the group and port that stand there; it has defaults for none at all."""
     group, colon, port = place.partition(":")
-    example = f"{scheme}://239.255.76.67:7667?ttl=0"
-    if not group:
-        return f"the address before the port is missing; write it like {example}"
     try:
-        first = socket.inet_aton(group)[0]
+        is_group = not place or 224 <= socket.inet_aton(group)[0] <= 239
     except (OSError, ValueError):
-        return (
-            f"{quote(group, 40)} is no IPv4 address; write one between 224.0.0.0 and 239.255.255.255, such as {example}"
-        )
-    if not 224 <= first <= 239:
-        return (
-            f"{quote(group, 40)} is no multicast address; write one between 224.0.0.0 and 239.255.255.255, the same on "
-            f"all machines, such as {example}"
-        )
+        return False
     if not colon:
         # mpudpm has a default, udpm waits on port 0 forever
-        return "" if scheme == "mpudpm" else f"the port is missing; write {scheme}://{group}:7667"
+        return is_group and (not place or scheme == "mpudpm")
     match = _NUMBER.match(port)
     number = int(match[0], 0 if match[1][:2] in ("0x", "0X") else 10) if match else -1
-    lowest = 0 if scheme == "mpudpm" else 1
-    if not lowest <= number <= 65535:
-        return f"the port is a number from {lowest} to 65535, got {quote(port, 40)}; such as {example}"
-    return ""
+    return is_group and (0 if scheme == "mpudpm" else 1) <= number <= 65535
 
 
-def _find_ttl_problem(options: str) -> str:
-    for each in options.split("&"):
-        key, _, value = each.partition("=")
-        if key == "ttl" and not (value.isascii() and value.isdigit() and len(value) <= 3 and int(value) <= 255):
-            return (
-                f"ttl is a whole number from 0 to 255, got {quote(value, 40)}; 0 stays on this machine, 1 goes to the "
-                "network's other machines"
-            )
-    return ""
+def _is_valid_ttl(option: str) -> bool:
+    """Return whether an option is none about the ttl, or one that liblcm interprets as written."""
+    key, _, value = option.partition("=")
+    return key != "ttl" or (value.isascii() and value.isdigit() and len(value) <= 3 and int(value) <= 255)
 
 
 GROUP: Final = "239.255.76.67"

@@ -70,14 +70,11 @@ class Receiver(Protocol):
         """Leave the bus."""
 
 
-def open_receiver(url: str, queue_bytes: int = 1 << 20, max_bytes: int = MAX_PARTIAL_BYTES) -> Receiver:
-    """Join the bus to receive. Raises BusError with hints.
-
-    `queue_bytes` per channel is what liblcm may queue; longer messages than `max_bytes` are refused.
-    """
+def open_receiver(url: str, max_bytes: int = MAX_PARTIAL_BYTES) -> Receiver:
+    """Join the bus to receive; longer messages than `max_bytes` are refused. Raises BusError with hints."""
     address = parse_udp_address(url)
     if address is None:
-        return LcmReceiver(url, queue_bytes, max_bytes)
+        return LcmReceiver(url, max_bytes)
     try:
         return UdpReceiver(address, max_bytes)
     except OSError as error:
@@ -239,74 +236,37 @@ class UdpReceiver:
         self._socket.close()
 
 
-MAX_QUEUED: Final = 50_000
-MIN_QUEUED: Final = 16
-"""Limits of the messages that LCM queues on a channel."""
+MAX_QUEUED: Final = 1000
+"""Messages that liblcm queues on a channel: at 100 Hz ten seconds, at 64 kB each 64 MB."""
 
 MESSAGE_OVERHEAD_BYTES: Final = 128
-"""Memory of LCM per message beside its data, about: a record with pointers and the channel's name."""
-
-
-class QueueLimit:
-    """Capacity of a channel's queue in messages for `limit_bytes`, by a moving average of the message length."""
-
-    __slots__ = ("_limit_bytes", "_mean", "capacity")
-
-    def __init__(self, limit_bytes: int):
-        self._limit_bytes = limit_bytes
-        self._mean = 256.0
-        self.capacity = self._compute_capacity()
-
-    def update(self, length: int) -> bool:
-        """Process the length of a message; return whether `capacity` has changed."""
-        # up fast, since many long messages may follow; down slowly
-        off = length - self._mean
-        if -0.1 * self._mean < off < 0.1 * self._mean:
-            return False
-        self._mean += off * (0.125 if off > 0.0 else 0.015625)
-        capacity = self._compute_capacity()
-        if 0.8 * self.capacity <= capacity <= 1.25 * self.capacity:
-            return False
-        self.capacity = capacity
-        return True
-
-    def _compute_capacity(self) -> int:
-        return max(MIN_QUEUED, min(MAX_QUEUED, int(self._limit_bytes / (self._mean + MESSAGE_OVERHEAD_BYTES))))
+"""Memory of a queued message beside its data, about: a record with pointers and the channel's name."""
 
 
 class LcmReceiver:
-    """Receiver by liblcm, for other providers.
+    """Receiver by liblcm, for other providers. It queues `MAX_QUEUED` messages of a channel, and drops further ones."""
 
-    liblcm limits a channel's queue by messages, which may have 64 kB and more; `QueueLimit` turns a limit in bytes into
-    one in messages by a moving average of their length. Beyond it liblcm drops messages.
-    """
-
-    def __init__(self, url: str, queue_bytes: int, max_bytes: int = MAX_PARTIAL_BYTES):
+    def __init__(self, url: str, max_bytes: int = MAX_PARTIAL_BYTES):
         self._bus = open_lcm(url)
         self._max_bytes = max_bytes
         self.refused: Counter[bytes] = Counter()
-        self._queue_bytes = queue_bytes
         self._subscriptions: list[lcm.LCMSubscription] = []
         self.fileno = self._bus.fileno()
         self._received: deque[Message] = deque()
 
     def subscribe(self, channel: str) -> None:
         """See `Receiver`."""
-        limit, index = QueueLimit(self._queue_bytes), len(self._subscriptions)
         # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
-        received, subscriptions, name = self._received, self._subscriptions, channel.encode()
-        refused, max_bytes = self.refused, self._max_bytes
+        received, name, refused, max_bytes = self._received, channel.encode(), self.refused, self._max_bytes
 
         def handle(_: str, data: bytes) -> None:
             if len(data) > max_bytes:
                 refused[name] += 1
             else:
                 received.append((name, data, None))
-            if limit.update(len(data)):
-                subscriptions[index].set_queue_capacity(limit.capacity)
 
         subscription = self._bus.subscribe(to_subscription_pattern(channel), handle)
-        subscription.set_queue_capacity(limit.capacity)
+        subscription.set_queue_capacity(MAX_QUEUED)
         self._subscriptions.append(subscription)
 
     def receive(self) -> Message | None:
