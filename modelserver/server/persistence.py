@@ -1,7 +1,7 @@
 """Persistence across restarts: the state directory, and what a service stores there.
 
 The directory has a lock, atomic files, and errors with their remedies. It holds the captured origin, and the state for
-a warm start: a line with magic, version and SHA-256, then JSON; anything else is rejected with a reason. It is written
+a warm start: a line with version and SHA-256, then JSON; anything else is rejected with a reason. It is written
 atomically by a thread, so that the loop never waits for the disk; only the newest state waits to be written.
 
 The age of a state is measured by the monotonic clock if the boot id is the same. After a reboot only the time of day is
@@ -17,14 +17,13 @@ import fcntl
 import hashlib
 import json
 import logging
-import math
 import os
 import shlex
 import tempfile
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, get_type_hints
+from typing import Any, Final
 from uuid import UUID
 
 import msgspec
@@ -32,11 +31,9 @@ import msgspec
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
-from modelserver.errors import quote
 from modelserver.files import check_links, read_start
-from modelserver.messages import Origin, PersistedPose, PersistedState, RestoredState
+from modelserver.messages import Origin, PersistedState, RestoredState
 from modelserver.server.log import escape_text, start_in_background
-from modelserver.transforms.so3 import Quaternion, Vector3
 
 log = logging.getLogger(__name__)
 
@@ -225,7 +222,7 @@ def describe_error(error: OSError, directory: Path, setting: str) -> str:
 
 
 VERSION: Final = 1
-"""Version of both files."""
+"""Version of the origin's file."""
 
 MAX_ORIGIN_BYTES: Final = 4096
 """Ten times the size of a valid file."""
@@ -282,39 +279,7 @@ def _parse_origin(content: dict[str, Any]) -> Origin:
 MAX_BYTES: Final = 1 << 18
 """Ten times the size of a filter with 30 error states."""
 
-MAX_STATES: Final = 100
-MAX_WHEELS: Final = 64
-MAX_NAME_LENGTH: Final = 256
-
-_MAGIC: Final = "modelserver-state"
-_MAX_NUMBER: Final = 1e9
-"""Upper bound of the numbers, except times and counts."""
-
-_Text = Annotated[str, msgspec.Meta(max_length=MAX_NAME_LENGTH)]
-_Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
-_Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
-
-
-def _make_struct(row: type, types: Mapping[Any, Any]) -> Any:
-    """Return the class that checks a mapping for a NamedTuple: its keys, and of each field the type and the bounds."""
-    fields = [(name, types[hint]) for name, hint in get_type_hints(row).items()]
-    return msgspec.defstruct(row.__name__, fields, forbid_unknown_fields=True)
-
-
-_TYPES: Final = {
-    str: _Text,
-    int: _Count,
-    float: _Number,
-    Vector3: tuple[_Number, _Number, _Number],
-    Quaternion: tuple[_Number, _Number, _Number, _Number],
-    tuple[float, ...]: tuple[_Number, ...],
-    tuple[str, ...]: tuple[_Text, ...],
-    tuple[tuple[str, float], ...]: Annotated[tuple[tuple[_Text, _Number], ...], msgspec.Meta(max_length=MAX_WHEELS)],
-}
-"""What is valid for a field of each declared type."""
-
-_Pose: Final = _make_struct(PersistedPose, _TYPES)
-_State: Final = _make_struct(PersistedState, {**_TYPES, PersistedPose | None: _Pose | None})
+_HEAD: Final = b"modelserver-state 2 "
 
 
 class PersistedStateError(ValueError):
@@ -323,63 +288,21 @@ class PersistedStateError(ValueError):
 
 def encode_state(state: PersistedState) -> bytes:
     """Encode a state as the bytes of its file."""
-    return _pack({**state._asdict(), "pose": None if state.pose is None else state.pose._asdict()})
+    text = msgspec.json.encode(state)
+    return _HEAD + hashlib.sha256(text).hexdigest().encode() + b"\n" + text
 
 
 def decode_state(data: bytes) -> PersistedState:
     """Decode and validate the bytes of a state file. Raises PersistedStateError."""
-    return _parse_state(_unpack(data))
-
-
-def _pack(content: dict[str, Any]) -> bytes:
-    text = json.dumps(content, allow_nan=False).encode()
-    return f"{_MAGIC} {VERSION} {hashlib.sha256(text).hexdigest()}\n".encode() + text + b"\n"
-
-
-def _unpack(data: bytes) -> bytes:
-    if not data:
-        raise PersistedStateError("the file is empty")
-    if len(data) > MAX_BYTES:
-        raise PersistedStateError(f"the file is larger than {MAX_BYTES} bytes")
     line, _, text = data.partition(b"\n")
-    words = line.split(b" ")
-    if len(words) != 3 or words[0] != _MAGIC.encode():
-        raise PersistedStateError("it is no state file")
-    if words[1] != str(VERSION).encode():
-        raise PersistedStateError(
-            f"its format is version {quote(words[1][:20].decode(errors='replace'))}; expected {VERSION}"
-        )
-    if not text.endswith(b"\n") or hashlib.sha256(text[:-1]).hexdigest().encode() != words[2]:
+    if not line.startswith(_HEAD):
+        raise PersistedStateError("it is no state file of this version")
+    if line.removeprefix(_HEAD) != hashlib.sha256(text).hexdigest().encode():
         raise PersistedStateError("it is damaged: the checksum is wrong")
-    return text
-
-
-def _parse_state(text: bytes) -> PersistedState:
     try:
-        found = msgspec.json.decode(text, type=_State)
-    except (msgspec.MsgspecError, RecursionError) as error:
+        return msgspec.json.decode(text, type=PersistedState)
+    except msgspec.MsgspecError as error:
         raise PersistedStateError(str(error)) from None
-    pose = None if found.pose is None else _check_pose(PersistedPose(*msgspec.structs.astuple(found.pose)))
-    state = PersistedState(*msgspec.structs.astuple(found))._replace(pose=pose)
-    count = len(state.names)
-    if not 15 <= count <= MAX_STATES:
-        raise PersistedStateError(f"names: expected 15 to {MAX_STATES} error states")
-    for key, values, expected in (("covariance", state.covariance, count**2), ("extras", state.extras, count - 15)):
-        if len(values) != expected:
-            raise PersistedStateError(f"{key}: expected {expected} numbers")
-    if min(state.covariance[:: count + 1]) < 0.0:
-        raise PersistedStateError("covariance: negative variance")
-    return state
-
-
-def _check_pose(pose: PersistedPose) -> PersistedPose:
-    if abs(pose.latitude_deg) > 90.0 or abs(pose.longitude_deg) > 360.0:
-        raise PersistedStateError(f"latitude {pose.latitude_deg:g}, longitude {pose.longitude_deg:g}: out of range")
-    if not abs(math.hypot(*pose.attitude) - 1.0) < 1e-6:
-        raise PersistedStateError("attitude: expected a unit quaternion")
-    if min(*pose.correlated_error_variance, pose.allowance) < 0.0 or pose.gnss_noise_inflation < 1.0:
-        raise PersistedStateError("correlated_error_variance, allowance or gnss_noise_inflation: out of range")
-    return pose
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -440,7 +363,7 @@ class StateStore:
             return nothing._replace(reason=f"the state in {self.path} belongs to {error.holder}, which is running")
         self._remove_temporary_files()
         try:
-            data = read_start(self.path, MAX_BYTES + 1)
+            data = read_start(self.path, MAX_BYTES)
         except FileNotFoundError:
             return nothing._replace(reason="no state of an earlier run is stored")
         except OSError as error:
