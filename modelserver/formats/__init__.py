@@ -43,10 +43,10 @@ __all__ = [
     "save_model",
 ]
 
-_WRITERS = {"yaml": "yaml_geometry", "miro": "miro", "miro-frames": "frame_tree", "urdf": "urdf"}
+_WRITERS = {"yaml": "yaml_geometry", "miro": "miro", "urdf": "urdf"}
 
 FORMATS = tuple(_WRITERS)
-"""Formats that `save_model` writes: YAML, Miro body and constraint XML, Miro frame-tree XML, URDF."""
+"""Formats that `save_model` writes: YAML, Miro body and constraint XML, URDF."""
 
 MAX_BYTES = 32 * 1024 * 1024
 """Larger files are rejected unread: 10,000 frames take 3 MiB in the most verbose format."""

@@ -119,7 +119,7 @@ def test_any_text_is_a_model_or_an_error(text, before):
     assert_loads_or_explains((before + text).encode())
 
 
-@pytest.mark.parametrize("file_format", ["yaml", "miro", "miro-frames", "urdf"])
+@pytest.mark.parametrize("file_format", ["yaml", "miro", "urdf"])
 @given(model=models(), part=st.floats(0, 1))
 @settings(max_examples=10)
 def test_a_file_cut_short_is_a_model_or_an_error(file_format, model, part):

@@ -71,11 +71,3 @@ def test_every_pair_of_frames_survives_conversion_and_back(miro, name, form):
     assert_same_transforms(model, through)
     assert_same_transforms(model, read(save_model(through, "miro").text))
     assert_same_transforms(model, read(save_model(through, "yaml").text))
-
-
-@pytest.mark.parametrize("name", NASA)
-def test_a_rover_written_as_a_frame_tree_is_the_same_rover(miro, name):
-    model = load_model(miro / name)
-    again = read(save_model(model, "miro-frames").text)
-    assert again.get_body_list() == model.get_body_list()
-    assert_same_transforms(model, again)

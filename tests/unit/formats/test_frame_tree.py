@@ -6,8 +6,6 @@ import pytest
 from support_formats import line_of, miro_body, miro_constraint, only_problem, problems_of, read, tree, tree_frame
 
 from modelserver.errors import Severity
-from modelserver.formats import save_model
-from modelserver.geometry import ModelBuilder
 from modelserver.transforms import Pose
 
 ROVER = tree(
@@ -328,20 +326,6 @@ def test_a_name_that_disagrees_with_its_instance_is_a_warning():
 
 def test_a_child_named_origin_is_an_error():
     assert "named Origin" in only_problem(ROVER.replace("Camera", "Origin")).message
-
-
-def test_given_a_mounted_body_named_origin_when_written_then_its_instance_has_another_name_and_its_place():
-    builder = ModelBuilder("rover")
-    builder.add_body("Rover").add_frame("Mount", Pose((1.0, 2.0, 3.0)))
-    builder.add_body("Origin").add_frame("Lens", Pose((0.0, 0.0, 0.5)))
-    builder.add_constraint("OriginOn", "Rover:Mount", "Origin:Lens")
-    model = builder.build()
-
-    again = read(save_model(model, "miro-frames").text)
-
-    assert again.get_body_list() == ["Rover", "Mount", "Origin_"]
-    pose = again.get_transformation("Origin_:Lens", "Rover:Origin").pose
-    assert pose.xyz == pytest.approx((1.0, 2.0, 3.0))
 
 
 def test_instances_of_other_types_are_noted_and_other_frames_warned_of():

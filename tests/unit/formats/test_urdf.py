@@ -224,11 +224,10 @@ def test_a_loop_and_a_follower_of_what_is_not_written_are_listed():
     assert read(saved.text).constraints[0].joint.mimic is None
 
 
-@pytest.mark.parametrize("file_format", ["miro", "miro-frames"])
-def test_formats_without_joints_and_shapes_list_them_and_write_the_default_position(file_format):
+def test_a_format_without_joints_and_shapes_lists_them_and_has_the_default_position():
     text = URDF.replace('lower="-1.5"', 'lower="0.5"')
     model = read(text)
-    saved = save_model(model, file_format)
+    saved = save_model(model, "miro")
     lost = "; ".join(saved.unsupported)
     assert "the motion of 2 joints, written as fixed at the default position: pan, grip" in lost
     assert "the visuals of 1 body: cart" in lost
