@@ -66,7 +66,7 @@ from modelserver.messages import (
 from modelserver.query.view import PlatformView
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Vector3, cross
+from modelserver.transforms.so3 import Vector3
 from modelserver.transforms.transformation import Transformation, compose_covariance
 from modelserver.wire.codec import SnapshotAssembler, decode
 
@@ -154,30 +154,14 @@ def estimate_motion(before: OdomSample, after: OdomSample) -> VehicleMotion:
     seconds = (after.utime - before.utime) * 1e-6
     X_AB = before.odom.inverse() @ after.odom
     rotation = so3.logarithm(X_AB.wxyz)
-    J = [_apply_left_jacobian(axis, rotation) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
-    x, y, z = np.linalg.solve(np.array(J).T, np.array(X_AB.xyz)).tolist()
+    travel = so3.to_vector3(np.linalg.solve(so3.left_jacobian(rotation), np.array(X_AB.xyz)).tolist())
     sigmas = (0.5 * ACCELERATION_SIGMA * seconds,) * 3 + (0.5 * ANGULAR_ACCELERATION_SIGMA * seconds,) * 3
     covariance = tuple(np.diag([sigma * sigma for sigma in sigmas]).ravel().tolist())
-    return VehicleMotion(
-        _scale((x, y, z), 1.0 / seconds), _scale(rotation, 1.0 / seconds), covariance=lambda: covariance
-    )
+    return VehicleMotion(_scale(travel, 1.0 / seconds), _scale(rotation, 1.0 / seconds), covariance=lambda: covariance)
 
 
 def _scale(vector: Vector3, factor: float) -> Vector3:
     return (vector[0] * factor, vector[1] * factor, vector[2] * factor)
-
-
-def _apply_left_jacobian(v: Vector3, rotation: Vector3) -> Vector3:
-    """Return J_l(rotation) v: the displacement of a body that travels `v` along its axes while it rotates evenly."""
-    angle = math.sqrt(sum(value * value for value in rotation))
-    if angle < 1e-6:
-        a, b = 0.5, 1.0 / 6.0
-    else:
-        a, b = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
-    once = cross(rotation, v)
-    twice = cross(rotation, once)
-    x, y, z = (each + a * o + b * t for each, o, t in zip(v, once, twice, strict=True))
-    return (x, y, z)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +222,8 @@ def _extrapolate(last: Estimate, utime: int, dt: float, is_stale: bool) -> Estim
         numbers = motion.covariance() if motion.covariance is not None else (0.0,) * 36
         speed_sigma, rate_sigma = math.sqrt(numbers[0]), math.sqrt(numbers[-1])
     rotation = _scale(rate, dt)
-    D = Pose(_apply_left_jacobian(_scale(velocity, dt), rotation), so3.exponential(rotation))
+    travel = so3.left_jacobian(rotation) @ np.array(_scale(velocity, dt))
+    D = Pose(so3.to_vector3(travel.tolist()), so3.exponential(rotation))
     angle = min(rate_sigma * dt + 0.5 * ANGULAR_ACCELERATION_SIGMA * dt * dt, MAX_ANGLE_SIGMA)
     lateral = math.sqrt(sum(value * value for value in velocity)) * dt * angle / 3.0
     position = speed_sigma * dt + 0.5 * ACCELERATION_SIGMA * dt * dt + lateral
