@@ -1,4 +1,4 @@
-"""Real processes under a service manager of the test's own: a start that is refused waits for its files, then ends."""
+"""Real processes under a service manager of the test's own: a start that is refused waits, then ends."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def fix_file(folder: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("words", [("run",), ("driver", "gps")], ids=["service", "driver"])
-def test_given_a_wrong_vehicle_file_then_it_is_reported_once_and_the_start_ends_when_the_file_is_another(
+def test_given_a_wrong_vehicle_file_then_it_is_reported_once_and_the_start_ends_later(
     begin: Begin, manager: Manager, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     write_vehicle(tmp_path, WRONG, GEOMETRY)
@@ -79,7 +79,7 @@ def test_given_a_wrong_vehicle_file_then_it_is_reported_once_and_the_start_ends_
     assert (tmp_path / "log").read_text() == log
 
 
-def test_given_a_geometry_that_is_not_there_then_the_start_ends_when_it_comes_and_the_next_one_serves(
+def test_given_a_geometry_that_is_not_there_then_the_start_ends_later_and_the_next_one_serves(
     begin: Begin, manager: Manager, tmp_path: Path
 ) -> None:
     write_vehicle(tmp_path, VEHICLE, GEOMETRY)

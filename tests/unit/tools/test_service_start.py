@@ -10,8 +10,9 @@ import typer
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
-from modelserver.server.supervision import FileWatcher, Notifier
+from modelserver.server.supervision import FAILED_START_S, Notifier
 from mstools.cli import main
+from mstools.commands import run
 from mstools.commands.run import ServiceStart, format_status
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
@@ -24,12 +25,10 @@ PROBLEMS = [
 
 
 @pytest.fixture(autouse=True)
-def waits(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """Return the names of the files of each wait; waits end at once."""
-    found: list[set[str]] = []
-    monkeypatch.setattr(
-        FileWatcher, "wait_for_change", lambda files: found.append({path.name for path in files._stamps})
-    )
+def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Return the seconds of each wait; waits end at once."""
+    found: list[float] = []
+    monkeypatch.setattr(run.time, "sleep", found.append)
     return found
 
 
@@ -61,8 +60,8 @@ def missing(path: Path) -> OSError:
         (ModelServerError("it names no drivers"), 1, "it names no drivers", "it names no drivers"),
     ],
 )
-def test_given_a_manager_then_an_error_is_printed_reported_and_waits_for_the_files(
-    capsys: pytest.CaptureFixture[str], waits: list[set[str]], error: Exception, code: int, status: str, printed: str
+def test_given_a_manager_then_an_error_is_printed_reported_and_waits(
+    capsys: pytest.CaptureFixture[str], waits: list[float], error: Exception, code: int, status: str, printed: str
 ) -> None:
     manager = Manager()
     with pytest.raises(typer.Exit) as ended:
@@ -74,11 +73,11 @@ def test_given_a_manager_then_an_error_is_printed_reported_and_waits_for_the_fil
     assert status in notification
     # otherwise systemd would end it before the wait is over
     assert "\nEXTEND_TIMEOUT_USEC=60000000" in notification
-    assert len(waits) == 1
+    assert waits == [FAILED_START_S]
 
 
 @pytest.mark.parametrize("error", [ConfigError(PROBLEMS), missing(CONFIG), typer.BadParameter("x"), BusError("x")])
-def test_given_no_manager_then_errors_propagate(waits: list[set[str]], error: Exception) -> None:
+def test_given_no_manager_then_errors_propagate(waits: list[float], error: Exception) -> None:
     manager = Manager(is_active=False)
     with pytest.raises(type(error)):
         manager.fail(error)
@@ -86,17 +85,17 @@ def test_given_no_manager_then_errors_propagate(waits: list[set[str]], error: Ex
 
 
 @pytest.mark.parametrize("error", [missing(Path("/another")), OSError("no file"), ZeroDivisionError()])
-def test_given_an_error_that_is_not_of_a_file_then_it_propagates(waits: list[set[str]], error: Exception) -> None:
+def test_given_an_error_that_is_not_of_a_file_then_it_propagates(waits: list[float], error: Exception) -> None:
     manager = Manager()
     with pytest.raises(type(error)):
         manager.fail(error)
     assert (manager.notifications, waits) == ([], [])
 
 
-def test_given_a_start_that_goes_well_then_nothing_is_reported(waits: list[set[str]]) -> None:
+def test_given_a_start_that_goes_well_then_nothing_is_reported(waits: list[float]) -> None:
     manager = Manager()
     with manager.start.wait_on_error():
-        manager.start.add_files("", "geometry.yaml")
+        pass
     assert (manager.notifications, waits) == ([], [])
 
 
@@ -105,22 +104,17 @@ def test_given_problems_without_an_error_then_there_is_a_line_all_the_same() -> 
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "geometry", "names"),
+    ("vehicle", "geometry"),
     [
-        (VEHICLE.replace("vehicle:", "vehicel:"), "", {"vehicle.yaml"}),
-        (VEHICLE, "bodies: [", {"vehicle.yaml", "geometry.yaml"}),
-        (VEHICLE, None, {"vehicle.yaml", "geometry.yaml"}),
-        (f"{VEHICLE}commands: {{reload: true, key_file: k}}\n", "", {"vehicle.yaml", "geometry.yaml", "k"}),
+        (VEHICLE.replace("vehicle:", "vehicel:"), ""),
+        (VEHICLE, "bodies: ["),
+        (VEHICLE, None),
+        (f"{VEHICLE}commands: {{reload: true, key_file: k}}\n", ""),
     ],
     ids=["vehicle file", "geometry", "geometry missing", "key"],
 )
-def test_given_the_service_then_it_waits_for_the_files_that_it_could_not_start_with(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    waits: list[set[str]],
-    vehicle: str,
-    geometry: str | None,
-    names: set[str],
+def test_given_the_service_then_it_waits_where_it_could_not_start_with_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: list[float], vehicle: str, geometry: str | None
 ) -> None:
     path = write_vehicle(tmp_path, vehicle, *([geometry] if geometry else []))
     if geometry is None:
@@ -129,18 +123,18 @@ def test_given_the_service_then_it_waits_for_the_files_that_it_could_not_start_w
     with pytest.raises(SystemExit) as ended:
         main(["run", "-c", str(path)])
     assert ended.value.code == 1
-    assert waits == [names]
+    assert waits == [FAILED_START_S]
 
 
 def test_given_a_driver_whose_dbc_file_is_wrong_then_it_waits_for_that_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: list[set[str]]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: list[float]
 ) -> None:
     shutil.copytree(RAPTOR, tmp_path / "raptor")
     (tmp_path / "raptor" / "raptor.dbc").write_text("BO_ x\n")
     monkeypatch.setenv("NOTIFY_SOCKET", "@no listener")
     with pytest.raises(SystemExit) as ended:
         main(["driver", "wheels", "-c", str(tmp_path / "raptor" / "vehicle.yaml")])
-    assert (ended.value.code, waits) == (1, [{"vehicle.yaml", "raptor.dbc"}])
+    assert (ended.value.code, waits) == (1, [FAILED_START_S])
 
 
 @pytest.mark.parametrize(
@@ -149,10 +143,10 @@ def test_given_a_driver_whose_dbc_file_is_wrong_then_it_waits_for_that_too(
     ids=["no drivers", "another", "wrong"],
 )
 def test_given_a_driver_then_it_waits_as_the_service_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: list[set[str]], drivers: str, code: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: list[float], drivers: str, code: int
 ) -> None:
     path = write_vehicle(tmp_path, VEHICLE + drivers)
     monkeypatch.setenv("NOTIFY_SOCKET", "@no listener")
     with pytest.raises(SystemExit) as ended:
         main(["driver", "gps", "-c", str(path)])
-    assert (ended.value.code, waits) == (code, [{"vehicle.yaml"}])
+    assert (ended.value.code, waits) == (code, [FAILED_START_S])

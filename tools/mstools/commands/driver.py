@@ -228,8 +228,6 @@ def run(
 
     kind = settings.kind
     with start.wait_on_error():
-        if database := getattr(settings.device_settings, "dbc", ""):
-            start.add_files(folder / Path(database).expanduser())
         station = make_driver(settings, folder)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
     publisher = DriverPublisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, Location, ModelServerError, Problem, Severity
 from modelserver.server.log import FORMATS, set_up_logging
-from modelserver.server.supervision import FileWatcher, Notifier
+from modelserver.server.supervision import FAILED_START_S, Notifier
 from mstools.terminal.options import UrlOption, option
 from mstools.terminal.output import print_problems
 
@@ -33,7 +34,7 @@ def command(
 
     Loads the geometry, subscribes to the sensors, publishes POSE and answers requests. Does not start with a wrong
     vehicle file or geometry, and reports all problems; under a service manager, which would restart it at once, it then
-    exits only when one of the files has changed, or after 30 s. Logs go to stderr. SIGHUP reloads the geometry file:
+    exits after 10 s. Logs go to stderr. SIGHUP reloads the geometry file:
     the whole file is used, or, if it is wrong, nothing changes and the log has the reason.
 
     Example: modelserver run -c config/raptor/vehicle.yaml
@@ -49,7 +50,6 @@ def command(
     start = ServiceStart(config, notifier)
     with start.wait_on_error():
         settings = load_config(config)
-        start.add_files(settings.geometry, settings.commands.key_file)
         vehicle = load_vehicle(settings, str(config))
         vehicle.make_command_verifier(0, str(config))
     for problem in vehicle.model.problems:
@@ -69,18 +69,13 @@ class ServiceStart:
 
     def __init__(self, config: Path, notifier: Notifier):
         self._config, self._notifier = config, notifier
-        self._files = FileWatcher(config)
-
-    def add_files(self, *files: str | Path) -> None:
-        """Add further files that the start depends on, before they are read."""
-        self._files.add(*(file for file in files if str(file)))
 
     @contextmanager
     def wait_on_error(self) -> Iterator[None]:
-        """Run the block; where its files are wrong, report that and wait for a change before the process exits.
+        """Run the block; where its files are wrong, report that and wait before the process exits.
 
         Without a service manager errors propagate. With one they are printed at once, the first is its status, and the
-        process exits with the same code, but only after a file has changed or the wait limit has passed.
+        process exits with the same code, after `FAILED_START_S`.
         """
         if not self._notifier.is_active:
             yield
@@ -100,10 +95,9 @@ class ServiceStart:
         except ModelServerError as error:
             problems = self._make_problem(str(error))
         print_problems(problems)
-        self._files.add(*(problem.file for problem in problems if problem.file))
         # also extends the start timeout of systemd
         self._notifier.notify_starting(format_status(problems))
-        self._files.wait_for_change()
+        time.sleep(FAILED_START_S)
         raise typer.Exit(code)
 
     def _make_problem(self, why: str) -> tuple[Problem, ...]:
