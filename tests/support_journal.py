@@ -62,9 +62,8 @@ class JournalRig:
         self.queue = JournalQueue()
         self.ring = ring(self.directory, max_bytes, segment_bytes)
         known = {**environment.collect_facts(), "run": run, **(facts or {})}
-        files = [(str(path), path.read_bytes())]
         self.writer = JournalWriter(
-            self.queue, self.ring, self.vehicle.config, known, files, self.clock, pause=lambda: None, key=key
+            self.queue, self.ring, self.vehicle.config, known, self.clock, pause=lambda: None, key=key
         )
         reader = GeometryReader(self.vehicle, str(path), read_geometry)
         self.loop = Loop(

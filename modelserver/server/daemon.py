@@ -99,7 +99,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     findings = probe_bus(bus.url)
     reader = GeometryReader(vehicle, file)
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))
-    journal = make_writer(config, file, clock, next(iter(vehicle.read_keys(file)), None))
+    journal = make_writer(config, clock, next(iter(vehicle.read_keys(file)), None))
     loop = Loop(
         bus,
         clock,

@@ -5,7 +5,7 @@ Sections of the journal's own are events on `CHANNEL`. A seal closes a batch of 
 of each record before it, the records that never were on a bus (ticks, rejections, warnings), and a CRC over the whole
 batch. A batch is accepted as a whole or not at all; `read_segment` resynchronizes at the next section after damage.
 
-    segment = head, files, state, (batch, seal) ..., end
+    segment = head, state, (batch, seal) ..., end
 
 `encode_*` and `read_segment` are pure functions between records and bytes. `server.journal.writer` links segments.
 """
@@ -31,14 +31,13 @@ CHANNEL: Final = "MODELSERVER_JOURNAL"
 MAGIC: Final = b"MSjrnl1\n"
 """In place of a message's fingerprint."""
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 
 
 class SectionType(IntEnum):
     """Type of a section of the journal's own."""
 
     HEAD = 1
-    FILE = 2
     STATE = 3
     SEAL = 4
     END = 5
@@ -90,16 +89,8 @@ class SegmentHead:
 
 
 @dataclass(frozen=True, slots=True)
-class SegmentFile:
-    """A file that the service was started with."""
-
-    name: str
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
 class SegmentState:
-    """State of the service at the start of the segment, encoded with the description of its types."""
+    """State of the service at the start of the segment."""
 
     data: bytes
 
@@ -135,7 +126,7 @@ class CorruptRegion:
         return f"{self.length} bytes at byte {self.start}: {self.reason}"
 
 
-Item: TypeAlias = SegmentHead | SegmentFile | SegmentState | JournalRecord | SegmentEnd | CorruptRegion
+Item: TypeAlias = SegmentHead | SegmentState | JournalRecord | SegmentEnd | CorruptRegion
 
 _OWN = struct.Struct(">8sBI")  # magic, part, checksum of what follows
 _DIGEST: Final = 32
@@ -159,10 +150,6 @@ def _encode_section(part: SectionType, utime: int, body: bytes, before: int = 0)
 
 def encode_head(facts: dict[str, Any], utime: int) -> bytes:
     return _encode_section(SectionType.HEAD, utime, json.dumps(facts).encode())
-
-
-def encode_file(name: str, data: bytes, utime: int) -> bytes:
-    return _encode_section(SectionType.FILE, utime, name.encode() + b"\0" + data)
 
 
 def encode_state(data: bytes, utime: int) -> bytes:
@@ -268,9 +255,6 @@ def _decode_section(part: SectionType, body: bytes, data: Buffer, begin: int) ->
     if part is SectionType.STATE:
         return [SegmentState(body)]
     try:
-        if part is SectionType.FILE:
-            name, _, content = body.partition(b"\0")
-            return [SegmentFile(name.decode(), content)]
         facts = json.loads(body)
     except (ValueError, RecursionError):
         return None

@@ -6,12 +6,10 @@ compared per record; the effects of others (a reloaded geometry, a persisted sta
 A run is the life of one service process. Its segments follow each other, and the replay continues from one into the
 next. After a gap (dropped by the ring, lost records, damaged bytes) it restarts from the state in the head of the next
 segment. That state has only the last seconds of the pose history: until the history is as long as in the recorded run,
-a differing reply about the past counts as `unverifiable`, not as a difference.
+a differing reply counts as `unverifiable`, not as a difference.
 
-Another numpy or Python may sum in another order, so that the last bits of a float differ. Two messages are equal within
-the tolerance if positions differ by at most 1e-9 m, orientations by 1e-9 rad, and other floats by 1e-9 of their
-magnitude (absolute below 1). Counts, texts, flags and non-finite numbers have to be equal. Such messages are a result
-of their own.
+Another numpy, Python or processor may sum in another order, so that the last bits of a float differ: a journal is
+verified with the build that wrote it, on a machine of the same kind.
 
 `ChainVerifier` checks by the heads and seals that the segments are complete, in order and authentic.
 """
@@ -19,13 +17,12 @@ of their own.
 from __future__ import annotations
 
 import hmac
-import math
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
-from itertools import islice, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -33,7 +30,7 @@ import mslcm
 from modelserver import core, messages
 from modelserver.core import AllOutputs, Instant
 from modelserver.errors import RecordingError, Status, WireError
-from modelserver.messages import GetHistory, GetTransformations, HealthWarning, Rejected
+from modelserver.messages import HealthWarning, Rejected
 from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import SensorChannel
@@ -58,67 +55,23 @@ from modelserver.signing import Key
 from modelserver.wire import journal
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode, read_request_header
-from modelserver.wire.eventlog import LogEvent, scan
 from modelserver.wire.journal import JournalRecord, RecordKind
-
-MAX_SEARCHED_ENTRIES: Final = 1000
-"""Entries of a folder without segments that are searched for a journal."""
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the segments of a journal: those of a directory, or the one file.
-
-    Raises RecordingError with a hint for anything else; OSError.
-    """
-    if not path.is_dir():
-        _check_journal_file(path)
-        return [path]
-    found = list_segments(path)
+    """Return the segments of a journal: those of a directory, or the one file. Raises RecordingError, OSError."""
+    if path.is_dir():
+        found = list_segments(path)
+    else:
+        with open_mapped(path) as data:
+            # a damaged segment is one
+            found = [path] if data.find(journal.MAGIC) >= 0 or (SEGMENT_NAME.fullmatch(path.name) and data) else []
     if not found:
-        raise RecordingError(f"{path}: {_describe_missing_segments(path)}")
-    return found
-
-
-def _check_journal_file(path: Path) -> None:
-    """Raise RecordingError for a file that is no segment. A damaged segment is one."""
-    with open_mapped(path) as data:
-        if not data:
-            raise RecordingError(
-                f"{path}: the file is empty, so there is nothing to verify; give the folder of the journal"
-            )
-        if data.find(journal.MAGIC) >= 0 or SEGMENT_NAME.fullmatch(path.name):
-            return
-        is_log = isinstance(next(iter(scan(data)), None), LogEvent)
-    if is_log:
         raise RecordingError(
-            f"{path}: is an LCM log, not a journal, so it has no output to verify; to play it: "
-            f"modelserver replay {path} (without --verify)"
+            f"{path}: is no journal, which is a folder of files journal-*.lcm (/var/lib/modelserver/journal-NAME); to "
+            "play an LCM log: modelserver replay LOG, without --verify"
         )
-    raise RecordingError(
-        f"{path}: is neither a journal nor an LCM log; a journal is a folder of files journal-*.lcm, such as "
-        "/var/lib/modelserver/journal-NAME"
-    )
-
-
-def _describe_missing_segments(folder: Path) -> str:
-    """Return the message for a folder without segments, with a hint."""
-    entries = sorted(islice(folder.iterdir(), MAX_SEARCHED_ENTRIES))
-    if not entries:
-        return "the folder is empty; a journal is a folder of files journal-*.lcm"
-    for each in entries:
-        try:
-            if each.is_dir() and list_segments(each):
-                return f"contains no segment of a journal (journal-*.lcm); did you mean {each}?"
-        except OSError:
-            continue  # not readable
-    text = "contains no segment of a journal (journal-*.lcm)"
-    if any(each.suffix == ".lcm" for each in entries):
-        text += "; to play its LCM logs: modelserver replay LOG, without --verify"
-    return text
-
-
-TOLERANCE: Final = 1e-9
-"""Meters, radians, and relative difference of other numbers."""
+    return found
 
 
 class FieldChange(NamedTuple):
@@ -127,22 +80,6 @@ class FieldChange(NamedTuple):
     name: str
     recorded: Any
     replayed: Any
-
-
-class Deviation(NamedTuple):
-    """Maximum differences in a message: meters, radians, and relative difference of other numbers."""
-
-    meters: float = 0.0
-    radians: float = 0.0
-    share: float = 0.0
-
-    @property
-    def is_tolerable(self) -> bool:
-        """Whether all differences are within the tolerance."""
-        return max(self) <= TOLERANCE
-
-    def elementwise_max(self, other: Deviation) -> Deviation:
-        return Deviation(*map(max, self, other))
 
 
 @cache
@@ -174,38 +111,6 @@ def _diff_fields(name: str, was: Any, now: Any) -> Iterator[FieldChange]:
             yield from _diff_fields(f"{name}[{index}]", *pair)
     elif repr(was) != repr(now):
         yield FieldChange(name, was, now)
-
-
-def compute_deviation(was: bytes, now: bytes) -> Deviation | None:
-    """Return the maximum differences of two messages; None where more than numbers differ."""
-    found = diff_messages(was, now)
-    if not found:
-        # not of one type, or different only in the bits of a nan
-        return None
-    total = Deviation()
-    for change in found:
-        if not (isinstance(change.recorded, float) and isinstance(change.replayed, float)):
-            return None
-        off = abs(change.recorded - change.replayed)
-        if not math.isfinite(off):
-            return None
-        total = total.elementwise_max(_to_deviation(change, off))
-    return total
-
-
-def _to_deviation(change: FieldChange, off: float) -> Deviation:
-    field, *indices = change.name.rpartition(".")[2].replace("]", "").split("[")
-    place = int(indices[-1]) if indices else 0
-    if field in ("vec", "vector", "vectors"):  # a position in meters, then a quaternion
-        # a component changes by at most half the angle, in up to three components
-        return Deviation(meters=off) if place < 3 else Deviation(radians=4.0 * off)
-    if field == "position":
-        return Deviation(meters=off)
-    if field == "orientation":
-        return Deviation(radians=4.0 * off)
-    if field == "h_transform":
-        return Deviation(meters=off) if place == 3 else Deviation(radians=2.0 * off)
-    return Deviation(share=off / max(1.0, abs(change.recorded)))
 
 
 PublishedMessage = tuple[str, bytes]
@@ -420,8 +325,6 @@ class VerificationResult(IntEnum):
     """Something is not reproduced, damaged, missing or not authentic."""
     REPRODUCED = 3
     """Everything is reproduced bit for bit; authenticity is not proven."""
-    WITHIN_TOLERANCE = 4
-    """Everything is reproduced, some of it only within the tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -459,7 +362,6 @@ class VerificationReport:
     unverifiable: see the module.
     seconds: replayed time of the span from first_utime to last_utime.
     environment_differences: of build and machine, in words.
-    within_tolerance: messages that differ within the tolerance, by channel; max_deviation: their maximum difference.
     genuine, unsealed: segments with a valid keyed seal, and without a verifiable one.
     is_complete: whether it is known that no segment is missing at the end.
     """
@@ -478,10 +380,6 @@ class VerificationReport:
     findings: list[JournalFinding] = field(default_factory=list)
     environment_differences: list[str] = field(default_factory=list)
     difference: Difference | None = None
-    within_tolerance: Counter[str] = field(default_factory=Counter)
-    max_deviation: Deviation = field(default_factory=Deviation)
-    max_deviation_channels: tuple[str, str] = ("", "")
-    """Channels of the maximum difference of a position, and of an orientation."""
     genuine: int = 0
     unsealed: int = 0
     is_complete: bool = False
@@ -492,9 +390,8 @@ class VerificationReport:
 
     @property
     def is_reproduced(self) -> bool:
-        """Whether something was verified, everything within tolerance, and nothing is damaged or missing."""
-        something = bool(self.reproduced) or bool(self.within_tolerance)
-        return something and self.difference is None and not any(each.is_damage for each in self.findings)
+        """Whether something was verified, nothing differs, and nothing is damaged or missing."""
+        return bool(self.reproduced) and self.difference is None and not any(each.is_damage for each in self.findings)
 
     @property
     def is_authentic(self) -> bool:
@@ -506,8 +403,6 @@ class VerificationReport:
         """The result."""
         if not self.is_reproduced:
             return VerificationResult.DIFFERS
-        if self.within_tolerance:
-            return VerificationResult.WITHIN_TOLERANCE
         return VerificationResult.AUTHENTIC if self.is_authentic else VerificationResult.REPRODUCED
 
 
@@ -579,7 +474,7 @@ class _Verifier:
                     continues = self._read_head(facts)
                 elif isinstance(item, journal.SegmentState):
                     if not continues:
-                        self._begin(item, facts)
+                        self._begin(item)
                 elif isinstance(item, journal.CorruptRegion):
                     self._report_corruption(item)
                 elif isinstance(item, journal.SegmentEnd):
@@ -629,12 +524,12 @@ class _Verifier:
             self._add_finding(f"{lost} records before it are lost: disk error, or the disk was too slow")
         return continues
 
-    def _begin(self, state: journal.SegmentState, facts: dict[str, Any] | None) -> None:
+    def _begin(self, state: journal.SegmentState) -> None:
         self.close()
         self._replay, self._at_ns = None, 0
         try:
             replay = ReplayLoop(state.data)
-            if facts is not None and facts.get("history_s") is not None and len(history := replay.state.history):
+            if len(history := replay.state.history):
                 self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
         except Exception as error:
             # a forged state may contain anything
@@ -699,7 +594,6 @@ class _Verifier:
         assert group is not None
         assert self._replay is not None
         report, lcm = self.report, self._replay.config.lcm
-        needs_history: bool | None = None
         for recorded, replayed in zip_longest(group.recorded, group.replayed):
             channel = replayed[0] if recorded is None else recorded.channel
             is_reply = channel.startswith(lcm.reply_prefix)
@@ -707,14 +601,9 @@ class _Verifier:
             if recorded is not None and replayed == (channel, recorded.data):
                 report.reproduced[label] += 1
                 continue
-            if recorded is not None and replayed is not None and self._is_close(recorded, replayed):
-                report.within_tolerance[label] += 1
+            if is_reply and len(history := self._replay.state.history) and history.last < self._held_until:
+                report.unverifiable += recorded is not None
                 continue
-            if is_reply:
-                needs_history = self._needs_history(group.record) if needs_history is None else needs_history
-                if needs_history:
-                    report.unverifiable += recorded is not None
-                    continue
             report.difference = Difference(
                 group.segment,
                 group.record.at if recorded is None else recorded.at,
@@ -724,43 +613,6 @@ class _Verifier:
                 None if replayed is None else replayed[1],
             )
             return
-
-    def _is_close(self, recorded: JournalRecord, replayed: PublishedMessage) -> bool:
-        """Return whether a message is equal within the tolerance, and update the maximum deviation."""
-        report = self.report
-        off = compute_deviation(recorded.data, replayed[1]) if replayed[0] == recorded.channel else None
-        if off is None or not off.is_tolerable:
-            return False
-        meters, radians = report.max_deviation_channels
-        report.max_deviation_channels = (
-            recorded.channel if off.meters > report.max_deviation.meters else meters,
-            recorded.channel if off.radians > report.max_deviation.radians else radians,
-        )
-        report.max_deviation = report.max_deviation.elementwise_max(off)
-        return True
-
-    def _needs_history(self, record: JournalRecord) -> bool:
-        """Return whether a reply may depend on poses before the restart of the replay."""
-        replay = self._replay
-        if replay is None or not len(replay.state.history) or replay.state.history.last >= self._held_until:
-            return False
-        if record.kind not in (
-            RecordKind.REQUEST,
-            RecordKind.CACHED,
-            RecordKind.MALFORMED,
-            RecordKind.OVERLOAD,
-            RecordKind.FAILED,
-        ):
-            # a deferred request is answered later
-            return True
-        channel = BY_NAME.get(record.channel.removeprefix(replay.config.lcm.channel_prefix))
-        try:
-            request = None if channel is None else decode(channel.type_name, record.data)
-        except WireError:
-            return False
-        if isinstance(request, (GetHistory, GetTransformations)):
-            return True
-        return bool(getattr(getattr(request, "time", None), "at", 0))
 
     def _report_corruption(self, broken: journal.CorruptRegion) -> None:
         if broken.tail:

@@ -29,7 +29,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -38,8 +38,7 @@ from typing import Any, Final, NamedTuple
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.errors import RecordingError
-from modelserver.files import open_regular, read_regular, read_start
-from modelserver.formats import MAX_BYTES as LARGEST_FILE
+from modelserver.files import open_regular, read_start
 from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import Clock
 from modelserver.server.journal import JournalEntry, JournalQueue, SegmentStart, encoding
@@ -321,9 +320,6 @@ PAUSE_S: Final = 5e-5
 CLOSE_TIMEOUT_S: Final = 1.5
 """Seconds that the stopping service waits for the rest to be written."""
 
-MAX_FILE_BYTES: Final = 4 << 20
-"""Greatest size of a file that is copied into every segment; of a larger one only the beginning."""
-
 
 def pause() -> None:
     """Release the interpreter to another thread."""
@@ -336,7 +332,6 @@ class JournalWriter:
     Parameters
     ----------
     facts: about service, build and machine, as JSON.
-    files: name and bytes of the files that the service was started with, for people; the replay does not use them.
     key: seals the segments; None: without authentication.
     """
 
@@ -346,7 +341,6 @@ class JournalWriter:
         ring: Ring,
         config: VehicleConfig,
         facts: Mapping[str, Any],
-        files: Iterable[tuple[str, bytes]],
         clock: Clock,
         pause: Callable[[], object] = pause,
         key: Key | None = None,
@@ -356,7 +350,7 @@ class JournalWriter:
         self._previous = ""
         self._queue = queue
         self._ring = ring
-        self._config, self._facts, self._files = config, facts, files
+        self._config, self._facts = config, facts
         self._clock = clock
         self._sync_ns = round(config.journal.sync_s * 1e9)
         self._pause = pause
@@ -465,14 +459,11 @@ class JournalWriter:
             segment = self._create_segment()
             facts: dict[str, Any] = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime}
             facts |= self._facts
-            facts["history_s"] = encoding.HISTORY_S if len(beginning.state.history) else None
             facts["key"] = "" if self._key is None else self._key.name
             facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
             self._previous = ""
             self._segment, self._batch = segment, 0
             segment.append(journal.encode_head(facts, now.utime))
-            for name, data in self._files:
-                segment.append(journal.encode_file(name, data[:MAX_FILE_BYTES], now.utime))
             segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
         except OSError:
@@ -576,11 +567,11 @@ def get_max_bytes(config: VehicleConfig) -> int:
 
 
 def make_writer(
-    config: VehicleConfig, file: str, clock: Clock, key: Key | None = None
+    config: VehicleConfig, clock: Clock, key: Key | None = None
 ) -> tuple[JournalQueue, JournalWriter] | None:
     """Return the queue for the loop and its writer, None where no journal is written.
 
-    `file`: the vehicle file. `key`: seals segments.
+    `key`: seals segments.
     """
     directory = get_journal_directory(config)
     if directory is None:
@@ -594,7 +585,5 @@ def make_writer(
         "run": secrets.token_hex(8),
         "pid": os.getpid(),
     }
-    paths = [path for path in (Path(file), Path(config.geometry)) if path.is_file()]
-    files = [(str(path), read_regular(path, LARGEST_FILE)) for path in paths]
     queue = JournalQueue()
-    return queue, JournalWriter(queue, ring, config, facts, files, clock, key=key)
+    return queue, JournalWriter(queue, ring, config, facts, clock, key=key)

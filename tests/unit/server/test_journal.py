@@ -268,7 +268,7 @@ def test_given_a_developer_machine_then_a_journal_is_written_only_under_systemd_
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert get_journal_directory(vehicle()) is None
-    assert make_writer(vehicle(), "", None) is None  # type: ignore[arg-type]
+    assert make_writer(vehicle(), None) is None  # type: ignore[arg-type]
     assert get_journal_directory(vehicle(directory="/x/y")) == Path("/x/y")
     assert get_journal_directory(vehicle(directory="/x/y", megabytes=0)) is None
     assert get_journal_directory(vehicle(megabytes=100)) == tmp_path / "modelserver" / "journal-my_cart_1"
@@ -277,14 +277,13 @@ def test_given_a_developer_machine_then_a_journal_is_written_only_under_systemd_
     assert get_journal_directory(vehicle(megabytes=0)) is None
 
 
-def test_given_a_vehicle_file_when_the_writer_is_made_then_it_holds_the_files_and_bounds(tmp_path: Path) -> None:
+def test_given_a_vehicle_file_when_the_writer_is_made_then_it_has_its_bounds(tmp_path: Path) -> None:
     rig = JournalRig(tmp_path, SMALL + "journal: {directory: box, megabytes: 64}\n")
-    made = make_writer(rig.vehicle.config, str(tmp_path / "vehicle.yaml"), rig.clock)
+    made = make_writer(rig.vehicle.config, rig.clock)
     assert made is not None
     _, writer = made
     assert writer._ring.directory == tmp_path / "box"
     assert (writer._ring.max_bytes, writer._ring.segment_bytes) == (64 << 20, 8 << 20)
-    assert [Path(name).name for name, _ in writer._files] == ["vehicle.yaml", "geometry.yaml"]
     assert writer._facts["vehicle"] == "cart"
 
 

@@ -433,24 +433,19 @@ def test_given_another_file_than_a_journal_then_the_error_has_a_hint(tmp_path: P
         assert words in str(raised.value)
         assert str(raised.value).startswith(f"{path}: ")
 
-    check_rejected(tmp_path, "the folder is empty")
+    check_rejected(tmp_path, "is no journal, which is a folder of files journal-*.lcm")
     empty = tmp_path / "empty.lcm"
     empty.touch()
-    check_rejected(empty, "the file is empty, so there is nothing to verify")
-    check_rejected(
-        tmp_path, "contains no segment of a journal (journal-*.lcm); to play its LCM logs: modelserver replay"
-    )
+    check_rejected(empty, "is no journal")
     text = tmp_path / "README.md"
     shutil.copy(__file__, text)
-    check_rejected(text, "is neither a journal nor an LCM log")
+    check_rejected(text, "is no journal")
     log = tmp_path / "drive.lcm"
     log.write_bytes(b"".join(encode_event(n, START, b"IMU", encode(imu(START))) for n in range(3)))
-    check_rejected(log, "is an LCM log, not a journal, so it has no output to verify")
-    check_rejected(log, f"to play it: modelserver replay {log} (without --verify)")
+    check_rejected(log, "to play an LCM log: modelserver replay LOG, without --verify")
     rig = tmp_path / "journal-rover"
     rig.mkdir()
     (rig / "journal-00000000.lcm").touch()
-    check_rejected(tmp_path, f"did you mean {rig}?")
     assert files_of(rig) == [rig / "journal-00000000.lcm"]
 
 

@@ -132,11 +132,11 @@ def test_given_options_of_another_use_then_the_usage_is_wrong(run: Run, folder: 
 def test_given_what_is_no_journal_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     code, out, err = run("--verify", tmp_path)
     assert (code, out) == (1, "")
-    assert "the folder is empty" in err
+    assert "is no journal" in err
     (tmp_path / "README.md").write_text("# Not a journal\n")
     code, out, err = run("--verify", tmp_path / "README.md")
     assert (code, out) == (1, "")
-    assert "README.md: is neither a journal nor an LCM log" in err
+    assert "README.md: is no journal" in err
     assert "No such file" in run("--verify", tmp_path / "gone.lcm")[2]
     (tmp_path / "journal-00000000.lcm").write_bytes(b"nonsense")
     code, out, err = run("--verify", tmp_path)

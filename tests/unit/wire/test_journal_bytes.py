@@ -17,12 +17,10 @@ from modelserver.wire.journal import (
     JournalRecord,
     RecordKind,
     SegmentEnd,
-    SegmentFile,
     SegmentHead,
     SegmentState,
     encode_batch,
     encode_end,
-    encode_file,
     encode_head,
     encode_state,
     read_end,
@@ -40,7 +38,7 @@ RECORDS = (
 
 def segment(*batches: tuple[JournalRecord, ...]) -> bytes:
     """Return the bytes of a segment."""
-    data = encode_head({"format": 1, "run": "x"}, 5) + encode_file("a.yaml", b"a\0b", 5) + encode_state(b"known", 5)
+    data = encode_head({"format": 1, "run": "x"}, 5) + encode_state(b"known", 5)
     data += b"".join(encode_batch(number, batch) for number, batch in enumerate(batches))
     return data + encode_end(hashlib.sha256(data).digest(), 6)
 
@@ -51,11 +49,11 @@ def records(items: list[Item]) -> list[JournalRecord]:
 
 def test_given_a_segment_when_read_then_everything_is_returned_in_order() -> None:
     found = list(read_segment(segment(RECORDS[:3], RECORDS[3:])))
-    assert found[:3] == [SegmentHead({"format": 1, "run": "x"}), SegmentFile("a.yaml", b"a\0b"), SegmentState(b"known")]
+    assert found[:2] == [SegmentHead({"format": 1, "run": "x"}), SegmentState(b"known")]
     assert records(found) == list(RECORDS)
     assert isinstance(found[-1], SegmentEnd)
     assert found[-1].is_intact
-    assert len(found) == 9
+    assert len(found) == 8
 
 
 def test_given_a_segment_when_read_by_lcm_then_the_bus_messages_are_unchanged(tmp_path: Path) -> None:

@@ -85,8 +85,8 @@ def command(
     --poses, --decisions and --report are replaced.
 
     With --verify a journal is replayed, and the first message that is not reproduced is printed. Exit code 0:
-    reproduced bit for bit, and authentic where --key is given; 3: reproduced, but --key does not prove authenticity; 4:
-    the same within 1e-9 m and rad, as with another numpy; 1: different, damaged, incomplete or forged.
+    reproduced bit for bit, and authentic where --key is given; 3: reproduced, but --key does not prove authenticity; 1:
+    different, damaged, incomplete or forged.
 
     \b
     Examples:
@@ -491,47 +491,33 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
 
 def format_result(found: VerificationReport, keyed: bool = False) -> list[str]:
     """Format the result; `keyed`: whether it was verified with a key."""
-    from modelserver.server.journal.verify import TOLERANCE
-
     span = (found.last_utime - found.first_utime) * 1e-6
     text = [
         f"{format_count(found.segments, 'segment')} of {format_count(found.runs, 'run')}, {found.seconds:.1f} of "
         f"{span:.1f} s ({_format_time(found.first_utime)} to {_format_time(found.last_utime)}), {found.handled} "
         "records replayed"
     ]
-    exact, close = sum(found.reproduced.values()), sum(found.within_tolerance.values())
-    poses, same = found.reproduced_poses, f"the same within {TOLERANCE:g} m and rad: {_format_largest(found)}"
-    for counts, what in (
-        (found.reproduced, f"{poses} poses and {exact - poses} other messages are reproduced bit for bit"),
-        (found.within_tolerance, f"{format_count(close, 'message')} are {same}"),
-    ):
-        if any(counts.values()):
-            text += [f"{what}:", *(f"  {name:24} {count:9}" for name, count in sorted(counts.items()))]
-    if not exact and not close:
+    exact, poses = sum(found.reproduced.values()), found.reproduced_poses
+    if exact:
+        text.append(f"{poses} poses and {exact - poses} other messages are reproduced bit for bit:")
+        text += [f"  {name:24} {count:9}" for name, count in sorted(found.reproduced.items()) if count]
+    else:
         text.append("nothing is reproduced: it has no sent messages, or no state to start from")
     if found.skipped:
         skipped = format_count(sum(found.skipped.values()), "message")
         text.append(f"not verified: {skipped}, which depend on a state before the journal")
     if found.unverifiable:
-        text.append(f"not verified: {found.unverifiable} replies about times before the first remaining segment")
+        text.append(f"not verified: {found.unverifiable} replies, which may need poses from before the first segment")
     if found.difference is not None:
         text += _format_difference(found.difference)
     text.append(_format_verdict(found, keyed))
     return text
 
 
-def _format_largest(found: VerificationReport) -> str:
-    off, (meters, radians) = found.max_deviation, found.max_deviation_channels
-    return (
-        f"largest difference {off.meters:.2g} m{f' in {meters}' if meters else ''}, "
-        f"{off.radians:.2g} rad{f' in {radians}' if radians else ''}, {off.share:.2g} of any other number"
-    )
-
-
 def _format_verdict(found: VerificationReport, keyed: bool) -> str:
     if not found.is_reproduced:
         return "NOT PROVED: see the problems above"
-    words = "reproduced, but not all of it bit for bit" if found.within_tolerance else "reproduced bit for bit"
+    words = "reproduced bit for bit"
     if found.is_authentic:
         return f"authentic: {words}, sealed with the vehicle's key"
     if not keyed:
@@ -593,8 +579,6 @@ def _as_json(found: VerificationReport) -> dict[str, Any]:
         "records": found.handled,
         "poses": found.reproduced_poses,
         "exact": dict(sorted(found.reproduced.items())),
-        "close": dict(sorted(found.within_tolerance.items())),
-        "largest": {name: getattr(found.max_deviation, name) for name in ("meters", "radians", "share")},
         "skipped": sum(found.skipped.values()),
         "old_replies": found.unverifiable,
         "lost": found.lost,
