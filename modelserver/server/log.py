@@ -2,8 +2,7 @@
 
 - `RateLimitedLog` logs one cause at most every `LOG_PERIOD_S` seconds, so that a flood cannot fill the log.
 - Text from the bus is escaped, so that it cannot imitate a log line or a terminal sequence.
-- systemd's journal gets each record as one entry of fields, by its native protocol
-  (systemd.io/JOURNAL_NATIVE_PROTOCOL), or, if its socket cannot be reached, as lines.
+- systemd's journal reads standard error; a prefix gives each line its priority (sd-daemon(3)).
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ import faulthandler
 import logging
 import os
 import signal
-import socket
 import sys
 import threading
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, TextIO
 
 if TYPE_CHECKING:
@@ -25,9 +23,6 @@ if TYPE_CHECKING:
 
 LOG_PERIOD_S = 5.0
 MAX_CAUSES = 256
-
-CAUSE: Final = "cause"
-"""Attribute of a log record: its cause, e.g. GPS:malformed; the journal's field MODELSERVER_CAUSE."""
 
 
 class RateLimitedLog:
@@ -60,7 +55,7 @@ class RateLimitedLog:
             text += f" (and {suppressed} times since the last line)"
         if trace:
             text += "".join(f"\n    {escape_text(line)}" for line in traceback.format_exc().splitlines())
-        self._logger.log(level, "%s", text, extra={CAUSE: cause}, stacklevel=3)
+        self._logger.log(level, "%s", text, stacklevel=3)
 
 
 def escape_lines(text: str) -> str:
@@ -77,15 +72,13 @@ def escape_text(text: str) -> str:
 FORMATS: Final = ("auto", "journal", "plain")
 """`auto` is journal if standard error is connected to it, else plain."""
 
-JOURNAL_SOCKET: Final = "/run/systemd/journal/socket"
-
 MAX_MESSAGE_LENGTH: Final = 60_000
-"""Characters of a message; a longer one is truncated. A datagram to the journal has at most some 200 kB."""
+"""Characters of a message; a longer one is truncated."""
 
 INDENT: Final = "    "
 
 
-def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserver") -> None:
+def set_up_logging(level: str, form: str = "auto") -> None:
     """Set up logging from `level` on, in a `form` of FORMATS, unless the program has set it up already.
 
     A process that is killed by a fatal signal, such as the watchdog's, prints the stack of its main thread.
@@ -93,7 +86,7 @@ def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserve
     root = logging.getLogger()
     if not root.handlers:
         root.setLevel(level.upper())
-        root.addHandler(make_handler(form, identifier))
+        root.addHandler(make_handler(form))
     with contextlib.suppress(OSError, ValueError):  # standard error is no file
         # other threads may run meanwhile: reading their stacks can crash, before that of the main thread is written
         faulthandler.enable(all_threads=False)
@@ -109,18 +102,13 @@ def start_in_background(thread: threading.Thread) -> None:
 
 
 def make_handler(
-    form: str,
-    identifier: str = "modelserver",
-    environment: Mapping[str, str] = os.environ,
-    stream: TextIO | None = None,
-    path: str = JOURNAL_SOCKET,
+    form: str, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None
 ) -> logging.Handler:
-    """Make the log handler of a form; `identifier` is the process's name in the journal."""
+    """Make the log handler of a form."""
     stream = stream or sys.stderr
-    if form == "journal" or (form == "auto" and is_journal_stream(stream, environment)):
-        return JournalHandler(stream, identifier, path)
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(PlainFormatter())
+    is_journal = form == "journal" or (form == "auto" and is_journal_stream(stream, environment))
+    handler.setFormatter(LineFormatter(has_priority=is_journal))
     return handler
 
 
@@ -133,61 +121,17 @@ def is_journal_stream(stream: TextIO, environment: Mapping[str, str]) -> bool:
     return environment.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
-class PlainFormatter(logging.Formatter):
-    """Formats as `LEVEL name: message`, further lines indented."""
+class LineFormatter(logging.Formatter):
+    """Formats as `LEVEL name: message`, further lines indented; `has_priority`: each line after its priority."""
+
+    def __init__(self, has_priority: bool = False):
+        super().__init__()
+        self._has_priority = has_priority
 
     def format(self, record: logging.LogRecord) -> str:
         first, *rest = lines_of(record)
-        return "\n".join((f"{record.levelname} {record.name}: {first}", *rest))
-
-
-class JournalHandler(logging.StreamHandler[TextIO]):
-    """Sends records to the journal; if it cannot, writes them as lines to a stream connected to it.
-
-    It never waits: if the journal does not keep up, entries are lost, and the next one reports how many.
-    """
-
-    def __init__(self, stream: TextIO, identifier: str, path: str = JOURNAL_SOCKET):
-        super().__init__(stream)
-        self.setFormatter(PlainFormatter())
-        self._identifier, self._path = identifier, path
-        self._lost = 0
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._socket.setblocking(False)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Send a record."""
-        try:
-            datagram = encode_journal_entry(self._fields(record))
-            try:
-                self._socket.sendto(datagram, self._path)
-            except BlockingIOError:
-                self._lost += 1
-            except OSError:
-                super().emit(record)
-            else:
-                self._lost = 0
-        except Exception:
-            self.handleError(record)
-
-    def close(self) -> None:
-        self._socket.close()
-        super().close()
-
-    def _fields(self, record: logging.LogRecord) -> Iterable[tuple[str, str]]:
-        text = "\n".join(lines_of(record))
-        if self._lost:
-            text += f" ({self._lost} entries before this one were lost: the journal did not keep up)"
-        yield "MESSAGE", text
-        yield "PRIORITY", str(get_priority(record.levelno))
-        yield "SYSLOG_IDENTIFIER", self._identifier
-        yield "LOGGER", record.name
-        yield "CODE_FILE", record.pathname
-        yield "CODE_LINE", str(record.lineno)
-        yield "CODE_FUNC", record.funcName or ""
-        cause = getattr(record, CAUSE, "")
-        if cause:
-            yield "MODELSERVER_CAUSE", escape_text(str(cause))
+        prefix = f"<{get_priority(record.levelno)}>" if self._has_priority else ""
+        return "\n".join(f"{prefix}{line}" for line in (f"{record.levelname} {record.name}: {first}", *rest))
 
 
 def lines_of(record: logging.LogRecord) -> list[str]:
@@ -208,15 +152,3 @@ def get_priority(level: int) -> int:
     """Return the syslog priority of a level: 2 critical, 3 error, 4 warning, 6 info, 7 debug."""
     ranks = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
     return next((number for least, number in ranks if level >= least), 7)
-
-
-def encode_journal_entry(fields: Iterable[tuple[str, str]]) -> bytes:
-    """Encode fields for the journal: `NAME=value`, or with a length if the value has several lines."""
-    parts = []
-    for name, value in fields:
-        data = value.encode("utf-8", "backslashreplace")
-        if b"\n" in data:
-            parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
-        else:
-            parts.append(name.encode() + b"=" + data + b"\n")
-    return b"".join(parts)

@@ -255,7 +255,7 @@ def test_given_the_installed_unit_then_doctor_looks_where_that_keeps_its_state(s
 
 def test_given_a_record_then_the_journal_has_its_fields(site: Site) -> None:
     output = site.machine.journal(SERVICE, "--output=json", "--priority=err")
-    assert '"LOGGER":"modelserver.server.loop"' in output
+    assert "ERROR modelserver.server.loop: " in output
     assert '"SYSLOG_IDENTIFIER":"modelserver"' in output
 
 

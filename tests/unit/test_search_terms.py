@@ -95,8 +95,8 @@ TERMS = {
     "Ackermann": "modelserver/estimation/sensor_rig.py",
     "UTM": "modelserver/earth/geodesy.py",
     # service and drivers
-    "rate limit": "modelserver/server/requests.py",
-    "token bucket": "modelserver/server/requests.py",
+    "rate limit": "modelserver/server/ingress.py",
+    "round robin": "modelserver/server/requests.py",
     "duplicate publisher": "modelserver/core/publisher_conflict.py",
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",

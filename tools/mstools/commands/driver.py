@@ -113,7 +113,7 @@ def command(
     start = ServiceStart(config, Notifier.from_environment())
     with start.wait_on_error():
         vehicle, settings = load_driver(name, config)
-    set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
+    set_up_logging(log_level, log_format)
     with contextlib.ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, play_raw)
         run(vehicle, settings, link, config.parent, url, start)
