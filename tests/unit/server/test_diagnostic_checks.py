@@ -107,18 +107,6 @@ def test_given_another_provider_then_the_missing_check_is_reported() -> None:
             "sudo ip link set eth0 up",
         ),
         (
-            replace(WELL, interface=replace(LO, multicast=False)),
-            "multicast route",
-            DiagnosisLevel.NOTE,
-            "sudo ip link set lo multicast on",
-        ),
-        (
-            replace(WELL, interface=ETH),
-            "multicast route",
-            DiagnosisLevel.NOTE,
-            "sudo ip link set lo up multicast on && sudo ip route replace 239.255.76.67/32 dev lo",
-        ),
-        (
             replace(OUTWARD, interface=LO),
             "multicast route",
             DiagnosisLevel.WARNING,
