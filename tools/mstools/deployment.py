@@ -109,14 +109,15 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Record of an earlier `install`: for each file the hashes that it wrote, and units it enabled."""
+    """Record of an earlier `install`: for each file the hashes that it wrote, units it enabled, folders it made."""
 
     files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
 
     def encode(self) -> bytes:
         files = dict(sorted(self.files.items()))
-        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units}
+        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units, "folders": self.folders}
         return (json.dumps(content, indent=1) + "\n").encode()
 
     @classmethod
@@ -129,6 +130,7 @@ class Manifest:
             return cls(
                 {str(path): tuple(map(str, hashes)) for path, hashes in content["files"].items()},
                 tuple(map(str, content["units"])),
+                tuple(map(str, content["folders"])),
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
@@ -144,6 +146,7 @@ class SystemFacts:
     Attributes
     ----------
     files : hash of each existing file of those that may be written
+    absent : missing folders around them
     by_id : device of each name below /dev/serial/by-id
     rules : content of the installed udev rules
     rmem_max : the kernel's limit of receive buffers, bytes, 0 if unknown
@@ -154,6 +157,7 @@ class SystemFacts:
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
+    absent: frozenset[str] = frozenset()
     manifest: Manifest = field(default_factory=Manifest)
     by_id: Mapping[str, str] = field(default_factory=dict)
     rules: str = ""
@@ -210,7 +214,8 @@ def plan_install(
             steps.append(RemovePath(path, "installed earlier, no longer needed"))
     units = tuple(units)
     obsolete = [unit for unit in facts.manifest.units if unit not in units]
-    manifest = Manifest(owned, units)
+    made = {folder for path in (*changed, MANIFEST) for folder in parent_folders(path)} & facts.absent
+    manifest = Manifest(owned, units, tuple(sorted({*facts.manifest.folders, *made})))
     # first, so that an interrupted installation can be undone
     steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver install --remove`"))
     steps += _plan_reloads(facts, changed)
@@ -246,11 +251,8 @@ def plan_removal(facts: SystemFacts, *, purge: bool) -> Plan:
     steps.append(RemovePath(MANIFEST, "the record of the installation"))
     if purge:
         steps += [RemovePath(path, "the service's state", is_recursive=True) for path in STATE]
-    # those of this installation, nested folders first
-    around = {
-        folder for path in (*manifest.files, MANIFEST) for folder in parent_folders(path) if "modelserver" in folder
-    }
-    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(around, reverse=True)]
+    # nested folders first
+    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(manifest.folders, reverse=True)]
     steps += _plan_reloads(facts, removed)
     notes = []
     if SYSCTL in removed:
@@ -594,6 +596,7 @@ def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
     paths = tuple(paths)
     manifest = read_manifest(root)
     contents = {path: _read_file(path_in_root(root, path)) for path in {*paths, *manifest.files}}
+    around = {folder for path in (*paths, MANIFEST) for folder in parent_folders(path)}
     programs = {name: found for name in PROGRAMS if (found := shutil.which(name, path=SEARCH_PATH))}
     is_live = root == Path("/") and os.path.isdir("/run/systemd/system")
     by_id, rmem_max = {}, 0
@@ -603,6 +606,7 @@ def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
         rmem_max = int(Path("/proc/sys/net/core/rmem_max").read_text()) if root == Path("/") else 0
     return SystemFacts(
         files={path: digest(content) for path, content in contents.items() if content is not None},
+        absent=frozenset(folder for folder in around if not path_in_root(root, folder).is_dir()),
         manifest=manifest,
         by_id=by_id,
         rules=(_read_file(path_in_root(root, RULES)) or b"").decode("utf-8", "replace"),

@@ -34,7 +34,6 @@ from mstools.deployment import (
 
 SERVICE = f"{UNITS}/modelserver.service"
 PATHS = (VEHICLE, f"{CONFIGURATION}/maps/geometry.yaml", SERVICE, RULES, SYSCTL)
-SYSTEM_FOLDERS = ("/etc", "/etc/systemd", UNITS, "/etc/udev", "/etc/udev/rules.d", "/etc/sysctl.d")
 PROGRAMS = {name: f"/usr/bin/{name}" for name in ("systemctl", "udevadm", "sysctl")}
 
 
@@ -43,13 +42,15 @@ class Disk:
 
     def __init__(self, files: Mapping[str, bytes] | None = None):
         self.files = dict(files or {})
-        self.folders = {folder for path in self.files for folder in parent_folders(path)} | set(SYSTEM_FOLDERS)
+        self.folders = {folder for path in self.files for folder in parent_folders(path)} | {"/etc"}
         self.ran: list[str] = []
 
     def facts(self) -> SystemFacts:
         raw = self.files.get(MANIFEST)
+        around = {folder for path in (*PATHS, MANIFEST) for folder in parent_folders(path)}
         return SystemFacts(
             files={path: digest(content) for path, content in self.files.items()},
+            absent=frozenset(around - self.folders),
             manifest=Manifest() if raw is None else Manifest.decode(raw),
             programs=PROGRAMS,
         )
@@ -145,7 +146,7 @@ def test_given_an_interrupted_installation_then_it_can_be_undone() -> None:
     disk.execute(replace(plan, steps=plan.steps[:3]))
     assert len(disk.files) == 3
     disk.remove()
-    assert (disk.files, disk.folders) == ({}, set(SYSTEM_FOLDERS))
+    assert (disk.files, disk.folders) == ({}, {"/etc"})
 
 
 def test_given_a_purge_then_what_was_edited_and_the_state_go_too() -> None:
