@@ -30,7 +30,9 @@ ROS_WORLDS = {"map": WORLD_ENU, "odom": ODOM, "utm": WORLD_UTM}
 
 def complete(name: str) -> str:
     """Return the full name of a frame. As in ROS, a name without a colon is a world frame, or a body's own frame."""
-    return name if ":" in name or not name else ROS_WORLDS.get(name) or join(name, ORIGIN)
+    if not name or not isinstance(name, str) or ":" in name:
+        return name  # what is no text is rejected where a message is made of it
+    return ROS_WORLDS.get(name) or join(name, ORIGIN)
 
 
 def shorten(name: str) -> str:
