@@ -212,7 +212,9 @@ def test_given_a_folder_that_is_not_there_then_it_is_reported_before_the_run(
 
 
 def test_given_help_then_it_reports_that_files_are_replaced(run: Run) -> None:
-    assert "Existing files of --poses, --decisions and --report are replaced" in " ".join(run("--help")[1].split())
+    assert "Existing files of --poses, --decisions, --report and --log are replaced" in " ".join(
+        run("--help")[1].split()
+    )
 
 
 def test_given_standard_output_when_replayed_then_only_the_poses_go_there(short_log: Path, run: Run) -> None:

@@ -15,7 +15,7 @@ from modelserver.errors import ModelServerError, RecordingError
 from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.terminal.options import PrefixOption, UrlOption, option
-from mstools.terminal.output import catch_signals, check_writable, format_count, show_progress
+from mstools.terminal.output import catch_signals, check_writable, format_count, load_given_model, show_progress
 
 PROGRESS_EVENTS = 5_000
 
@@ -26,6 +26,10 @@ DEFAULT_PORT = 8765
 def command(
     log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="LCM log of the service.")] = None,
     out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="MCAP file to write.")] = None,
+    model: Annotated[Path | None, option("--model FILE", "Geometry for a log that has none of the service.")] = None,
+    config: Annotated[
+        Path | None, option("--config -c FILE", "Vehicle file: run the localization on a log that has no poses.")
+    ] = None,
     live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
     raw: Annotated[bool, typer.Option("--raw/--no-raw", help="Include the LCM messages as they are.")] = True,
     force: Annotated[bool, option("--force", "Replace OUT if it exists.")] = False,
@@ -49,11 +53,12 @@ def command(
     \b
     Examples:
       modelserver export drive.lcm drive.mcap
+      modelserver export imported.lcm drive.mcap -c vehicle.yaml
       modelserver export --live
     """
     if live:
-        if log is not None or force or not raw:
-            raise typer.BadParameter("excludes LOG, OUT, --force and --no-raw", param_hint="--live")
+        if log is not None or force or not raw or model is not None or config is not None:
+            raise typer.BadParameter("excludes LOG, OUT, --model, --config, --force and --no-raw", param_hint="--live")
         check_foxglove()
         serve_live(bind, port, seconds, url, prefix)
         return
@@ -61,12 +66,21 @@ def command(
         raise typer.BadParameter("give LOG and OUT, or --live for the running service", param_hint="LOG")
     if bind != "127.0.0.1" or port != DEFAULT_PORT or math.isfinite(seconds) or url:
         raise typer.BadParameter("goes with --live", param_hint="--bind, --port, --seconds, --url")
+    if model is not None and config is not None:
+        raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
     check_foxglove()
-    write_mcap(log, out, raw, prefix, force)
+    from mstools.recordings.localized import open_localized
+
+    check_writable(str(out), force)
+    with open_localized(log, config) as localized:
+        write_mcap(localized, out, raw, prefix, force, model)
 
 
-def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> None:
-    """Write the MCAP file of a log, whole or not at all. Raises ModelServerError, RecordingError, OSError."""
+def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool, model: Path | None = None) -> None:
+    """Write the MCAP file of a log, whole or not at all; `model`: geometry in place of the log's.
+
+    Raises ModelServerError, RecordingError, OSError.
+    """
     import foxglove
 
     from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
@@ -83,7 +97,8 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> Non
             show_progress(f"exporting {log.name}", events.size) as show,
             foxglove.open_mcap(part, context=context),
         ):
-            writer = FoxgloveWriter(context, prefix, find_definitions() if raw else None)
+            given = None if model is None else load_given_model(model, {})
+            writer = FoxgloveWriter(context, prefix, find_definitions() if raw else None, given)
             for count, event in enumerate(events, 1):
                 writer.feed(event.channel, event.data, event.utime)
                 if count % PROGRESS_EVENTS == 0:
@@ -92,7 +107,8 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool) -> Non
                 raise RecordingError(
                     f"{log}: no complete geometry on {prefix}MODEL_SNAPSHOT, so there are no frames. The service "
                     "publishes it at its start and every few seconds: record its channels too (modelserver record); "
-                    "for a channel prefix use --prefix"
+                    "for a channel prefix use --prefix. Or give the geometry with --model FILE, or the vehicle file, "
+                    "with which the localization runs too: -c FILE"
                 )
         part.replace(out)
     finally:

@@ -47,6 +47,10 @@ def command(
         str,
         option("--decisions JSONL", "Offline: write the decision on each measurement here, one JSON object per line."),
     ] = "",
+    out: Annotated[
+        Path | None,
+        option("--log OUT", "Offline: write an LCM log of its messages and of all that the service publishes."),
+    ] = None,
     report: Annotated[str, option("--report HTML", "Replay offline, and write a report for a browser.")] = "",
     frame: Annotated[
         str, option("--frame BODY:FRAME", "Frame of the poses. Default: the base frame.", autocompletion=complete_frame)
@@ -80,9 +84,10 @@ def command(
 
     Offline, with --poses, the daemon's core processes the log as fast as possible, and writes the pose of one frame in
     World:UTM at a fixed rate or at listed times, each from the samples that had arrived before it; see
-    docs/recordings.md. --report writes a report of the same run: track, innovations, biases, gaps, validity, findings.
+    docs/recordings.md. --log writes the log as it would be with the service running: for view, export, query --log and
+    status. --report writes a report of the same run: track, innovations, biases, gaps, validity, findings.
     A log with an incomplete last event is used up to there; for other damage the exit code is 1. Existing files of
-    --poses, --decisions and --report are replaced.
+    --poses, --decisions, --report and --log are replaced.
 
     With --verify a journal is replayed, and the first message that is not reproduced is printed. Exit code 0:
     reproduced bit for bit, and authentic where --key is given; 3: reproduced, but --key does not prove authenticity; 1:
@@ -94,6 +99,7 @@ def command(
       modelserver replay drive.lcm --speed 2
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCenter --rate 10
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --report drive.html
+      modelserver replay drive.lcm -c config/husky/vehicle.yaml --log localized.lcm
       modelserver replay --verify /var/lib/modelserver/journal-Husky --key /etc/modelserver/commands.key
     """
     if verify:
@@ -107,7 +113,13 @@ def command(
     if key is not None:
         raise typer.BadParameter("--key needs --verify")
     channels = frozenset(channel or ())
-    if poses or report:
+    if out is not None:
+        if config is None:
+            raise typer.BadParameter("needs the vehicle file: -c FILE", param_hint="--log")
+        if any((poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")):
+            raise typer.BadParameter("goes with -c and --json alone: run twice for more", param_hint="--log")
+        localize(log, config, out, as_json)
+    elif poses or report:
         if config is None:
             raise typer.BadParameter(f"{'--poses' if poses else '--report'} needs the vehicle file: -c FILE")
         if rate is not None and not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
@@ -132,6 +144,25 @@ def command(
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp needs --speed 1: stamps must not run faster than the clock")
         replay_to_bus(log, config, factor, None if everything else channels, url, as_json, restamp)
+
+
+def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
+    """Write a log with the service's messages, whole or not at all."""
+    from mstools.recordings.localized import write_localized
+
+    _check_outputs({"log": str(out)}, [log, config])
+    part = out.with_name(f".{out.name}.part")
+    try:
+        counts = write_localized(log, config, part)
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+    if as_json:
+        typer.echo(json.dumps(counts))
+        return
+    typer.echo(escape(f"{out}: {format_count(sum(counts.values()), 'message')}"))
+    for name, count in sorted(counts.items()):
+        typer.echo(escape(f"  {name} {count}"))
 
 
 def replay_to_bus(

@@ -12,7 +12,7 @@ import tempfile
 import time
 import weakref
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
-from modelserver.errors import NoServerError, WireError, find_nearest_names, quote
+from modelserver.errors import NoServerError, RecordingError, WireError, find_nearest_names, quote
 from modelserver.messages import DriverHealth, Health
 from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_pattern
 from modelserver.wire.codec import decode
@@ -58,7 +58,13 @@ HEALTH = "MODELSERVER_HEALTH"
 
 
 def command(
-    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, for its bus and prefix.")] = None,
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="Show the last report in this LCM log instead.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        option("--config -c FILE", "The vehicle file, for its bus and prefix; with LOG: run the localization on it."),
+    ] = None,
     watch: Annotated[bool, option("--watch -w", "Show each report, until Ctrl-C.")] = False,
     spy: Annotated[bool, option("--spy", "Show all channels decoded, in lcm-spy.")] = False,
     as_json: JsonOption = False,
@@ -77,6 +83,8 @@ def command(
     and Java (default-jre), and at the first run a Java compiler (default-jdk-headless): the types are compiled once for
     each version of the wire contract, and stored in the user's cache.
 
+    With LOG it shows the last report in a log. With -c too the localization runs on the log first.
+
     Exit code: 0 the daemon runs with a valid pose, 3 it runs without one, 1 no report was received, 2 wrong usage.
 
     \b
@@ -91,6 +99,11 @@ def command(
         vehicle = load_config(config)
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         drivers = tuple(vehicle.drivers)
+    if log is not None:
+        if watch or spy or url:
+            raise typer.BadParameter("goes without --watch, --spy and --url", param_hint="LOG")
+        show_last_report(log, config, prefix, as_json)
+        return
     if spy:
         run_spy(url)
     provider = resolve_url(url)
@@ -105,11 +118,37 @@ def command(
     listener.listen(
         max(0.0, min(DRIVER_WAIT_S, timeout) - (time.monotonic() - began)), lambda: listener.has_drivers(drivers)
     )
-    reports = (listener.report, listener.drivers.values())
-    text = json.dumps(as_data(*reports), indent=2) if as_json else replace_unencodable(format_report(*reports, drivers))
-    typer.echo(text)
-    if not is_healthy(listener.report):
+    show_report(listener.report, listener.drivers.values(), drivers, as_json)
+
+
+def show_report(health: Health, reports: Iterable[DriverHealth], drivers: tuple[str, ...], as_json: bool) -> None:
+    """Print a report, and exit with EXIT_UNHEALTHY where it has no valid pose."""
+    text = format_report(health, reports, drivers)
+    typer.echo(json.dumps(as_data(health, reports), indent=2) if as_json else replace_unencodable(text))
+    if not is_healthy(health):
         raise typer.Exit(EXIT_UNHEALTHY)
+
+
+def show_last_report(log: Path, config: Path | None, prefix: str, as_json: bool) -> None:
+    """Print the last report in a log, with a vehicle file after the localization. Raises RecordingError, OSError."""
+    from modelserver.wire.eventlog import LogFile
+    from mstools.recordings.localized import open_localized
+
+    health: Health | None = None
+    drivers: dict[str, DriverHealth] = {}
+    with open_localized(log, config) as localized, LogFile(localized) as events:
+        for event in events:
+            with suppress(WireError):
+                if event.channel == f"{prefix}{HEALTH}":
+                    health = decode("health_t", event.data)
+                elif event.channel == f"{prefix}DRIVER_HEALTH":
+                    driver: DriverHealth = decode("driver_health_t", event.data)
+                    drivers[driver.source] = driver
+    if health is None:
+        raise RecordingError(
+            f"{log}: no report on {prefix}{HEALTH}; with -c and the vehicle file the localization runs on the log"
+        )
+    show_report(health, drivers.values(), tuple(drivers), as_json)
 
 
 POLL_S: Final = 0.2

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 import webbrowser
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +42,9 @@ def command(
     ] = None,
     live: Annotated[bool, option("--live", "Follow the running service.")] = False,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log, in place of its own.")] = None,
+    config: Annotated[
+        Path | None, option("--config -c FILE", "Vehicle file: run the localization on a log that has no poses.")
+    ] = None,
     settings: Variables = None,
     bind: Annotated[
         str, option("--bind ADDRESS", "Serve the page at this address. Beyond loopback its link has a token.")
@@ -61,6 +65,7 @@ def command(
 
     The page shows bodies, frames, constraints and joints in 3D, the vehicle in the world with trail, fixes and
     uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
+    --config the localization runs on a log that has no poses, such as an imported one. With
     --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
     to the running service, signed with --key. It needs the extra view: pip install 'modelserver[view]'. Nothing is
     loaded from the internet.
@@ -70,10 +75,13 @@ def command(
       modelserver view config/raptor/geometry.yaml
       modelserver view config/raptor/vehicle.yaml --edit --key reload.key
       modelserver view drive.lcm
+      modelserver view imported.lcm -c vehicle.yaml
       modelserver view --live
     """
     if live == (file is not None):
         raise typer.BadParameter("give a file or --live", param_hint="FILE")
+    if config is not None and (live or edit or model is not None):
+        raise typer.BadParameter("goes with a log: it runs the localization on it", param_hint="--config")
     if edit and live:
         raise typer.BadParameter("goes with a geometry or vehicle file: that of the service", param_hint="--edit")
     check_installed()
@@ -81,31 +89,33 @@ def command(
     from mstools.view.viewer import Viewer
 
     editing = open_editing(file, settings, url, prefix, key or "") if edit and file is not None else None
-    source = open_source(file, model, settings, url, prefix, timeout, editing)
-    try:
+    with ExitStack() as stack:
+        shown = file
+        if config is not None and file is not None:
+            from mstools.recordings.localized import open_localized
+
+            shown = stack.enter_context(open_localized(file, config))
+        source = open_source(shown, model, settings, url, prefix, timeout, editing)
+        stack.callback(source.close)
         try:
             page = open_page(bind, DEFAULT_PORT if port is None else port, with_token=edit)
         except ViewError:
             if port is not None:
                 raise
             page = open_page(bind, 0, with_token=edit)
-        try:
-            viewer = Viewer(page, source, editing)
-            typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
-            sys.stdout.flush()
-            if editing is not None and editing.session.has_errors:
-                typer.echo(escape(f"modelserver: {source.title}: has errors, listed in the tab Edit"), err=True)
-            for each in source.notes[:SHOWN_NOTES]:
-                typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
-            if not no_browser and bind == LOOPBACK and has_screen():
-                webbrowser.open(page.link)
-            end = time.monotonic() + seconds
-            with catch_signals() as stop:
-                viewer.run(lambda: stop.is_set() or time.monotonic() >= end)
-        finally:
-            page.close()
-    finally:
-        source.close()
+        stack.callback(page.close)
+        viewer = Viewer(page, source, editing)
+        typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
+        sys.stdout.flush()
+        if editing is not None and editing.session.has_errors:
+            typer.echo(escape(f"modelserver: {source.title}: has errors, listed in the tab Edit"), err=True)
+        for each in source.notes[:SHOWN_NOTES]:
+            typer.echo(escape(f"modelserver: {source.title}: {each}"), err=True)
+        if not no_browser and bind == LOOPBACK and has_screen():
+            webbrowser.open(page.link)
+        end = time.monotonic() + seconds
+        with catch_signals() as stop:
+            viewer.run(lambda: stop.is_set() or time.monotonic() >= end)
 
 
 def has_screen() -> bool:

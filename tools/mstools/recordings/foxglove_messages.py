@@ -121,11 +121,13 @@ class FoxgloveWriter:
     ----------
     prefix : of the service's channels
     definitions : folder of the .lcm files; with it the LCM messages are logged too, None for none
+    model : geometry in place of that of the service
     """
 
-    def __init__(self, context: Context, prefix: str = "", definitions: Path | None = None):
+    def __init__(self, context: Context, prefix: str = "", definitions: Path | None = None, model: Model | None = None):
         self._context = context
-        self._drive = Drive(prefix, on_event=self._log_event)
+        base = "" if model is None else names.join(model.root.name, model.root.frames[0].name)
+        self._drive = Drive(prefix, model, base, keep_geometry=model is not None, on_event=self._log_event)
         self._now = 0
         self._definitions = definitions
         self._frames: FramePoses | None = None

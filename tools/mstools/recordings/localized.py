@@ -1,0 +1,55 @@
+"""A log as it would be if the service had run meanwhile, for commands that show what the service publishes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import lcm
+import typer
+
+from modelserver.config.vehicle_file import load_config
+from modelserver.server.offline import serve
+from modelserver.server.recordings import StampAxis
+from modelserver.server.vehicle import load_vehicle
+from modelserver.wire.eventlog import LogFile
+from mstools.terminal.output import escape, show_progress
+
+PROGRESS_EVENTS = 500
+
+
+def write_localized(log: Path, config: Path, out: Path) -> dict[str, int]:
+    """Write the log with the service's messages; return the number of messages by channel.
+
+    Notes of the log go to stderr. Raises ConfigError, GeometryError, RecordingError, OSError.
+    """
+    vehicle = load_vehicle(load_config(config), str(config))
+    axis = StampAxis()
+    counts: dict[str, int] = {}
+    writer = lcm.EventLog(str(out), "w", overwrite=True)
+    try:
+        with LogFile(log) as events, show_progress(f"localizing {log.name}", events.size) as show:
+            for number, event in enumerate(serve(vehicle, events, axis)):
+                writer.write_event(event.utime, event.channel, event.data)
+                counts[event.channel] = counts.get(event.channel, 0) + 1
+                if number % PROGRESS_EVENTS == 0:
+                    show(event.end)
+    finally:
+        writer.close()
+    for note in (*axis.describe(), *map(str, events.damage)):
+        typer.echo(escape(f"modelserver: {log}: {note}"), err=True)
+    return counts
+
+
+@contextmanager
+def open_localized(log: Path, config: Path | None) -> Iterator[Path]:
+    """Give the log itself, or with a vehicle file a temporary one with what the service makes of it."""
+    if config is None:
+        yield log
+        return
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        out = Path(folder) / log.name
+        write_localized(log, config, out)
+        yield out
