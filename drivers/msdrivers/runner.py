@@ -94,6 +94,7 @@ class HealthReporter:
         self._reported = self._logged = (DriverPhase.CLOSED, "")
         self._changes, self._changed_ns = 0, now.monotonic_ns
         self._logged_ns: dict[tuple[DriverPhase, str], int] = {}
+        self._started_ns = now.monotonic_ns
 
     @property
     def state(self) -> tuple[DriverPhase, str]:
@@ -134,7 +135,10 @@ class HealthReporter:
         self._changes += 1
         if self._changes > MAX_CHANGES_PER_PERIOD and not self.is_ending:
             return
-        if self.is_ending or now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS:
+        # at a start the device may appear after its driver: what is wrong then is logged once it lasts (`on_timer`)
+        is_starting = self._sample_ns is None and now.monotonic_ns - self._started_ns < STABLE_NS
+        is_new = now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS
+        if self.is_ending or (is_new and not (is_starting and self._is_bad)):
             self._log(now)
         self._send(now)
 
@@ -151,14 +155,19 @@ class HealthReporter:
         self._counted_ns, self._counted = now.monotonic_ns, self.samples
         self._send(now)
 
+    @property
+    def _is_bad(self) -> bool:
+        phase, _ = self.state
+        is_lost = phase is DriverPhase.CLOSED and not self.is_ending
+        return phase is DriverPhase.SILENT or is_lost or self._is_warning
+
     def _log(self, now: HostTime) -> None:
         self._logged = self.state
         if len(self._logged_ns) >= MAX_LOGGED_STATES:
             self._logged_ns.clear()
         self._logged_ns[self._logged] = now.monotonic_ns
         phase, text = self._logged
-        bad = phase is DriverPhase.SILENT or (phase is DriverPhase.CLOSED and not self.is_ending)
-        level = logging.WARNING if bad or self._is_warning else logging.INFO
+        level = logging.WARNING if self._is_bad else logging.INFO
         log.log(level, "%s: %s%s", self._source, phase.name.lower(), f": {text}" if text else "")
 
 

@@ -223,6 +223,19 @@ def test_given_a_warning_that_is_over_then_a_later_silence_does_not_name_it(capl
     assert messages[-1] == ("WARNING", "imu: silent: nothing received for 3 s")
 
 
+@pytest.mark.parametrize(("seconds", "first_warning"), [(2.0, math.inf), (20.0, 5.0)])
+def test_given_a_device_that_appears_after_its_driver_then_only_a_lasting_absence_is_a_warning(
+    caplog: pytest.LogCaptureFixture, seconds: float, first_warning: float
+) -> None:
+    bench = Bench()
+    bench.link.outages = [(0.0, seconds)]
+    at = math.inf
+    while bench.now < 8.0 and not math.isfinite(at):
+        messages = collect_log(caplog, lambda: bench.until(bench.now + 0.5))
+        at = bench.now if any(level == "WARNING" and "closed" in text for level, text in messages) else at
+    assert at == pytest.approx(first_warning, abs=1.6)
+
+
 def test_given_bytes_that_are_no_command_then_the_endpoint_reports_it_as_a_warning(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

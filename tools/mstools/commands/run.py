@@ -53,7 +53,8 @@ def command(
         vehicle = load_vehicle(settings, str(config))
         vehicle.make_command_verifier(0, str(config))
     for problem in vehicle.model.problems:
-        logging.getLogger("modelserver").warning("%s", problem)
+        level = logging.INFO if problem.severity is Severity.NOTE else logging.WARNING
+        logging.getLogger("modelserver").log(level, "%s", problem)
     daemon.run(vehicle, url, str(config), notifier)
 
 
