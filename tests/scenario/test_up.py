@@ -104,7 +104,7 @@ def test_given_emulated_devices_then_pose_and_viewer_are_there_and_all_end_with_
 def test_given_real_devices_that_are_missing_then_up_waits_for_them_and_ends_after_its_time(
     cart: Path, lcm_url: str
 ) -> None:
-    process = start_up(cart, lcm_url, "--seconds", "6")
+    process = start_up(cart, lcm_url, "--seconds", "9")
     try:
         out, _ = process.communicate(timeout=TIMEOUT_S)
     finally:
