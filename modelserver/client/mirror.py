@@ -81,7 +81,7 @@ class LocalPlatform(PlatformClient):
     def _query_pose(
         self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
     ) -> PoseAnswer:
-        time = _make_time(at, policy, wait_ms)
+        interest, reference, time = names.complete(interest), names.complete(reference), _make_time(at, policy, wait_ms)
         state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
         if _is_static(view, interest, reference) and len(state.static_answers) < CACHE_SIZE:
@@ -315,8 +315,7 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_answers[frame_of_interest, frame_of_reference].transformation
         except KeyError:
-            ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
-            return self._query_pose(*ends, to_utime(at), policy, wait_ms).transformation
+            return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms).transformation
 
     def _query_pose(
         self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND

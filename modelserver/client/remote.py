@@ -250,8 +250,7 @@ class FrameClient(ABC):
         """
         demand = make_demand(max_horizontal, max_heading, max_age, min_integrity)
         utime = at if type(at) is int else to_utime(at)
-        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
-        return self._query_pose(*ends, utime, policy, wait_ms, demand)
+        return self._query_pose(frame_of_interest, frame_of_reference, utime, policy, wait_ms, demand)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -381,8 +380,9 @@ class PlatformClient(FrameClient):
         QueryError
             The reason in the reply.
         """
-        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
-        return self._query_pose(*ends, at if type(at) is int else to_utime(at), policy, wait_ms).transformation
+        return self._query_pose(
+            frame_of_interest, frame_of_reference, at if type(at) is int else to_utime(at), policy, wait_ms
+        ).transformation
 
     def get_state_vector(
         self, *, at: Time = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0

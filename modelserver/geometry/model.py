@@ -207,7 +207,7 @@ class Model:
         try:
             return self._transformations[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._compute(names.complete(frame_of_interest), names.complete(frame_of_reference))
+            return self._compute(*_complete(frame_of_interest, frame_of_reference))
 
     def get_kinematic_path(self, frame_of_interest: str, frame_of_reference: str) -> KinematicPath:
         """Return the shortest kinematic path from the frame of reference to the frame of interest, cached.
@@ -216,8 +216,7 @@ class Model:
         """
         found = self._paths.get((frame_of_interest, frame_of_reference))
         if found is None:
-            frame_of_interest = names.complete(frame_of_interest)
-            frame_of_reference = names.complete(frame_of_reference)
+            frame_of_interest, frame_of_reference = _complete(frame_of_interest, frame_of_reference)
             interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
             if interest.assembly in self._assemblies_with_loops:
                 path = self.find_path(frame_of_interest, frame_of_reference)
@@ -386,6 +385,13 @@ class Model:
             f"<Model {self.name or 'unnamed'}: {len(self.bodies)} bodies, {frames} frames, "
             f"{len(self.constraints)} constraints, revision {self.revision}>"
         )
+
+
+def _complete(interest: str, reference: str) -> tuple[str, str]:
+    """Return two names of frames in full; most are."""
+    if ":" in interest and ":" in reference:
+        return interest, reference
+    return names.complete(interest), names.complete(reference)
 
 
 def _check_unique(what: str, given: list[str]) -> None:

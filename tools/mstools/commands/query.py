@@ -447,6 +447,7 @@ class FileAnswers(FrameClient):
     def _query_pose(
         self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int, demand: PoseDemand = NO_DEMAND
     ) -> PoseAnswer:
+        interest, reference = names.complete(interest), names.complete(reference)
         known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
         reserved = [each for each in (interest, reference) if each.partition(":")[0] in names.RESERVED_BODIES]
         for frame in reserved:
