@@ -90,7 +90,7 @@ def main() -> int:
         queue = JournalQueue()
         with_it, without = LoopBench(vehicle, queue), LoopBench(vehicle, JournalQueue())
         ring = Ring(Path(folder) / "journal", 1 << 30, 16 << 20)
-        write = JournalWriter(queue, ring, config, {"run": "bench"}, [], with_it.clock)
+        write = JournalWriter(queue, ring, config, {"run": "bench"}, with_it.clock)
         samples = simulate_samples(config)
         costs: dict[str, list[float]] = {"with": [], "without": [], "thread": []}
         for number in range(ROUNDS):
