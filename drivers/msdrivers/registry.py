@@ -105,8 +105,9 @@ class NtripSettings:
     """User name; empty for none."""
     password: str = ""
     """Password."""
-    gga_period: float = 0.0
-    """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; 0: none."""
+    gga_period: float | None = None
+    """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; None: 10 for a
+    stream that sends nothing and needs them by the source table; 0: none."""
 
     def __post_init__(self) -> None:
         try:
@@ -115,7 +116,7 @@ class NtripSettings:
             raise ValueError(f"caster is HOST:PORT, e.g. rtk.example.org:2101, got {quote(self.caster)}") from None
         if not self.mountpoint or not self.mountpoint.isprintable() or set(self.mountpoint) & set(" /\r\n"):
             raise ValueError(f"mountpoint is the name of a stream, got {quote(self.mountpoint)}")
-        if not (self.gga_period == 0.0 or 1.0 <= self.gga_period <= 3600.0):
+        if self.gga_period is not None and not (self.gga_period == 0.0 or 1.0 <= self.gga_period <= 3600.0):
             raise ValueError(f"gga_period is 0 or 1 to 3600 s, got {self.gga_period:g}")
 
 

@@ -38,6 +38,8 @@ maps = st.builds(
     st.booleans(),
     st.floats(1e-3, 10.0).flatmap(lambda scale: st.sampled_from((scale, -scale))),
     st.floats(-360.0, 360.0),
+    st.none(),
+    st.sampled_from((None, "CDAB", "DCBA")),
 )
 frames = st.builds(
     CanFrame,
@@ -54,7 +56,7 @@ def test_given_any_whole_number_when_written_to_registers_then_it_is_read_again(
 ) -> None:
     number = data.draw(st.integers(mapped.lowest, mapped.highest))
     words = mapped.to_words(number)
-    assert len(words) == mapped.registers
+    assert len(words) == mapped.word_count
     assert all(0 <= word <= 0xFFFF for word in words)
     assert mapped.to_number(words) == number
     assert mapped.to_degrees(mapped.from_degrees(mapped.to_degrees(words))) == pytest.approx(

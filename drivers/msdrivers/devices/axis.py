@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import contextlib
 import math
+import struct
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
+from modelserver.errors import quote
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
 from msdrivers.devices import Strict, check_ranges
 from msdrivers.devices.stream import BoundedCounter
@@ -45,10 +47,27 @@ from msdrivers.endpoint import (
     is_reply_to,
 )
 
+_TYPES: Final = {
+    "int16": (1, True),
+    "uint16": (1, False),
+    "int32": (2, True),
+    "uint32": (2, False),
+    "float32": (2, True),
+}
+"""Registers and sign of each type."""
+
+_ORDERS: Final = ("ABCD", "CDAB", "BADC", "DCBA")
+
+_MAX_FLOAT32: Final = (2**24 - 1) << 104
+"""IEEE 754, binary32: 24 bits of 1 at the highest exponent, which is a whole number."""
+
+_FLOAT32_TOLERANCE: Final = 4 * 2.0**-23
+"""Relative: a device that stores another unit rounds twice on writing and twice on reading."""
+
 
 @dataclass(frozen=True, slots=True)
 class RegisterMap(Strict):
-    """A number in degrees or degrees a second: the registers' whole number times `scale_deg` plus `offset_deg`."""
+    """A number in degrees or degrees a second: that of the registers times `scale_deg` plus `offset_deg`."""
 
     address: int
     """Address of the protocol, from 0: what manuals call 40001 is 0."""
@@ -62,13 +81,32 @@ class RegisterMap(Strict):
     """Degrees (a second) for each unit; negative turns the sense."""
     offset_deg: float = 0.0
     """Degrees (a second) at 0."""
+    type: Literal["int16", "uint16", "int32", "uint32", "float32"] | None = None
+    """Instead of `registers` and `is_signed`; None: a whole number as they describe it."""
+    order: Literal["ABCD", "CDAB", "BADC", "DCBA"] | None = None
+    """Instead of `high_word_first`: the order in which the bytes are sent, A the highest. None: ABCD, or CDAB with
+    `high_word_first: false`. Of 16 bits, BADC and DCBA swap the bytes."""
 
     def __post_init__(self) -> None:
         if self.registers not in (1, 2):
             raise ValueError(f"registers is 1 (16 bits) or 2 (32 bits), got {self.registers}")
-        if not 0 <= self.address <= LAST_ADDRESS + 1 - self.registers:
+        if self.type is not None:
+            if self.type not in _TYPES:
+                raise ValueError(f"type is {', '.join(_TYPES)}, got {quote(self.type)}")
+            count, is_signed = _TYPES[self.type]
+            # a default that is written cannot be distinguished from nothing written, and contradicts nothing
+            if self.registers not in (1, count):
+                raise ValueError(f"registers is left out with type: {self.type} has {count}, got {self.registers}")
+            if not self.is_signed and is_signed:
+                raise ValueError(f"is_signed is left out with type: {self.type} is signed, got false")
+        if self.order is not None:
+            if self.order not in _ORDERS:
+                raise ValueError(f"order is {', '.join(_ORDERS)}, got {quote(self.order)}")
+            if not self.high_word_first and self.order not in ("CDAB", "DCBA"):
+                raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
+        if not 0 <= self.address <= LAST_ADDRESS + 1 - self.word_count:
             raise ValueError(
-                f"address is 0 to {LAST_ADDRESS + 1 - self.registers}, got {self.address}; a manual's 40001 is 0"
+                f"address is 0 to {LAST_ADDRESS + 1 - self.word_count}, got {self.address}; a manual's 40001 is 0"
             )
         if not math.isfinite(self.scale_deg) or self.scale_deg == 0.0:
             raise ValueError(f"scale_deg is a number and not 0, got {self.scale_deg:g}")
@@ -76,29 +114,43 @@ class RegisterMap(Strict):
             raise ValueError(f"offset_deg is a number, got {self.offset_deg:g}")
 
     @property
+    def word_count(self) -> int:
+        """The number of registers."""
+        return self.registers if self.type is None else _TYPES[self.type][0]
+
+    @property
+    def is_float(self) -> bool:
+        return self.type == "float32"
+
+    @property
     def lowest(self) -> int:
-        """The lowest whole number that the registers hold."""
-        return -(1 << (16 * self.registers - 1)) if self.is_signed else 0
+        """The lowest number that the registers hold."""
+        if self.is_float:
+            return -_MAX_FLOAT32
+        is_signed = self.is_signed if self.type is None else _TYPES[self.type][1]
+        return -(1 << (16 * self.word_count - 1)) if is_signed else 0
 
     @property
     def highest(self) -> int:
-        """The highest whole number that the registers hold."""
-        return self.lowest + (1 << (16 * self.registers)) - 1
+        """The highest number that the registers hold."""
+        return _MAX_FLOAT32 if self.is_float else self.lowest + (1 << (16 * self.word_count)) - 1
 
-    def to_number(self, values: Sequence[int]) -> int:
-        """Return the integer of `registers` registers."""
-        words = values if self.high_word_first else values[::-1]
-        number = 0
-        for word in words:
-            number = number << 16 | word
-        return number - (1 << 16 * self.registers) if number > self.highest else number
+    def to_number(self, values: Sequence[int]) -> float:
+        """Return the number of the registers: a whole one except of float32, which may be non-finite."""
+        data = struct.pack(f">{len(values)}H", *self._reorder(values))
+        if self.is_float:
+            (real,) = struct.unpack(">f", data)
+            return float(real)
+        number = int.from_bytes(data, "big")
+        return number - (1 << 16 * self.word_count) if number > self.highest else number
 
-    def to_words(self, number: int) -> tuple[int, ...]:
-        """Return the registers of a whole number. Raises ValueError for one that they do not hold."""
+    def to_words(self, number: float) -> tuple[int, ...]:
+        """Return the registers of a number. Raises ValueError for one that they do not hold."""
         if not self.lowest <= number <= self.highest:
             raise ValueError(f"{number} is not within {self.lowest} to {self.highest}")
-        words = tuple(number >> shift & 0xFFFF for shift in range(16 * (self.registers - 1), -1, -16))
-        return words if self.high_word_first else words[::-1]
+        bits = 16 * self.word_count
+        data = struct.pack(">f", number) if self.is_float else (int(number) % (1 << bits)).to_bytes(bits // 8, "big")
+        return self._reorder(struct.unpack(f">{self.word_count}H", data))
 
     def to_degrees(self, values: Sequence[int]) -> float:
         """Return the value of registers in degrees (a second)."""
@@ -106,10 +158,26 @@ class RegisterMap(Strict):
 
     def from_degrees(self, degrees: float) -> tuple[int, ...]:
         """Return the registers nearest to a value. Raises ValueError for one that they do not hold."""
-        return self.to_words(round((degrees - self.offset_deg) / self.scale_deg))
+        return self.to_words(self._find_nearest(degrees))
 
     def can_hold(self, degrees: float) -> bool:
-        return self.lowest <= round((degrees - self.offset_deg) / self.scale_deg) <= self.highest
+        return self.lowest <= self._find_nearest(degrees) <= self.highest
+
+    def is_same(self, values: Sequence[int], degrees: float) -> bool:
+        """Return whether registers that are read have the value that was written, but for rounding of float32."""
+        if self.is_float:
+            return math.isclose(self.to_number(values), self._find_nearest(degrees), rel_tol=_FLOAT32_TOLERANCE)
+        return tuple(values) == self.from_degrees(degrees)
+
+    def _find_nearest(self, degrees: float) -> float:
+        number = (degrees - self.offset_deg) / self.scale_deg
+        return number if self.is_float else round(number)
+
+    def _reorder(self, values: Sequence[int]) -> tuple[int, ...]:
+        """Return registers as sent in the order ABCD, or the reverse: both are the same swap."""
+        order = self.order or ("ABCD" if self.high_word_first else "CDAB")
+        words = values[::-1] if order in ("CDAB", "DCBA") else values
+        return tuple((word & 0xFF) << 8 | word >> 8 for word in words) if order in ("BADC", "DCBA") else tuple(words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +206,7 @@ class AxisRegisters(Strict):
             raise ValueError(
                 "lower_limit, upper_limit and nod_rate are given together or not at all: nodding needs all"
             )
-        spread = max(each.address + each.registers for each in self.measured.values()) - self.begin
+        spread = max(each.address + each.word_count for each in self.measured.values()) - self.begin
         if spread > MAX_READ:
             raise ValueError(
                 f"angle, rate and sequence lie {spread} registers apart; at most {MAX_READ} are read at one instant"
@@ -273,7 +341,7 @@ class ReadingValidator:
     def clear(self) -> None:
         self._last: _TimedAngle | None = None
         self._suspect: _TimedAngle | None = None
-        self._number: int | None = None
+        self._number: float | None = None
 
     def validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
         """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
@@ -285,7 +353,7 @@ class ReadingValidator:
         def get_words(name: str) -> Sequence[int]:
             mapped = registers.measured[name]
             begin = mapped.address - registers.begin
-            return values[begin : begin + mapped.registers]
+            return values[begin : begin + mapped.word_count]
 
         if registers.sequence is not None:
             number = registers.sequence.to_number(get_words("sequence"))
@@ -346,7 +414,7 @@ class AxisDriver:
         self.counts = BoundedCounter()
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
         self._table = RegisterTable(registers.table)
-        self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
+        self._length = max(each.address + each.word_count for each in registers.measured.values()) - registers.begin
         self._readings = ReadingValidator(settings)
         self._commanded: Mapping[str, RegisterMap] = registers.commanded
         self._steps: _Steps | None = None
@@ -462,14 +530,14 @@ class AxisDriver:
             self._current[name] = wanted[name]
         for name in order:
             mapped, reply = self._commanded[name], (yield self._read(name))
-            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
+            if isinstance(reply, Registers) and not mapped.is_same(reply.values, wanted[name]):
                 self._current[name] = mapped.to_degrees(reply.values)
                 actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
                 self._warning = f"{actual}: the axis's own limit"
 
     def _read(self, name: str) -> _Step:
         mapped = self._commanded[name]
-        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.registers)
+        return f"reading {name} (register {mapped.address})", ReadRegisters(mapped.address, mapped.word_count)
 
     def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
@@ -566,7 +634,8 @@ class AxisDriver:
 
 _WARNINGS = {
     "repeated": "the sequence number does not change; a reading with the same number is not published",
-    "range": "an angle outside lowest_deg and highest_deg; are scale_deg, is_signed and high_word_first right?",
+    "range": "an angle outside lowest_deg and highest_deg; are scale_deg, is_signed and high_word_first right? "
+    "(With type and order: are they?)",
     "jump": "an angle that the axis cannot have reached since the last reading; it is not published",
     "rate": "a rate above fastest_deg; is the scale of `rate` right? It is published as not measured",
 }

@@ -10,6 +10,12 @@ reserves for "not available" or "error" is no value. cantools reads a whole file
 is split into its statements, and each message is read by itself with what belongs to it: those that can be read may be
 mapped, and the others are problems of the file.
 
+J1939 (SAE J1939-21, 5.2): a 29-bit identifier is priority (3 bits), PGN (18 bits; with a PDU format below 240 its low
+byte is the destination instead) and source address (8 bits). A DBC file has any priority, and customarily 0xFE, the
+null address, as source. So frames of a J1939 message are matched by PGN: from the source that the settings state, else
+from the file's own, else from the first that sends it, until that is silent. Messages of more than 8 bytes come in
+several packets (transport protocol), which are not supported.
+
 Driver (`CanDriver`): decoding, assembly of instants, silence, malformed frames, bus-off.
 """
 
@@ -39,6 +45,29 @@ from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
+
+
+MAX_SOURCE_ADDRESS: Final = 0xFD
+"""0xFE is the null address, 0xFF all (SAE J1939-81)."""
+
+MAX_J1939_BYTES: Final = 8
+"""Of a message in one frame."""
+
+_PDU1_FORMATS: Final = 240
+
+
+def find_pgn(arbitration_id: int) -> int:
+    """Return the PGN of a 29-bit identifier."""
+    pgn = arbitration_id >> 8 & 0x3FFFF
+    return pgn if pgn >> 8 & 0xFF >= _PDU1_FORMATS else pgn & 0x3FF00
+
+
+def parse_pgn(name: str) -> int | None:
+    """Return the PGN of a message that is named by it, such as 65215 or 0xFEBF; None for a name."""
+    try:
+        return int(name, 16) if name[:2].lower() == "0x" else int(name) if name.isdecimal() else None
+    except ValueError:
+        return None
 
 
 def check_signal(signal: str, key: str = "signal") -> None:
@@ -88,10 +117,15 @@ class BusSettings(Strict):
     """Seconds from the measurement to the frame's arrival, as far as known."""
     delay_sigma: float = 0.0
     """Standard deviation of `delay`, seconds."""
+    source_address: Mapping[str, int] = field(default_factory=dict)
+    """J1939 source address by message, where several devices send one PGN; others are matched from any one source."""
 
     def __post_init__(self) -> None:
         if not self.dbc:
             raise ValueError("dbc is the path of a DBC file, got nothing")
+        for name, address in self.source_address.items():
+            if not 0 <= address <= MAX_SOURCE_ADDRESS:
+                raise ValueError(f"source_address of {quote(name)} is 0 to {MAX_SOURCE_ADDRESS} (0xFD), got {address}")
         check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
 
 
@@ -182,13 +216,14 @@ class CanDatabase:
     """The messages of a DBC file called `name`.
 
     flaws: what is wrong with the messages that cannot be used, by name, as errors; with anything else, as warnings
-    under "".
+    under "". is_j1939: the file states that protocol for all its messages with 29-bit identifiers.
     """
 
     name: str
     messages: Mapping[str, Message] = field(repr=False)
     by_key: Mapping[FrameKey, Message] = field(repr=False)
     flaws: Mapping[str, tuple[Problem, ...]] = field(default_factory=dict)
+    is_j1939: bool = False
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
@@ -237,7 +272,13 @@ class CanDatabase:
     def bind_signals(self, message: str) -> dict[str, BoundSignal]:
         """Return the signals of a message by name. Raises KeyError for an unknown message."""
         found = self.messages[message]
-        return {signal.name: _bind_signal(found, signal) for signal in found.signals}
+        return {signal.name: _bind_signal(found, signal, self.is_j1939) for signal in found.signals}
+
+    def find_by_pgn(self, pgn: int) -> list[str]:
+        """Return the names of the messages of a PGN."""
+        return [
+            name for name, each in self.messages.items() if each.is_extended_frame and find_pgn(each.frame_id) == pgn
+        ]
 
 
 class SignalBinder:
@@ -252,9 +293,18 @@ class SignalBinder:
     def bind_signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
         """Return the signal `Message.Signal` of the setting `key`; add a problem and return None if it is unknown.
 
-        `whole`: it must be an integer of at most `bits` bits.
+        The message may be named by its PGN. `whole`: it must be an integer of at most `bits` bits.
         """
         message_name, _, name = path.partition(".")
+        pgn = parse_pgn(message_name)
+        if pgn is not None:
+            names = self._database.find_by_pgn(pgn)
+            if len(names) != 1:
+                listed = ", ".join(names[:10]) or "none"
+                fix = f"name one of them: {listed}" if names else "name a message of the file, or correct the PGN"
+                self.add_problem(key, f"{len(names)} messages have PGN {pgn} (0x{pgn:X}); one is needed", fix)
+                return None
+            message_name = names[0]
         if message_name in self._database.flaws:
             self.problems += self._database.flaws[message_name]
             return None
@@ -276,7 +326,12 @@ class SignalBinder:
                 key, f"{path} is {kind}; a whole number of at most {bits} bits is needed", "map another signal"
             )
             return None
-        return _bind_signal(message, signal)
+        bound = _bind_signal(message, signal, self._database.is_j1939 or pgn is not None)
+        if bound.is_j1939 and message.length > MAX_J1939_BYTES:
+            what = f"message {message_name} has {message.length} bytes, which J1939 sends in several packets"
+            self.add_problem(key, f"{what}; those are not supported", "map a signal of a message of at most 8 bytes")
+            return None
+        return bound
 
     def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
@@ -297,7 +352,7 @@ class SignalBinder:
         self.add_problem(key, f"{what} {quote(name)}", fix, near)
 
 
-def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
+def _bind_signal(message: Message, signal: Signal, is_j1939: bool) -> BoundSignal:
     return BoundSignal(
         FrameKey(message.frame_id, message.is_extended_frame),
         message.name,
@@ -310,7 +365,7 @@ def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
         -inf if signal.minimum is None else float(signal.minimum),
         inf if signal.maximum is None else float(signal.maximum),
         {int(number): str(name) for number, name in (signal.choices or {}).items()},
-        message.protocol == "j1939",
+        message.is_extended_frame and (is_j1939 or message.protocol == "j1939"),
         signal.unit or "",
     )
 
@@ -388,6 +443,7 @@ _KEYWORD = re.compile(r"\s*(BO_|SG_|[A-Z][A-Z_]*_)\b")
 _MESSAGE = re.compile(r"\s*BO_\s+(\d+)\s+(\w+)\s*:")
 _OF_MESSAGE = re.compile(r"\s*(VAL_|SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\b|\s*BA_\s+\"VFrameFormat\"\s+BO_\s+(\d+)\b")
 _FRAME_FORMAT = re.compile(r"\s*BA_DEF_(DEF_)?\s+(BO_\s+)?\"VFrameFormat\"")
+_J1939_FILE = re.compile(r"^\s*BA_\s+\"ProtocolType\"\s+\"J1939\"", re.MULTILINE)
 _PLACE = re.compile(r"at line (\d+)")
 _HEAD: Final = 'VERSION ""\nNS_ :\nBS_:\nBU_:\n'
 
@@ -427,6 +483,7 @@ def parse_dbc(text: str, name: str) -> CanDatabase:
         {each.name: each for each in messages if each.name not in flaws},
         {key: each for key, each in by_key.items() if each.name not in flaws},
         flaws,
+        _J1939_FILE.search(text) is not None,
     )
 
 
@@ -541,8 +598,9 @@ class CanDriver(ABC):
     Silence, errors and recovery are reported once per change. Without needed frames there is no silence.
     """
 
-    def __init__(self, database: CanDatabase, needed: Mapping[FrameKey, str], silence: float, window: float):
-        """`needed` are the kinds of frame and their names; the others see `WheelsSettings`."""
+    def __init__(self, database: CanDatabase, signals: Iterable[BoundSignal], settings: BusSettings):
+        """The frames of `signals` are needed; the others see `WheelsSettings`. Raises ConfigError."""
+        signals = list(signals)
         self.phase = EndpointPhase.WAITING
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
@@ -551,8 +609,19 @@ class CanDriver(ABC):
         outside the range of the DBC, which are used; `rejected.reserved`: those that stand for no measurement."""
         self.problems = database.warnings
         """What is wrong with parts of the DBC file that are not used, which `modelserver check` reports."""
-        self._database, self._needed, self._silence_s = database, needed, silence
-        self._assembler = CanFrameAssembler(frozenset(needed), round(window * 1e9))
+        self._needed: Mapping[FrameKey, str] = {signal.key: signal.message for signal in signals}
+        self._database, self._silence_s = database, settings.silence
+        self._assembler = CanFrameAssembler(frozenset(self._needed), round(settings.window * 1e9))
+        self._stated = _bind_source_addresses(settings, database, self._needed)
+        self._by_pgn: dict[int, list[FrameKey]] = {}
+        """Messages that are matched by PGN; not where the file has several of one PGN, and so means its identifiers."""
+        is_j1939 = {signal.key for signal in signals if signal.is_j1939}
+        for key in self._needed:
+            pgn = find_pgn(key.arbitration_id)
+            if key in self._stated or (key in is_j1939 and len(database.find_by_pgn(pgn)) == 1):
+                self._by_pgn.setdefault(pgn, []).append(key)
+        self._sources: dict[FrameKey, tuple[int, int]] = {}
+        """Source address that is used, and when its last frame arrived, monotonic nanoseconds."""
         self._seq = 0
         self._silence_deadline_ns: int | None = None
         self._received = 0
@@ -566,6 +635,7 @@ class CanDriver(ABC):
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Discard incomplete instants and start the silence timer."""
         self._assembler.clear()
+        self._sources.clear()
         self.phase, self.is_bus_off = EndpointPhase.WAITING, False
         self._reported.clear()
         self._restart_silence_timer(now)
@@ -576,18 +646,51 @@ class CanDriver(ABC):
         if unit.is_error:
             return self._on_error_frame(unit)
         self._received += 1
-        if unit.key not in self._needed:
+        key, outputs = self._match(unit, now)
+        if key is None:
             self.counts["other_frames"] += 1
             if unit.key in self._others or len(self._others) < MAX_SEEN:
                 self._others[unit.key] += 1
-            return []
+            return outputs
+        if key in self._by_pgn.get(find_pgn(key.arbitration_id), ()):
+            # J1939 pads frames to 8 bytes
+            length = self._database.by_key[key].length
+            unit = replace(unit, arbitration_id=key.arbitration_id, data=unit.data[:length])
         try:
             values = self._database.decode(unit)
         except FrameError as error:
             return self._on_malformed_frame(unit, error)
         self.counts["frames"] += 1
         arrival = get_arrival_time(unit, now)
-        return self._publish(self._assembler.add(unit.key, values, arrival.monotonic_ns, arrival.utime), now)
+        return outputs + self._publish(self._assembler.add(key, values, arrival.monotonic_ns, arrival.utime), now)
+
+    def _match(self, frame: CanFrame, now: HostTime) -> tuple[FrameKey | None, list[Output[CanFrame]]]:
+        """Return the kind of a frame, None if it is not needed; and a warning about a second source of a PGN."""
+        pgn = find_pgn(frame.arbitration_id)
+        keys = self._by_pgn.get(pgn, ()) if frame.is_extended else ()
+        if not keys:
+            return (frame.key if frame.key in self._needed else None), []
+        source = frame.arbitration_id & 0xFF
+        stated = [key for key in keys if key in self._stated]
+        if stated:
+            return next((key for key in stated if self._stated[key] == source), None), []
+        (key,) = keys
+        used, last_ns = self._sources.get(key, (source, now.monotonic_ns))
+        if source != used and now.monotonic_ns - last_ns < self._silence_s * 1e9:
+            outputs: list[Output[CanFrame]] = []
+            if ("sources", key) not in self._reported:
+                self._reported.add(("sources", key))
+                name, first = self._needed[key], min(source, used)
+                chosen = source if source == key.arbitration_id & 0xFF else used
+                what = f"source addresses 0x{first:02X} and 0x{max(source, used):02X} send PGN {pgn} ({name})"
+                fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
+                outputs.append(EndpointStatus(self.phase, f"{what}; {fix}", is_warning=True))
+            if source != key.arbitration_id & 0xFF:
+                return None, outputs
+            self._sources[key] = (source, now.monotonic_ns)
+            return key, outputs
+        self._sources[key] = (source, now.monotonic_ns)
+        return key, []
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
         """Publish instants whose window has passed; report silence after its timeout."""
@@ -695,4 +798,32 @@ class CanDriver(ABC):
         return f"{head}; received {self._received} frames: {'; '.join(wrong) or 'not all of an instant'}{fix}"
 
     def _format_needed(self) -> str:
-        return ", ".join(f"{name} ({key})" for key, name in sorted(self._needed.items()))
+        def describe(key: FrameKey) -> str:
+            pgn = find_pgn(key.arbitration_id)
+            source = f" from 0x{self._stated[key]:02X}" if key in self._stated else ""
+            return f"PGN {pgn}{source}" if key in self._by_pgn.get(pgn, ()) else str(key)
+
+        return ", ".join(f"{name} ({describe(key)})" for key, name in sorted(self._needed.items()))
+
+
+def _bind_source_addresses(
+    settings: BusSettings, database: CanDatabase, needed: Mapping[FrameKey, str]
+) -> dict[FrameKey, int]:
+    """Return the stated source addresses. Raises ConfigError for a message without a mapped signal, or a PGN."""
+    binder = SignalBinder(database, f"drivers.{settings.source}")
+    keys = {name: key for key, name in needed.items()}
+    bound = {}
+    for name, address in settings.source_address.items():
+        key = keys.get(name)
+        if key is None:
+            near = suggest_name(name, keys)
+            listed = ", ".join(keys)
+            fix = f"write {near[0]}" if near else f"messages with mapped signals: {listed or 'none'}"
+            binder.add_problem("source_address", f"no signal of message {quote(name)} is mapped", fix, near)
+        elif not key.is_extended:
+            fix = "leave it out: frames with an 11-bit identifier have no source address"
+            binder.add_problem("source_address", f"message {name} has the identifier {key}", fix)
+        else:
+            bound[key] = address
+    binder.finish()
+    return bound

@@ -97,7 +97,7 @@ class CommandMap(Strict):
 
     @property
     def message(self) -> str:
-        """Name of the message in the DBC file."""
+        """Name of the message in the DBC file, or its PGN."""
         return self.forward_speed.signal.partition(".")[0]
 
 
@@ -171,7 +171,7 @@ class BoundCommand:
         raw[self.steering_angle.name] = self.steering_angle.to_bits(self.map.steering_angle.from_si(steering_angle))
         if self.alive is not None:
             raw[self.alive.name] = number % (1 << self.alive.length)
-        return self.database.encode(self.map.message, raw)
+        return self.database.encode(self.forward_speed.message, raw)
 
     def find_range_problem(self, forward_speed: float, steering_angle: float) -> str:
         """Describe why the signals cannot represent a speed or an angle; empty if they can."""
@@ -203,13 +203,12 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
             binder.add_problem("forward_speed", text, fix)
     if alive is not None and alive.is_signed:
         binder.add_problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
-    if command.message in database.messages:
+    message = command.message if speed is None else speed.message
+    if message in database.messages:
         bound = {signal.name for signal in (speed, steering, alive) if signal is not None} | drive_bits.keys()
-        for name in database.bind_signals(command.message).keys() - bound:
+        for name in database.bind_signals(message).keys() - bound:
             fix = f"add {name}: 0, or what the controller expects there"
-            binder.add_problem(
-                "drive_signals", f"{command.message}.{name} is given no value, and the frame needs one", fix
-            )
+            binder.add_problem("drive_signals", f"{message}.{name} is given no value, and the frame needs one", fix)
     binder.finish()
     assert speed is not None
     assert steering is not None
@@ -317,8 +316,7 @@ class VehicleDriver(CanDriver):
         place = f"drivers.{settings.source}"
         self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
         signals = self._status.signals if self._status is not None else {}
-        needed = {signal.key: signal.message for signal in signals.values()}
-        super().__init__(database, needed, settings.silence, settings.window)
+        super().__init__(database, signals.values(), settings)
         self.max_silence = settings.silence if signals else math.inf
         self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
         self._mode: VehicleMode | None = None

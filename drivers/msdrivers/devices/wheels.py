@@ -368,9 +368,7 @@ class WheelsDriver(CanDriver):
         self.max_silence = settings.silence
         place = f"drivers.{settings.source}.wheels"
         self._wheels = bind_wheels(settings.wheels, database, place, settings.max_speed, settings.frame_delay)
-        signals = (signal for wheel in self._wheels for signal in wheel.signals)
-        needed = {signal.key: signal.message for signal in signals}
-        super().__init__(database, needed, settings.silence, settings.window)
+        super().__init__(database, (signal for wheel in self._wheels for signal in wheel.signals), settings)
         odometers = {
             wheel.name: wheel.make_odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels
         }

@@ -404,7 +404,7 @@ class AxisEmulator:
         return words
 
     def _write(self, unit: WriteRegisters) -> ModbusUnit:
-        places = {(mapped.address, mapped.registers): name for name, mapped in self._registers.commanded.items()}
+        places = {(mapped.address, mapped.word_count): name for name, mapped in self._registers.commanded.items()}
         name = places.get((unit.address, len(unit.values)))
         if name is None or len(unit.values) > MAX_WRITE:
             return self._make_exception(unit, ILLEGAL_ADDRESS)

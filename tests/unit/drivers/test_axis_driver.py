@@ -7,6 +7,7 @@ import math
 import random
 import re
 import tracemalloc
+from typing import Any
 
 import pytest
 from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis_settings
@@ -327,6 +328,68 @@ def test_given_a_transport_that_reports_silence_itself_then_it_is_as_a_reply_tha
     assert driver.counts["unanswered"] == 1
 
 
+@pytest.mark.parametrize(
+    ("kind", "order", "words", "number"),
+    [
+        # 123456.0 is 0x47F12000 in IEEE 754
+        ("float32", None, (0x47F1, 0x2000), 123456.0),
+        ("float32", "ABCD", (0x47F1, 0x2000), 123456.0),
+        ("float32", "CDAB", (0x2000, 0x47F1), 123456.0),
+        ("float32", "BADC", (0xF147, 0x0020), 123456.0),
+        ("float32", "DCBA", (0x0020, 0xF147), 123456.0),
+        ("int32", "CDAB", (0xFFFE, 0xFFFF), -2),
+        ("uint32", "DCBA", (0x0403, 0x0201), 0x01020304),
+        ("int16", "ABCD", (0xFFFE,), -2),
+        ("uint16", "BADC", (0x0201,), 0x0102),
+        ("uint16", "DCBA", (0x0201,), 0x0102),
+        ("uint16", "CDAB", (0x0102,), 0x0102),
+    ],
+)
+def test_given_a_type_and_an_order_of_bytes_then_numbers_are_read_and_written_so(
+    kind: Any, order: Any, words: tuple[int, ...], number: float
+) -> None:
+    mapped = RegisterMap(0, type=kind, order=order)
+    assert mapped.to_number(words) == number
+    assert mapped.to_words(number) == words
+
+
+def test_given_an_axis_of_floats_then_it_nods_and_its_angles_are_published() -> None:
+    def real(address: int, scale_deg: float = math.degrees(1.0)) -> RegisterMap:
+        return RegisterMap(address, type="float32", order="CDAB", scale_deg=scale_deg)
+
+    registers = AxisRegisters(
+        real(0), real(2), RegisterMap(4, type="uint32", order="DCBA"),
+        lower_limit=real(16), upper_limit=real(18), nod_rate=real(20),
+    )  # fmt: skip
+    wire, driver, emulator = connect(settings=axis_settings(registers=registers))
+    wire.run(5.0)
+    assert len(joints(wire, 1.0)) > 350
+    assert min(degrees(wire, 1.0)) == pytest.approx(-30.24, abs=0.46)
+    assert max(degrees(wire, 1.0)) == pytest.approx(20.16, abs=0.46)
+    assert all(abs(each.joints[0].rate) == pytest.approx(45.0 * DEG) for each in joints(wire, 1.0))
+    assert emulator.commanded == pytest.approx({"lower_limit": -30.24, "upper_limit": 20.16, "nod_rate": 45.0})
+    assert not driver.counts["readback"]
+    assert not any(name.startswith("rejected") for name in driver.counts)
+
+
+@pytest.mark.parametrize("words", [(0x7FC0, 0), (0x7F80, 0), (0xFF80, 0)])
+def test_given_a_float_that_is_not_finite_then_it_is_no_angle(words: tuple[int, int]) -> None:
+    registers = AxisRegisters(RegisterMap(0, type="float32"))
+    driver = AxisDriver(axis_settings(registers=registers, nod=None))
+    driver.on_open(at(0.0))
+    driver.on_receive(Registers(0, words, 1), at(0.001))
+    assert driver.counts["rejected.range"] == 1
+    registers = AxisRegisters(RegisterMap(0, type="float32"), RegisterMap(2, type="float32"))
+    driver = AxisDriver(axis_settings(registers=registers, nod=None))
+    driver.on_open(at(0.0))
+    (*_, measured) = (
+        each
+        for each in driver.on_receive(Registers(0, (0, 0, *words), 1), at(0.001))
+        if isinstance(each, MeasuredSample)
+    )
+    assert math.isnan(measured.sample.joints[0].rate)  # type: ignore[union-attr]
+
+
 def test_given_registers_of_another_scale_then_angles_out_of_range_are_reported() -> None:
     registers = AxisRegisters(RegisterMap(0, 2, high_word_first=False, scale_deg=0.072))
     driver = AxisDriver(axis_settings(registers=registers, nod=None))
@@ -439,6 +502,12 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
         (lambda: RegisterMap(65535, 2), "address is 0 to 65534"),
         (lambda: RegisterMap(40001, scale_deg=0.0), "scale_deg is a number and not 0"),
         (lambda: RegisterMap(0, offset_deg=math.nan), "offset_deg is a number"),
+        (lambda: RegisterMap(0, type="float64"), "type is int16, uint16, int32, uint32, float32, got 'float64'"),  # type: ignore[arg-type]
+        (lambda: RegisterMap(0, order="ACBD"), "order is ABCD, CDAB, BADC, DCBA, got 'ACBD'"),  # type: ignore[arg-type]
+        (lambda: RegisterMap(65535, type="float32"), "address is 0 to 65534"),
+        (lambda: RegisterMap(0, 2, type="int16"), "registers is left out with type: int16 has 1, got 2"),
+        (lambda: RegisterMap(0, is_signed=False, type="int32"), "is_signed is left out with type: int32 is signed"),
+        (lambda: RegisterMap(0, high_word_first=False, order="BADC"), "high_word_first is left out with order"),
         (lambda: NodSettings(1.0, 1.0), "lower_deg is below upper_deg"),
         (lambda: AxisRegisters(RegisterMap(0), RegisterMap(125)), "lie 126 registers apart; at most 125"),
         (lambda: AxisRegisters(RegisterMap(0), nod_rate=RegisterMap(1)), "given together"),

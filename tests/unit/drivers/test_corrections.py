@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import threading
 import time
@@ -15,13 +16,16 @@ from hypothesis import strategies as st
 from support_gps import drive, split_randomly
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
+from msdrivers import corrections
 from msdrivers.corrections import (
     MAX_WAITING,
     CorrectionsClient,
+    MissingMountpointError,
     NtripError,
     NtripSession,
     encode_request,
     make_gga,
+    parse_source_table,
 )
 from msdrivers.devices.ublox import UbloxDriver, UbloxSettings
 from msdrivers.links.fake import FakeLink, FakeTimeSource
@@ -47,6 +51,14 @@ def chunk(data: bytes, sizes: int = 7) -> bytes:
 ANSWERS = {
     "version 1": b"ICY 200 OK\r\n\r\n" + STREAM,
     "version 1, at once": b"ICY 200 OK\r\n" + STREAM,
+    "version 1, with a header": b"ICY 200 OK\r\nServer: NTRIP Caster/5.2\r\nDate: 28/Nov/2026\r\n\r\n" + STREAM,
+    "version 1, with a header and its end in the data": b"ICY 200 OK\r\nServer: x\r\n" + STREAM,
+    "version 1, lines without return": b"ICY 200 OK\n\n" + STREAM,
+    "version 2, other spelling": b"HTTP/1.0 200 ok\r\ntransfer-encoding:Chunked\r\n\r\n" + chunk(STREAM),
+    "version 2, length of chunks in capitals, with parameters": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n"
+    + b"%X;a=b\r\n" % len(STREAM)
+    + STREAM
+    + b"\r\n",
     "version 2": b"HTTP/1.1 200 OK\r\nNtrip-Version: Ntrip/2.0\r\nContent-Type: gnss/data\r\n\r\n" + STREAM,
     "version 2, chunks": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + chunk(STREAM),
 }
@@ -57,8 +69,7 @@ ANSWERS = {
 def test_given_an_answer_of_a_caster_then_its_corrections_are_found_whatever_the_pieces(name: str, seed: int) -> None:
     session = NtripSession("MOUNT")
     found = b"".join(session.feed(piece) for piece in split_randomly(ANSWERS[name], seed))
-    # the receiver skips the end of a header of version 1
-    assert found.removeprefix(b"\r\n") == STREAM
+    assert found == STREAM
     assert session.is_answered
 
 
@@ -70,6 +81,28 @@ def test_given_an_answer_of_a_caster_then_its_corrections_are_found_whatever_the
         (b"HTTP/1.1 503 Service Unavailable\r\n\r\n", "try again later"),
         (b"SOURCETABLE 200 OK\r\nSTR;A;B\r\n", "no mountpoint 'MOUNT'"),
         (b"HTTP/1.1 200 OK\r\nContent-Type: gnss/sourcetable\r\n\r\n", "no mountpoint 'MOUNT'"),
+        (
+            b"HTTP/1.1 401 Unauthorized\r\nContent-Length: 40\r\n\r\n<html><b>Your account</b> has expired.\r\n",
+            "has expired",
+        ),
+        (b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", "403 Forbidden: check user"),
+        (b"HTTP/1.0 302 Found\r\nLocation: http://b.example:2101/X\r\n\r\n", "redirects to 'http://b.example:2101/X'"),
+        (b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\n\r\n<html>", "web page"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\nThe plain HTTP request was sent to HTTPS port", "sent to HTTPS port"),
+        (b"ERROR - Bad Password\r\n", "'ERROR - Bad Password': check mountpoint, user and password"),
+        (b"\x15\x03\x01\x00\x02\x02\x46", "wants TLS"),
+        (b"", "without an answer"),
+        (
+            b"SOURCETABLE 200 OK\r\n\r\n" + b"STR;Mount1;;;;;;;;1;2;0\r\nSTR;B;x\r\nENDSOURCETABLE\r\n",
+            "it has 'Mount1'",
+        ),
+        (b"SOURCETABLE 200 OK\r\n\r\nSTR;MOUNT;x\r\nENDSOURCETABLE\r\n", "its station is off the air"),
+        (
+            b"HTTP/1.1 200 OK\r\nContent-Type: gnss/sourcetable\r\nTransfer-Encoding: chunked\r\n\r\n"
+            + chunk(b"STR;A;\r\nSTR;B;\r\nENDSOURCETABLE\r\n")
+            + b"0\r\n\r\n",
+            "it has 'A', 'B'",
+        ),
         (b"SSH-2.0-OpenSSH\r\n", "not that of an NTRIP caster"),
         (b"x" * 9000, "not that of an NTRIP caster"),
         (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n", "damaged"),
@@ -77,8 +110,14 @@ def test_given_an_answer_of_a_caster_then_its_corrections_are_found_whatever_the
     ],
 )
 def test_given_another_answer_then_the_error_has_what_to_do(answer: bytes, words: str) -> None:
+    session = NtripSession("MOUNT")
+
+    def receive() -> None:
+        session.feed(answer)
+        session.finish()
+
     with pytest.raises(NtripError, match=words):
-        NtripSession("MOUNT").feed(answer)
+        receive()
 
 
 def test_given_a_request_and_a_position_then_they_are_written_as_casters_read_them() -> None:
@@ -89,6 +128,38 @@ def test_given_a_request_and_a_position_then_they_are_written_as_casters_read_th
     fix = GpsSample(SensorHeader(0, "gps", 0), FixType.FIX_3D, 50.27, -111.18, height_msl=717.5, satellites=12)
     gga = make_gga(fix, 8 * 3600 * 1_000_000).decode()
     assert gga.startswith("$GPGGA,080000.000,5016.2000000,N,11110.8000000,W,1,12,1.0,717.50,M,0.0,M,,*")
+
+
+TABLE = (
+    b"SOURCETABLE 200 OK\r\nServer: NTRIP Caster\r\nContent-Type: text/plain\r\n\r\n"
+    b"CAS;rtk.example;2101;X;Y;0;DEU;50.12;8.69;http://x\r\n"
+    b'STR;MOUNT;Town;RTCM 3.2;1004(1)";"1005;2;GPS;NET;DEU;50.00;8.00;1;1;TNET;none;B;N;9600;\r\n'
+    b"STR;FAR;Town;RTCM 3.2;1004(1);2;GPS;NET;DEU;-50.00;8.00;0;0;TNET;none;B;N;9600;\r\n"
+    b"STR;NEAR0;Town;RTCM 3.2;1004(1);2;GPS;NET;DEU;50.0;8.1;0;0;TNET;none;B;N;9600;\r\n"
+    b"STR;SHORT\r\nENDSOURCETABLE\r\n"
+)
+
+
+def test_given_a_source_table_then_its_streams_have_their_place_and_whether_they_need_the_rovers() -> None:
+    streams = parse_source_table(TABLE.decode())
+    assert [each.name for each in streams] == ["MOUNT", "FAR", "NEAR0", "SHORT"]
+    assert [each.needs_place for each in streams] == [True, False, False, False]
+    assert streams[0] == ("MOUNT", 50.0, 8.0, True)
+    assert math.isnan(streams[3].latitude_deg)
+    place = GpsSample(SensorHeader(0, "gps", 0), FixType.FIX_3D, 50.0, 8.0)
+    text = str(MissingMountpointError("NEAR1", streams, place))
+    assert "it has 'NEAR0'; nearest to the rover: 'MOUNT' (0 km), 'NEAR0' (7 km), 'FAR' (11119 km)" in text
+
+
+@given(
+    st.binary(max_size=300),
+    st.sampled_from([b"", b"ICY 200 OK\r\n", b"HTTP/1.1 404 N\r\n\r\n", b"SOURCETABLE 200 OK\n"]),
+)
+def test_given_any_bytes_then_a_session_gives_bytes_or_an_error(data: bytes, head: bytes) -> None:
+    session = NtripSession("MOUNT")
+    with contextlib.suppress(NtripError):
+        assert isinstance(session.feed(head + data), bytes)
+        session.finish()
 
 
 # --- the thread -----------------------------------------------------------------------------------------------
@@ -195,6 +266,125 @@ def test_given_a_network_of_stations_then_it_gets_the_position_of_the_fixes(cast
         wait_for(lambda: b"$GPGGA" in b"".join(caster.received[1:]))
 
 
+class Network:
+    """A caster of a network of stations on loopback: it sends a stream to who has sent a position, and its table."""
+
+    def __init__(self, table: bytes = TABLE, closes: bool = False, answer: bytes = b"ICY 200 OK\r\n\r\n"):
+        self._table, self._closes, self._answer = table, closes, answer
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self._server.settimeout(0.1)
+        self.address = f"127.0.0.1:{self._server.getsockname()[1]}"
+        self.requests: list[bytes] = []
+        self.ended = threading.Event()
+        self._threads = [threading.Thread(target=self._run, daemon=True)]
+        self._threads[0].start()
+
+    def _run(self) -> None:
+        while not self.ended.is_set():
+            with contextlib.suppress(OSError):
+                connection, _ = self._server.accept()
+                self._threads.append(threading.Thread(target=self._serve, args=(connection,), daemon=True))
+                self._threads[-1].start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.settimeout(0.1)
+            received = connection.recv(4096)
+            self.requests.append(received)
+            if received.startswith(b"GET / "):
+                connection.sendall(self._table)
+                return
+            connection.sendall(self._answer)
+            while b"$GPGGA" not in received:
+                if self._closes or self.ended.is_set():
+                    return
+                with contextlib.suppress(TimeoutError):
+                    received += connection.recv(4096)
+            connection.sendall(STREAM)
+            self.ended.wait(TIMEOUT_S)
+
+    def close(self) -> None:
+        self.ended.set()
+        for thread in self._threads:
+            thread.join()
+        self._server.close()
+
+
+@pytest.fixture
+def networks(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Network]]:
+    for name, seconds in (("QUIET_S", 0.3), ("FIRST_DELAY_S", 0.05), ("SILENCE_S", 1.0), ("REJECTION_S", 0.3)):
+        monkeypatch.setattr(corrections, name, seconds)
+    with contextlib.ExitStack() as stack:
+
+        def make(*args: Any, **more: Any) -> Network:
+            network = Network(*args, **more)
+            stack.callback(network.close)
+            return network
+
+        yield make
+
+
+@pytest.mark.parametrize("closes", [False, True])
+@pytest.mark.parametrize("answer", [b"ICY 200 OK\r\n\r\n", b"HTTP/1.1 200 OK\r\nContent-Type: gnss/data\r\n\r\n"])
+def test_given_a_stream_that_needs_the_position_by_its_table_then_it_gets_it_unasked(
+    networks: Callable[..., Network], caplog: pytest.LogCaptureFixture, closes: bool, answer: bytes
+) -> None:
+    caplog.set_level("INFO")
+    network = networks(closes=closes, answer=answer)
+    with receiving(network.address) as client:
+        client.note_place(next(drive(1.0)))
+        wait_for(lambda: client.counts.get("corrections.bytes", 0) >= len(STREAM))
+    assert "needs the rover's position, by its source table: it is sent every 10 s" in caplog.text
+    # a caster that closes at once has it in the next request
+    assert not closes or b"Ntrip-GGA: $GPGGA" in network.requests[-1]
+    assert sum(each.startswith(b"GET / ") for each in network.requests) == 1
+
+
+def test_given_such_a_stream_without_a_fix_then_the_reason_is_logged_until_there_is_one(
+    networks: Callable[..., Network], caplog: pytest.LogCaptureFixture
+) -> None:
+    network = networks()
+    with receiving(network.address) as client:
+        wait_for(lambda: "it needs the rover's position, and the receiver has no fix yet" in caplog.text)
+        client.note_place(next(drive(1.0)))
+        wait_for(lambda: client.counts.get("corrections.bytes", 0) >= len(STREAM))
+
+
+@pytest.mark.parametrize(
+    ("table", "more", "words"),
+    [
+        (TABLE, {"gga_period": 0.0}, "gga_period: 0 does not send: set it to 10, or leave it out"),
+        (TABLE.replace(b";1;1;TNET", b";0;1;TNET"), {}, "its source table asks for no position; if it is a network"),
+        (
+            b"HTTP/1.1 404 Not Found\r\n\r\n",
+            {},
+            r"a network of stations (VRS) needs the rover's position: set gga_period",
+        ),
+    ],
+)
+def test_given_a_stream_without_corrections_then_the_log_has_what_to_set(
+    networks: Callable[..., Network], caplog: pytest.LogCaptureFixture, table: bytes, more: dict[str, Any], words: str
+) -> None:
+    network = networks(table)
+    with receiving(network.address, **more) as client:
+        client.note_place(next(drive(1.0)))
+        wait_for(lambda: words in caplog.text)
+        assert not client.counts.get("corrections.bytes")
+    assert b"GPGGA" not in b"".join(network.requests)
+
+
+@pytest.mark.parametrize("answer", [TABLE, b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"])
+def test_given_a_wrong_mountpoint_then_those_near_it_are_named(
+    networks: Callable[..., Network], caplog: pytest.LogCaptureFixture, answer: bytes
+) -> None:
+    network = networks(TABLE.replace(b"MOUNT", b"MOUNT7"), answer=answer.replace(b"MOUNT", b"MOUNT7"))
+    with receiving(network.address) as client:
+        client.note_place(next(drive(1.0)))
+        wait_for(
+            lambda: "no mountpoint 'MOUNT': check mountpoint; it has 'MOUNT7'; nearest to the rover: " in caplog.text
+        )
+
+
 def test_given_corrections_then_a_runner_sends_them_to_its_device(casters: Callable[..., Caster]) -> None:
     caster = casters(ANSWERS["version 1"])
     clock = FakeTimeSource()
@@ -207,7 +397,7 @@ def test_given_corrections_then_a_runner_sends_them_to_its_device(casters: Calla
         feed()
     assert b"".join(unit for _, unit in link.sent).endswith(STREAM)
     counters = dict(runner.make_health(clock.now()).counters)
-    assert counters["corrections.bytes"] == len(STREAM) + 2
+    assert counters["corrections.bytes"] == len(STREAM)
 
 
 def test_given_no_corrections_yet_then_there_is_no_age() -> None:

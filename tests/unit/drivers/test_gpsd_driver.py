@@ -113,6 +113,78 @@ def test_given_fields_that_are_none_then_they_are_not_known() -> None:
     assert line.driver.counts["rejected.json"] >= 1
 
 
+HEAD = {"device": "/dev/ttyACM0", "time": "2027-01-15T08:00:00.000Z"}
+FIX = {"class": "TPV", **HEAD, "mode": 3, "lat": 50.0, "lon": 8.0}
+
+
+def receive(*reports: dict[str, object] | bytes, **settings: object) -> Line:
+    line = Line(GpsdDriver(GpsdSettings("gps", **settings)), GpsdEmulator(()))  # type: ignore[arg-type]
+    line.open()
+    for each in reports:
+        line.deliver((each if isinstance(each, bytes) else json.dumps(each).encode()) + b"\r\n")
+    line.run(0.1)
+    return line
+
+
+def test_given_a_release_without_usat_then_the_used_satellites_are_counted() -> None:
+    satellites = [{"PRN": n, "ss": 30, "used": n % 2 == 0} for n in range(12)]
+    sky = {"class": "SKY", "device": "/dev/ttyACM0", "hdop": 1.5, "satellites": satellites}
+    (sample,) = receive(sky, FIX).samples
+    assert (sample.satellites, sample.hdop) == (6, 1.5)
+
+
+def test_given_a_sky_report_in_two_then_dilution_and_satellites_are_of_both() -> None:
+    dilution = {"class": "SKY", **HEAD, "hdop": 0.9, "pdop": 1.4}
+    satellites = {"class": "SKY", **HEAD, "nSat": 20, "uSat": 11, "satellites": []}
+    for both in ((dilution, satellites), (satellites, dilution)):
+        (sample,) = receive(*both, FIX).samples
+        assert (sample.satellites, sample.hdop, sample.pdop) == (11, 0.9, 1.4)
+
+
+def test_given_several_reports_of_an_instant_then_the_fix_has_what_all_have() -> None:
+    later = {"class": "TPV", **HEAD, "mode": 3, "lat": 50.0, "lon": 8.0, "altMSL": 150.0, "track": 90.0, "speed": 2.0}
+    line = receive(FIX, later)
+    (sample,) = line.samples
+    assert (sample.height_msl, sample.speed) == (150.0, 2.0)
+    assert line.driver.counts["repeated"] == 1
+
+
+def test_given_numbers_as_printf_writes_those_that_are_none_then_the_report_is_used() -> None:
+    line = receive(
+        b'{"class":"TPV","mode":3,"time":"2027-01-15T08:00:00.000Z","lat":50.0,"lon":8.0,"epx":nan,"climb":-inf}'
+    )
+    (sample,) = line.samples
+    assert sample.fix_type is FixType.FIX_3D
+    assert not line.driver.counts["rejected.json"]
+
+
+@pytest.mark.parametrize(
+    ("report", "settings", "words"),
+    [
+        ({"class": "DEVICES", "devices": []}, {}, "gpsd has no receiver; name it in DEVICES of /etc/default/gpsd"),
+        (
+            {"class": "DEVICES", "devices": [{"class": "DEVICE", "path": "/dev/ttyUSB0"}]},
+            {"receiver": "/dev/gps"},
+            "gpsd has no receiver '/dev/gps'; it has '/dev/ttyUSB0': correct `receiver`",
+        ),
+        (
+            {"class": "DEVICE", "path": "/dev/ttyACM0", "activated": 0},
+            {},
+            "gpsd has closed '/dev/ttyACM0': is it plugged in",
+        ),
+        ({"class": "ERROR", "message": "Can't open /dev/gps"}, {}, 'its last error: "Can\'t open /dev/gps"'),
+    ],
+)
+def test_given_gpsd_without_fixes_then_the_status_has_why(
+    report: dict[str, object], settings: dict[str, object], words: str
+) -> None:
+    line = Line(GpsdDriver(GpsdSettings("gps", **settings)), GpsdEmulator(()))  # type: ignore[arg-type]
+    line.open().run(1.0)
+    line.deliver(json.dumps(report).encode() + b"\r\n")
+    line.run(6.0)
+    assert words in line.status_text
+
+
 @given(st.binary(max_size=300), st.integers(0, 100))
 def test_given_any_bytes_then_nothing_is_raised_and_pieces_give_the_same(data: bytes, seed: int) -> None:
     data += b'\n{"class":"TPV","mode":1}\n'

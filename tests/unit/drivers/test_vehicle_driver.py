@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import math
 import random
@@ -9,6 +10,7 @@ import tracemalloc
 
 import pytest
 from support_vehicle_bus import (
+    DBC,
     DEG,
     RAPTOR_COMMAND,
     RAPTOR_STATUS,
@@ -22,7 +24,7 @@ from support_vehicle_bus import (
 from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.can import SignalMap
-from msdrivers.devices.vehicle import CommandLimits, StatusMap, VehicleDriver, VehicleSettings
+from msdrivers.devices.vehicle import CommandLimits, CommandMap, StatusMap, VehicleDriver, VehicleSettings
 from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Send
@@ -413,3 +415,21 @@ def test_given_bus_off_while_a_command_counts_then_nothing_is_sent() -> None:
     for t in (0.06, 0.3, 1.0):
         assert not [output for output in driver.on_timer(at(t)) if isinstance(output, Send)]
     assert driver.on_close(at(1.1)) == []
+
+
+def test_given_a_command_named_by_its_pgn_then_it_is_sent_with_the_identifier_of_the_file() -> None:
+    from msdrivers.devices.can import parse_dbc
+
+    number = 0x0CFF0127
+    text = DBC.read_text(encoding="utf-8").replace(" 768 ", f" {0x80000000 + number} ")
+    command = CommandMap(
+        SignalMap("0xFF01.ForwardSpeed"), SignalMap("0xFF01.SteeringAngle", DEG), alive="0xFF01.Alive",
+        drive_signals={"Enable": 1}, stop_signals={"Enable": 0},
+    )  # fmt: skip
+    driver = VehicleDriver(vehicle_settings(command=command), parse_dbc(text, "j.dbc"))
+    driver.on_open(at(0.0))
+    (frame,) = [each.unit for each in driver.on_command(make_command(0.0, 1), at(0.0)) if isinstance(each, Send)]
+    assert (frame.arbitration_id, frame.is_extended) == (number, True)
+    broken = dataclasses.replace(command, drive_signals={}, stop_signals={})
+    with pytest.raises(ConfigError, match=r"VehicleCommand.Enable is given no value"):
+        VehicleDriver(vehicle_settings(command=broken), parse_dbc(text, "j.dbc"))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import gc
 import itertools
 import math
 import random
 import re
+import socket
+import time
 import tracemalloc
 from collections.abc import Callable
 
@@ -34,6 +37,7 @@ from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap,
 from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import WheelsEmulator
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
+from msdrivers.links.can_bus import CanLink
 
 BOTH = ("front_left", "front_right")
 
@@ -454,3 +458,150 @@ def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_o
             # below 2 cm/s the direction is `stopped`, and a speed without sign has none
             assert measured.speed == pytest.approx(true.speed, abs=0.00051) or abs(true.speed) <= 0.02
     assert min(wheel.speed for sample in samples for wheel in sample.wheels) < -0.5
+
+
+# --- J1939 ------------------------------------------------------------------------------------------------------
+
+NULL_SOURCE = 0x18FEBFFE
+"""PGN 65215 (EBC2) from the null address, as files have it."""
+J1939_FILE = 'BA_DEF_ "ProtocolType" STRING ;\nBA_DEF_DEF_ "ProtocolType" "";\nBA_ "ProtocolType" "J1939";'
+SPEED_SIGNAL = '+ (0.001,0) [0|64.255] "m/s"'
+
+
+def j1939_driver(dbc: str, message: str = "Wheels", **changes: object) -> WheelsDriver:
+    maps = {side: WheelMap(speed=SpeedMap(f"{message}.V_{side}")) for side in "LR"}
+    return WheelsDriver(wheels_settings(wheels=maps, **changes), parse_dbc(dbc, "d.dbc"))
+
+
+def j1939_file(more: str = J1939_FILE) -> str:
+    return make_dbc(SPEED_SIGNAL, 0x80000000 + NULL_SOURCE, more)
+
+
+def j1939_frame(number: int, millimeters: int = 2000) -> CanFrame:
+    return CanFrame(number, millimeters.to_bytes(2, "little") * 2 + b"\xff" * 4, is_extended=True)
+
+
+def speeds(outputs: list[object]) -> list[float]:
+    return [each.sample.wheels[0].speed for each in outputs if isinstance(each, MeasuredSample)]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("number", [NULL_SOURCE, 0x18FEBF0B, 0x0CFEBF0B, 0x1CFEBF31])
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (J1939_FILE, "Wheels"),
+        (J1939.format(0x80000000 + NULL_SOURCE), "Wheels"),
+        (J1939_FILE, "65215"),
+        ("", "0xFEBF"),
+    ],
+)
+def test_given_another_priority_or_source_address_then_a_j1939_message_is_matched_by_its_pgn(
+    number: int, more: str, message: str
+) -> None:
+    driver = j1939_driver(j1939_file(more), message)
+    (status,) = driver.on_open(at(0.0))
+    assert status.text == "waiting for Wheels (PGN 65215)"  # type: ignore[union-attr]
+    assert speeds(list(driver.on_receive(j1939_frame(number), at(0.1)))) == [2.0]
+    assert speeds(list(driver.on_receive(j1939_frame(number ^ 0x100), at(0.2)))) == []
+
+
+def test_given_a_file_of_no_stated_protocol_then_the_identifier_is_exact_unless_a_source_is_stated() -> None:
+    driver = j1939_driver(j1939_file(""))
+    driver.on_open(at(0.0))
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF0B), at(0.1)))) == []
+    assert speeds(list(driver.on_receive(j1939_frame(NULL_SOURCE), at(0.1)))) == [2.0]
+    driver = j1939_driver(j1939_file(""), source_address={"Wheels": 0x0B})
+    (status,) = driver.on_open(at(0.0))
+    assert status.text == "waiting for Wheels (PGN 65215 from 0x0B)"  # type: ignore[union-attr]
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF31), at(0.1)))) == []
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF0B), at(0.1)))) == [2.0]
+
+
+def test_given_two_sources_of_a_pgn_then_one_is_used_and_the_warning_has_the_setting() -> None:
+    driver = j1939_driver(j1939_file())
+    driver.on_open(at(0.0))
+    found: list[object] = []
+    for n in range(20):
+        found += driver.on_receive(j1939_frame(0x18FEBF0B, 2000), at(0.1 * n))
+        found += driver.on_receive(j1939_frame(0x18FEBF31, 3000), at(0.1 * n + 0.05))
+    assert speeds(found) == [2.0] * 20
+    (warning,) = [each.text for each in found if isinstance(each, EndpointStatus) and each.is_warning]
+    assert warning == (
+        "source addresses 0x0B and 0x31 send PGN 65215 (Wheels); that of 0x0B is used; state it: "
+        "source_address: {Wheels: 0x0B}"
+    )
+    # the other continues when the first is silent
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF31, 3000), at(4.0)))) == [3.0]
+
+
+def test_given_a_source_in_the_file_then_it_takes_precedence_over_the_first() -> None:
+    driver = j1939_driver(make_dbc(SPEED_SIGNAL, 0x80000000 + 0x18FEBF0B, J1939_FILE))
+    driver.on_open(at(0.0))
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF31, 3000), at(0.1)))) == [3.0]
+    found = list(driver.on_receive(j1939_frame(0x18FEBF0B), at(0.15)))
+    assert speeds(list(found)) == [2.0]
+    assert "that of 0x0B is used" in found[0].text  # type: ignore[union-attr]
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF31, 3000), at(0.2)))) == []
+
+
+def test_given_a_file_with_several_messages_of_a_pgn_then_its_identifiers_or_stated_sources_count() -> None:
+    second = f"BO_ {0x80000000 + 0x18FEBF31} Rear: 8 A\n SG_ V_L : 0|16@1{SPEED_SIGNAL} A\n"
+    dbc = make_dbc(SPEED_SIGNAL, 0x80000000 + 0x18FEBF0B, second + J1939_FILE)
+    driver = j1939_driver(dbc)
+    driver.on_open(at(0.0))
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF31), at(0.1)))) == []
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF0B), at(0.1)))) == [2.0]
+    with pytest.raises(ConfigError, match=r"2 messages have PGN 65215 \(0xFEBF\); one is needed"):
+        j1939_driver(dbc, "65215")
+
+
+def test_given_a_j1939_message_shorter_than_its_frames_then_the_padding_is_left_out() -> None:
+    driver = j1939_driver(j1939_file().replace("Wheels: 8", "Wheels: 4"))
+    driver.on_open(at(0.0))
+    assert speeds(list(driver.on_receive(j1939_frame(0x18FEBF0B), at(0.1)))) == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("dbc", "message", "source_address", "expected"),
+    [
+        (
+            j1939_file().replace("Wheels: 8", "Wheels: 20"),
+            "Wheels",
+            {},
+            "20 bytes, which J1939 sends in several",
+        ),
+        (j1939_file(), "65216", {}, "0 messages have PGN 65216"),
+        (j1939_file(), "Wheels", {"Wheel": 11}, "no signal of message 'Wheel' is mapped"),
+        (make_dbc(SPEED_SIGNAL), "Wheels", {"Wheels": 11}, "message Wheels has the identifier 0x217"),
+    ],
+)
+def test_given_j1939_settings_that_cannot_be_then_the_problem_is_named(
+    dbc: str, message: str, source_address: dict[str, int], expected: str
+) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        j1939_driver(dbc, message, source_address=source_address)
+
+
+def test_given_a_source_address_that_cannot_be_then_the_key_is_named() -> None:
+    with pytest.raises(ValueError, match=r"source_address of 'Wheels' is 0 to 253 \(0xFD\), got 254"):
+        wheels_settings(source_address={"Wheels": 254})
+
+
+def test_given_a_j1939_bus_over_udp_then_frames_of_another_source_make_samples() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        group = f"239.74.163.2:{probe.getsockname()[1]}"
+    one, two = CanLink(group, "udp_multicast"), CanLink(group, "udp_multicast")
+    driver = j1939_driver(j1939_file())
+    with contextlib.ExitStack() as stack:
+        for link in (one, two):
+            link.open()
+            stack.callback(link.close)
+        driver.on_open(at(0.0))
+        one.send(j1939_frame(0x0CFEBF0B))
+        found: list[object] = []
+        deadline = time.monotonic() + 10.0
+        while not speeds(found) and time.monotonic() < deadline:
+            for frame in two.poll(0.1):
+                found += driver.on_receive(frame, at(0.1))
+    assert speeds(found) == [2.0]
