@@ -60,7 +60,7 @@ def skip_reason() -> str:
     if not interpreter():
         return f"no {version} below /usr: the tests' own is in {sys.base_prefix}, which a hardened unit does not see"
     if find_spec("hatchling") is None:
-        return "hatchling, which builds the wheel, is not installed (pip install 'modelserver[test]')"
+        return "hatchling, which builds the wheel, is not installed (pip install -e '.[test]')"
     tried = subprocess.run(["unshare", "--mount", "--pid", "--net", "--fork", "true"], capture_output=True, text=True)
     if tried.returncode:
         return f"this machine makes no namespaces: {tried.stderr.strip()}"

@@ -27,6 +27,7 @@ from urllib.parse import parse_qs, urlsplit
 import typer
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
+from modelserver.extras import SYSTEM_ENVIRONMENT, make_requirement, make_system_command
 from modelserver.wire.provider import group_of
 from mstools.terminal.output import ProblemCollector, escape, make_error
 
@@ -551,12 +552,14 @@ SEARCH_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/b
 COMMAND_TIMEOUT_S: Final = 120.0
 """Time limit of a command: a start waits until the service is ready."""
 
-INSTALL_HINT: Final = (
-    "install with the system's Python, to a folder that all users may read: sudo /usr/bin/python3 -m venv --clear "
-    "/opt/modelserver && sudo /opt/modelserver/bin/pip install modelserver, then sudo /opt/modelserver/bin/modelserver "
-    "install ... (another python3 in the PATH may be in a home directory, and an environment that was made with it "
-    "keeps it unless it is cleared)"
-)
+
+def make_install_hint() -> str:
+    """Return how to install this version where the units and all users can access it."""
+    command = make_system_command(make_requirement())
+    return (
+        f"install it to {SYSTEM_ENVIRONMENT}, then install the units from there: "
+        f"{command} && sudo {SYSTEM_ENVIRONMENT}/bin/modelserver install --vehicle FILE"
+    )
 
 
 def get_command_path() -> str:
@@ -571,7 +574,7 @@ def get_examples_folder() -> Path:
 
 def check_installation() -> None:
     """Raise ConfigError where the units could not access or read this installation, with all problems."""
-    subject, command = "this installation", get_command_path()
+    subject, command, hint = "this installation", get_command_path(), make_install_hint()
     paths = [
         (command, "the command of this installation"),
         (os.path.realpath(sys.executable), "its Python"),
@@ -580,9 +583,9 @@ def check_installation() -> None:
     ]
     gathered = ProblemCollector()
     with gathered.collect(subject):
-        check_visible(paths, INSTALL_HINT)
+        check_visible(paths, hint)
     if not os.path.isfile(command):
-        gathered.add(subject, f"there is no {command}: the package is not installed", INSTALL_HINT)
+        gathered.add(subject, f"there is no {command}: the package is not installed", hint)
     if not _UNIT_PATH.fullmatch(command):
         fix = "install to a folder whose path has only letters, digits and ._+@-"
         gathered.add(subject, f"{command!r} cannot be written in a unit", fix)

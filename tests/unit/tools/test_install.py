@@ -235,12 +235,12 @@ def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> Non
 
 def test_given_an_installation_that_the_units_do_not_see_then_it_is_rejected_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.INSTALL_HINT)
+        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.make_install_hint())
 
 
 def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
     with pytest.raises(ConfigError) as caught:
-        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.INSTALL_HINT)
+        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.make_install_hint())
     (problem,) = caught.value.problems
     assert problem.message == (
         "its Python is /root/x, its package is /tmp/y, which the hardened units cannot access "
@@ -254,7 +254,7 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
     way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
-    assert way in install_steps.INSTALL_HINT
+    assert way in install_steps.make_install_hint()
     # the README has the Debian package only
     assert way in text or page == "README.md"
     assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
