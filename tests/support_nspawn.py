@@ -201,9 +201,17 @@ def _remove_groups(group: Path) -> None:
             time.sleep(0.02)
 
 
-def build_package(folder: Path) -> Path:
+def build_package(folder: Path, *options: str) -> Path:
     """Return a Debian package of this project for the Python of these tests, built from its source."""
-    command = [sys.executable, ROOT / "tools" / "debian_package.py", "--compression", "none", "--output", folder]
+    command = [
+        sys.executable,
+        ROOT / "tools" / "debian_package.py",
+        "--compression",
+        "none",
+        "--output",
+        folder,
+        *options,
+    ]
     wheel = build_wheel(folder)
     done = subprocess.run([*command, "--wheel", wheel], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
