@@ -499,6 +499,8 @@ def render_udev_rules(
     `given` are names below /dev/serial/by-id by driver, as `check_serial` accepts them; they take precedence over the
     found ones. Raises ModelServerError.
     """
+    from msdrivers.links.serial_port import BOARD_UARTS
+
     lines, notes = [], []
     for driver in drivers:
         own = f"{DEVICE_FOLDER}{driver.name}"
@@ -515,6 +517,9 @@ def render_udev_rules(
             lines.append(f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", {link}')
         elif known:
             lines.append(known[0])
+        elif re.fullmatch(rf"/dev/({'|'.join(BOARD_UARTS)})[0-9]+", driver.port):
+            # a UART of the board: its name is fixed
+            continue
         else:
             fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
             notes.append(f"no device id is known for driver {driver.name} (port {driver.port}); {fix}")

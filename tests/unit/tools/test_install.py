@@ -250,6 +250,13 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
     assert "sudo /usr/bin/python3 -m venv --clear /opt/modelserver" in problem.fix
 
 
+@pytest.mark.parametrize("port", ["/dev/ttyTHS1", "/dev/ttymxc0", "/dev/ttyAMA10", "/dev/ttySC0", "/dev/ttyS0"])
+def test_given_a_uart_of_the_board_then_nobody_is_asked_to_plug_it_in(port: str) -> None:
+    assert render_udev_rules([SerialDriver("gps", port)], {}, SystemFacts()) == ([], [])
+    writes, _ = render_udev_rules([SerialDriver("gps", port)], {"gps": "usb-A"}, SystemFacts())
+    assert len(writes) == 1
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/deployment.md"])
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
