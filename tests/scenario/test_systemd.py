@@ -105,6 +105,9 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Machine, s
     # shared with the container
     package = build_package(folder)
     shutil.copytree(ROOT / "config" / "raptor", folder / "raptor")
+    # as `modelserver new` writes it
+    with (folder / "raptor" / "vehicle.yaml").open("a") as file:
+        file.write("\nstate_directory: state\njournal: {directory: journal, megabytes: 256}\n")
     with boot_machine(folder) as booted:
         yield booted, install_package(booted, package)
 
@@ -248,9 +251,12 @@ def test_given_a_vehicle_file_that_is_wrong_then_the_journal_reports_it_and_once
 
 def test_given_the_installed_unit_then_doctor_looks_where_that_keeps_its_state(site: Site) -> None:
     output = site.machine.run(site.program, "doctor", "-c", "/etc/modelserver/vehicle.yaml", check=False).stdout
-    assert re.search(r"^ok +state +/var/lib/modelserver may be written", output, re.MULTILINE), output
-    journal = r"^ok +journal +/var/lib/modelserver/journal-\S+ may be written"
-    assert re.search(journal, output, re.MULTILINE), output
+    for name in ("state", "journal"):
+        written = rf"^ok +{name} +/var/lib/(private/)?modelserver/{name} may be written"
+        assert re.search(written, output, re.MULTILINE), output
+    # the unit writes there, not beside the installed vehicle file
+    folder = "/var/lib/modelserver/journal"
+    site.wait_until(lambda: ".lcm" in site.machine.run("ls", folder, check=False).stdout, "no journal is written")
 
 
 def test_given_a_record_then_the_journal_has_its_fields(site: Site) -> None:

@@ -328,6 +328,14 @@ class SerialDriver:
     port: str
 
 
+def is_unit_state(folder: str) -> bool:
+    """Return whether the unit can write a folder of the installed vehicle file: one in its state directory."""
+    if folder.startswith("~"):
+        return False
+    whole = os.path.normpath(os.path.join(STATE[0], folder))
+    return any(whole == state or whole.startswith(f"{state}/") for state in STATE)
+
+
 def find_hiding_setting(path: str) -> str:
     """Return the unit setting that hides a path from the service, empty for none."""
     return next((why for folder, why in HIDDEN_FOLDERS.items() if path == folder or path.startswith(f"{folder}/")), "")
