@@ -109,6 +109,8 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Machine, s
     with (folder / "raptor" / "vehicle.yaml").open("a") as file:
         file.write("\nstate_directory: state\njournal: {directory: journal, megabytes: 256}\n")
     with boot_machine(folder) as booted:
+        # of Debian's package udev, which this host may lack
+        booted.run("mkdir", "-p", "/etc/udev/rules.d")
         yield booted, install_package(booted, package)
 
 
