@@ -1,7 +1,7 @@
 # Two commands on a fresh machine with python3, python3-venv, libglib2.0-0 and make:
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
-#   make deb      a Debian package of it in build/
+#   make deb      a Debian package of it in build/; for a board with ARM: make deb ARCH=arm64
 # and: make test-quick (without processes and long drives, for the inner loop: a minute on two cores),
 #      make check (format, lint, types), make docs (the generated parts of docs/; the site in build/site), make bench (ratio benchmarks), make clean,
 #      make screenshots (of the viewer, for the docs).
@@ -15,6 +15,7 @@ BIN    := $(VENV)/bin
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
 DOCS_STAMP := $(VENV)/.installed-docs
+DEB_STAMP := $(VENV)/.installed-deb
 
 .PHONY: demo deb test test-quick check format screenshots docs bench types clean help
 
@@ -42,11 +43,15 @@ $(DOCS_STAMP): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $(RUN_STAMP) $@
 
+$(DEB_STAMP): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bags,foxglove,report,view]'
+	@touch $(RUN_STAMP) $@
+
 demo: $(RUN_STAMP)
 	$(BIN)/modelserver demo
 
-deb: $(RUN_STAMP)
-	$(BIN)/python tools/debian_package.py
+deb: $(DEB_STAMP)
+	$(BIN)/python tools/debian_package.py $(if $(ARCH),--arch $(ARCH))
 
 test: $(DEV_STAMP)
 	$(BIN)/python -m pytest -n auto $(TESTS)

@@ -60,7 +60,7 @@ def skip_reason() -> str:
     if not interpreter():
         return f"no {version} below /usr: the tests' own is in {sys.base_prefix}, which a hardened unit does not see"
     if find_spec("hatchling") is None:
-        return "hatchling, which builds the wheel, is not installed (pip install 'modelserver[test]')"
+        return "hatchling, which builds the wheel, is not installed (pip install -e '.[test]')"
     tried = subprocess.run(["unshare", "--mount", "--pid", "--net", "--fork", "true"], capture_output=True, text=True)
     if tried.returncode:
         return f"this machine makes no namespaces: {tried.stderr.strip()}"
@@ -201,9 +201,17 @@ def _remove_groups(group: Path) -> None:
             time.sleep(0.02)
 
 
-def build_package(folder: Path) -> Path:
+def build_package(folder: Path, *options: str) -> Path:
     """Return a Debian package of this project for the Python of these tests, built from its source."""
-    command = [sys.executable, ROOT / "tools" / "debian_package.py", "--compression", "none", "--output", folder]
+    command = [
+        sys.executable,
+        ROOT / "tools" / "debian_package.py",
+        "--compression",
+        "none",
+        "--output",
+        folder,
+        *options,
+    ]
     wheel = build_wheel(folder)
     done = subprocess.run([*command, "--wheel", wheel], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr

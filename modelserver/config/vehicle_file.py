@@ -7,10 +7,11 @@ is wrong, and a suggestion for a misspelled key. The attributes of the dataclass
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict
 
@@ -398,7 +399,7 @@ class JournalConfig:
     """The journal: everything that is received and sent, on disk; see docs/journal.md."""
 
     directory: str = ""
-    """Its directory, relative to this file; empty: `journal-` and the vehicle's name in the state directory."""
+    """Its directory, relative as `state_directory`; empty: `journal-` and the vehicle's name in the state directory."""
     megabytes: int | None = None
     """Its greatest size, 32 at least; 0: no journal. Default: 1024 under systemd or with a directory, else 0."""
     sync_s: float = 2.0
@@ -431,7 +432,8 @@ class VehicleConfig:
     variables: dict[str, str] = field(default_factory=dict)
     """Values of the $NAMES in a frame-tree file."""
     state_directory: str = ""
-    """Directory of the persisted origin and state, relative to this file; empty: the user's state directory."""
+    """Directory of the persisted origin and state, relative to this file, for one in /etc/modelserver to
+    /var/lib/modelserver; empty: the user's state directory."""
     lcm: LcmConfig = field(default_factory=LcmConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
@@ -513,6 +515,13 @@ _FIXES: dict[FileKind, str] = {
 }
 
 
+INSTALLED_FOLDER: Final = "/etc/modelserver"
+"""Folder of the installed vehicle file."""
+
+STATE_FOLDER: Final = "/var/lib/modelserver"
+"""Folder of the installed service's state: `StateDirectory=` of its unit."""
+
+
 def _read_bytes(path: Path) -> bytes:
     """Read a vehicle file. Raises ConfigError for a file of another type, OSError."""
     try:
@@ -533,12 +542,17 @@ def _resolve_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
     def resolve(given: str) -> str:
         return str((path.parent / Path(given).expanduser()).resolve()) if given else ""
 
+    def resolve_state(given: str) -> str:
+        # the units and the container have /etc read-only, and state where the file hierarchy standard has it
+        is_relative = str(path.parent.resolve()) == INSTALLED_FOLDER and not given.startswith(("/", "~"))
+        return resolve(os.path.join(STATE_FOLDER, given) if given and is_relative else given)
+
     return dataclasses.replace(
         config,
         geometry=resolve(config.geometry),
-        state_directory=resolve(config.state_directory),
+        state_directory=resolve_state(config.state_directory),
         commands=dataclasses.replace(config.commands, key_file=resolve(config.commands.key_file)),
-        journal=dataclasses.replace(config.journal, directory=resolve(config.journal.directory)),
+        journal=dataclasses.replace(config.journal, directory=resolve_state(config.journal.directory)),
     )
 
 

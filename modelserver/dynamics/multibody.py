@@ -50,6 +50,7 @@ from modelserver.dynamics.tree import (
     iterate_center_covariance,
 )
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
+from modelserver.extras import make_install_command
 from modelserver.geometry.inertia import RigidInertia, to_rows
 from modelserver.geometry.joint import JointType
 from modelserver.geometry.model import Model
@@ -540,9 +541,7 @@ def _build_pinocchio(tree: Tree, gravity: float) -> tuple[Any, Any, list[int], A
     try:
         import pinocchio as pin
     except ImportError as error:
-        raise ModelServerError(
-            f"dynamics needs Pinocchio ({error}); install it with pip install 'modelserver[dynamics]'"
-        ) from None
+        raise ModelServerError(f"dynamics needs Pinocchio ({error}); {make_install_command('dynamics')}") from None
     model = pin.Model()
     model.gravity.linear = np.array([0.0, 0.0, -gravity])
     last: list[int] = []

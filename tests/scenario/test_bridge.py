@@ -18,7 +18,7 @@ import pytest
 from support_lcm import MODELSERVER, TIMEOUT_S
 from support_view import record_drive
 
-pytest.importorskip("foxglove", reason="the extra foxglove is not installed: pip install 'modelserver[foxglove]'")
+pytest.importorskip("foxglove", reason="the extra foxglove is not installed: pip install -e '.[foxglove]'")
 
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory

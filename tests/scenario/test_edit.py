@@ -20,7 +20,7 @@ from support_command import run_command
 from support_lcm import TIMEOUT_S, reserved_url
 from support_signing import ALLOWED, write_test_key
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from PIL import Image
 

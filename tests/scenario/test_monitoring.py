@@ -12,6 +12,7 @@ import signal
 import subprocess
 import termios
 import time
+import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -266,3 +267,43 @@ def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_com
     assert codes["after"] in ("0", "1")
     found = {each["subject"]: each for each in json.loads((tmp_path / "after.json").read_text())["findings"]}
     assert (found["own message"]["level"], found["multicast route"]["level"]) == ("ok", "ok")
+
+
+# --- metrics --------------------------------------------------------------------------------------------------
+
+
+def test_given_a_real_daemon_then_prometheus_reads_its_metrics_and_whether_it_is_gone(
+    start_daemon: StartDaemon,
+) -> None:
+    daemon = start_daemon()
+    daemon.health()
+    environment = os.environ | {"LCM_DEFAULT_URL": daemon.url}
+    with subprocess.Popen(
+        [*MODELSERVER, "status", "--metrics", "0"], env=environment, stdout=subprocess.PIPE, text=True
+    ) as serving:
+        try:
+            assert serving.stdout is not None
+            address = serving.stdout.readline().split()[0]
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/metrics", address)
+
+            def wait_for(line: str) -> str:
+                deadline = time.monotonic() + TIMEOUT_S
+                while True:
+                    with urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
+                        text: str = answer.read().decode()
+                    if f"\n{line}\n" in text:
+                        return text
+                    assert time.monotonic() < deadline, text
+                    time.sleep(0.1)
+
+            text = wait_for("modelserver_up 1.0")
+            assert 'modelserver_source_silent{source="GPS"} 1.0' in text
+            assert "modelserver_pose_valid 0.0" in text
+            assert text.endswith("\n# EOF\n")
+            daemon.process.kill()
+            text = wait_for("modelserver_up 0.0")
+            assert "modelserver_pose_valid" not in text
+            serving.send_signal(signal.SIGINT)
+            assert serving.wait(TIMEOUT_S) == 0
+        finally:
+            serving.kill()

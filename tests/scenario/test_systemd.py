@@ -105,7 +105,12 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Machine, s
     # shared with the container
     package = build_package(folder)
     shutil.copytree(ROOT / "config" / "raptor", folder / "raptor")
+    # as `modelserver new` writes it
+    with (folder / "raptor" / "vehicle.yaml").open("a") as file:
+        file.write("\nstate_directory: state\njournal: {directory: journal, megabytes: 256}\n")
     with boot_machine(folder) as booted:
+        # of Debian's package udev, which this host may lack
+        booted.run("mkdir", "-p", "/etc/udev/rules.d")
         yield booted, install_package(booted, package)
 
 
@@ -248,9 +253,12 @@ def test_given_a_vehicle_file_that_is_wrong_then_the_journal_reports_it_and_once
 
 def test_given_the_installed_unit_then_doctor_looks_where_that_keeps_its_state(site: Site) -> None:
     output = site.machine.run(site.program, "doctor", "-c", "/etc/modelserver/vehicle.yaml", check=False).stdout
-    assert re.search(r"^ok +state +/var/lib/modelserver may be written", output, re.MULTILINE), output
-    journal = r"^ok +journal +/var/lib/modelserver/journal-\S+ may be written"
-    assert re.search(journal, output, re.MULTILINE), output
+    for name in ("state", "journal"):
+        written = rf"^ok +{name} +/var/lib/(private/)?modelserver/{name} may be written"
+        assert re.search(written, output, re.MULTILINE), output
+    # the unit writes there, not beside the installed vehicle file
+    folder = "/var/lib/modelserver/journal"
+    site.wait_until(lambda: ".lcm" in site.machine.run("ls", folder, check=False).stdout, "no journal is written")
 
 
 def test_given_a_record_then_the_journal_has_its_fields(site: Site) -> None:
@@ -271,6 +279,55 @@ def test_given_a_stop_then_it_ends_cleanly_within_two_seconds(site: Site) -> Non
     site.wait_until(lambda: ": stopped" in site.machine.run(*read_log).stdout, "the log does not end with it")
     site.machine.systemctl("start", SERVICE)
     assert site.measure_answer() > 0
+
+
+def read_commands(page: str, heading: str) -> list[str]:
+    """Return the shell commands below a heading of a page, without sudo."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8").partition(f"\n## {heading}\n")[2]
+    lines = text.partition("```sh\n")[2].partition("```")[0].splitlines()
+    return [line.partition("  #")[0].replace("sudo ", "").strip() for line in lines]
+
+
+def test_given_the_backup_of_the_page_then_it_restores_the_service(site: Site) -> None:
+    save, restore = read_commands("operation.md", "Back up")
+    site.machine.run("sh", "-ec", f"cd {SHARED} && {save}")
+    listed = site.machine.run("tar", "-tzf", f"{SHARED}/vehicle.tar.gz").stdout.splitlines()
+    assert {"etc/modelserver/vehicle.yaml", "etc/modelserver/installed.json"} <= set(listed)
+    assert any(line.startswith("var/lib/private/modelserver/state") for line in listed)
+    assert not [line for line in listed if line.endswith(".lcm")]
+    site.machine.systemctl("stop", SERVICE)
+    site.machine.run("rm", "-r", "/etc/modelserver", "/var/lib/private/modelserver")
+    site.machine.run("sh", "-ec", f"cd {SHARED} && {restore} --drivers gps")
+    assert site.machine.get_property(SERVICE, "ActiveState") == "active"
+    assert site.measure_answer() > 0
+
+
+def test_given_the_upgrade_of_the_page_then_the_service_is_a_new_process(site: Site) -> None:
+    before = site.main_pid()
+    for command in read_commands("operation.md", "Upgrade"):
+        # there is no apt in the container, and no index
+        upgrade = command.replace("apt install ./build/", f"dpkg --install {SHARED}/")
+        upgrade += " --drivers gps" if command == "modelserver install" else ""
+        is_report = command.startswith(("modelserver status", "modelserver doctor"))
+        done = site.machine.run("sh", "-ec", f"cd /tmp && {upgrade}", check=not is_report, timeout=120.0)
+        assert done.returncode in ((0, 1, 3) if is_report else (0,)), done
+    assert site.main_pid() not in ("0", before)
+    assert site.measure_answer() > 0
+
+
+def test_given_the_metrics_unit_of_the_page_then_it_serves_the_health(site: Site) -> None:
+    text = (ROOT / "docs" / "monitoring.md").read_text(encoding="utf-8").partition("```ini\n")[2].partition("```")[0]
+    (site.machine.folder / "metrics.service").write_text(text)
+    unit = "modelserver-metrics.service"
+    site.machine.run("cp", f"{SHARED}/metrics.service", f"/run/systemd/system/{unit}")
+    site.machine.systemctl("daemon-reload")
+    site.machine.systemctl("start", unit)
+    code = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:9464/metrics').read().decode())"
+    read = (f"{PREFIX}/bin/python", "-c", code)
+    site.wait_until(lambda: "\nmodelserver_up 1.0\n" in site.machine.run(*read, check=False).stdout, "no metrics")
+    site.machine.systemctl("stop", unit)
+    site.machine.run("rm", f"/run/systemd/system/{unit}")
+    site.machine.systemctl("daemon-reload")
 
 
 def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, before: list[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from support_browser import choose, find_fields, needs_browser, show
 from support_view import follow_drive, record_drive
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from PIL import Image
 

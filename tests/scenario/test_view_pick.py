@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from support_browser import TIMEOUT_MS, choose, needs_browser, show
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from mstools.view.sources import open_geometry
 

@@ -32,9 +32,10 @@ LINKING = [
     *PAGES,
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "examples/README.md", "tests/realdata/README.md")),
 ]
-WORDS_AT_MOST = 30_800
+WORDS_AT_MOST = 31_900
 """Over README and what is written by hand in docs/, as `wc -w` counts: what `make docs` writes does not count, neither
-in the reference nor below the marks of other pages. They were 52,000, and 29,300 without dynamics."""
+in the reference nor below the marks of other pages. They were 52,000, 29,300 without dynamics, and 30,800 without
+operation (metrics, backup, upgrade, exit codes)."""
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ TOOLS = {
     "view": {"terminal", "edit", "recordings"},
 }
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
-BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"}
+BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers", "extras"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -45,7 +45,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "transforms": {"errors"},
     "geometry": VALUES | {"plugins"},
-    "dynamics": GEOMETRY,
+    "dynamics": GEOMETRY | {"extras"},
     "messages": VALUES | {"earth"},
     "signing": VALUES | {"messages"},
     "key_files": VALUES | {"messages", "signing", "files"},
@@ -55,6 +55,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     # load code, and neither compute nor read anything
     "estimation.filterpy_import": set(),
     "plugins": set(),
+    # reads the metadata of this installation, for messages
+    "extras": set(),
     "formats": GEOMETRY | FILES | {"yaml_tree"},
     "estimation": GEOMETRY | POSES | {"estimation.filterpy_import", "plugins"},
     "query": CORE,
@@ -247,8 +249,8 @@ def test_the_table_itself_has_no_cycle():
     graphlib.TopologicalSorter({package: others - {package} for package, others in MAY_IMPORT.items()}).prepare()
     assert set(MAY_IMPORT) >= PURE
     assert set().union(*MAY_IMPORT.values()) <= set(MAY_IMPORT)
-    # what is pure imports only what is pure, the version, or the modules that load filterpy and plug-ins
-    loading = {"version", "estimation.filterpy_import", "plugins"}
+    # what is pure imports only what is pure, the version, or modules that load code or know the installation
+    loading = {"version", "estimation.filterpy_import", "plugins", "extras"}
     assert set().union(*(MAY_IMPORT[package] for package in PURE)) <= PURE | loading
 
 

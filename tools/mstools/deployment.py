@@ -27,6 +27,7 @@ from urllib.parse import parse_qs, urlsplit
 import typer
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
+from modelserver.extras import SYSTEM_ENVIRONMENT, make_requirement, make_system_command
 from modelserver.wire.provider import group_of
 from mstools.terminal.output import ProblemCollector, escape, make_error
 
@@ -329,6 +330,14 @@ class SerialDriver:
     port: str
 
 
+def is_unit_state(folder: str) -> bool:
+    """Return whether the unit can write a folder of the installed vehicle file: one in its state directory."""
+    if folder.startswith("~"):
+        return False
+    whole = os.path.normpath(os.path.join(STATE[0], folder))
+    return any(whole == state or whole.startswith(f"{state}/") for state in STATE)
+
+
 def find_hiding_setting(path: str) -> str:
     """Return the unit setting that hides a path from the service, empty for none."""
     return next((why for folder, why in HIDDEN_FOLDERS.items() if path == folder or path.startswith(f"{folder}/")), "")
@@ -500,6 +509,8 @@ def render_udev_rules(
     `given` are names below /dev/serial/by-id by driver, as `check_serial` accepts them; they take precedence over the
     found ones. Raises ModelServerError.
     """
+    from msdrivers.links.serial_port import BOARD_UARTS
+
     lines, notes = [], []
     for driver in drivers:
         own = f"{DEVICE_FOLDER}{driver.name}"
@@ -516,6 +527,9 @@ def render_udev_rules(
             lines.append(f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", {link}')
         elif known:
             lines.append(known[0])
+        elif re.fullmatch(rf"/dev/({'|'.join(BOARD_UARTS)})[0-9]+", driver.port):
+            # a UART of the board: its name is fixed
+            continue
         else:
             fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
             notes.append(f"no device id is known for driver {driver.name} (port {driver.port}); {fix}")
@@ -553,12 +567,14 @@ SEARCH_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/b
 COMMAND_TIMEOUT_S: Final = 120.0
 """Time limit of a command: a start waits until the service is ready."""
 
-INSTALL_HINT: Final = (
-    "install with the system's Python, to a folder that all users may read: sudo /usr/bin/python3 -m venv --clear "
-    "/opt/modelserver && sudo /opt/modelserver/bin/pip install modelserver, then sudo /opt/modelserver/bin/modelserver "
-    "install ... (another python3 in the PATH may be in a home directory, and an environment that was made with it "
-    "keeps it unless it is cleared)"
-)
+
+def make_install_hint() -> str:
+    """Return how to install this version where the units and all users can access it."""
+    command = make_system_command(make_requirement())
+    return (
+        f"install it to {SYSTEM_ENVIRONMENT}, then install the units from there: "
+        f"{command} && sudo {SYSTEM_ENVIRONMENT}/bin/modelserver install --vehicle FILE"
+    )
 
 
 def get_command_path() -> str:
@@ -573,7 +589,7 @@ def get_examples_folder() -> Path:
 
 def check_installation() -> None:
     """Raise ConfigError where the units could not access or read this installation, with all problems."""
-    subject, command = "this installation", get_command_path()
+    subject, command, hint = "this installation", get_command_path(), make_install_hint()
     paths = [
         (command, "the command of this installation"),
         (os.path.realpath(sys.executable), "its Python"),
@@ -582,9 +598,9 @@ def check_installation() -> None:
     ]
     gathered = ProblemCollector()
     with gathered.collect(subject):
-        check_visible(paths, INSTALL_HINT)
+        check_visible(paths, hint)
     if not os.path.isfile(command):
-        gathered.add(subject, f"there is no {command}: the package is not installed", INSTALL_HINT)
+        gathered.add(subject, f"there is no {command}: the package is not installed", hint)
     if not _UNIT_PATH.fullmatch(command):
         fix = "install to a folder whose path has only letters, digits and ._+@-"
         gathered.add(subject, f"{command!r} cannot be written in a unit", fix)

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from modelserver.errors import ModelServerError
+from modelserver.extras import DEBIAN_INSTALLER, make_system_command, read_installation
 
 
 class MissingToolError(ModelServerError):
@@ -48,5 +49,8 @@ def _get_site_packages() -> Path:
 
 def _check_file(path: Path) -> Path:
     if not path.is_file():
+        if read_installation()[0] == DEBIAN_INSTALLER:
+            fix = f"the Debian package does not have it; in a folder with the source: {make_system_command('.')}"
+            raise MissingToolError(f"{path.name} is missing: {fix}")
         raise MissingToolError(f"{path} is missing; reinstall the wheel: pip install --force-reinstall lcm")
     return path

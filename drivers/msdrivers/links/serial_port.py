@@ -35,10 +35,38 @@ class PortInfo(NamedTuple):
     hint: str
 
 
+BOARD_UARTS = ("ttyS", "ttyAMA", "ttyTHS", "ttymxc", "ttySC", "ttyLP")
+"""Kernel names of the UARTs of boards: 8250, Arm PL011, NVIDIA Tegra, NXP i.MX 6 to 8M, SC16IS7xx, NXP i.MX 8 LPUART.
+
+Each is the `dev_name` of its driver in the kernel (drivers/tty/serial). The units allow the same ones.
+"""
+
+DEVICES, KERNEL_DEVICES = Path("/dev"), Path("/sys/class/tty")
+
+
 def find_ports() -> list[PortInfo]:
     """Return the serial ports found, those with something plugged in first."""
     ports = sorted(list_ports.comports(), key=lambda port: (port.vid is None, port.device))
-    return [PortInfo(port.device, _describe_port(port), find_access_problem(port.device)) for port in ports]
+    found = [PortInfo(port.device, _describe_port(port), find_access_problem(port.device)) for port in ports]
+    known = {port.path for port in found}
+    uarts = sorted(str(path) for path in find_board_uarts())
+    return [
+        *found,
+        *(PortInfo(path, "UART of the board", find_access_problem(path)) for path in uarts if path not in known),
+    ]
+
+
+def find_board_uarts() -> list[Path]:
+    """Return the UARTs of the board that are present: pyserial leaves out those that are no separate device.
+
+    The kernel's serial core has the type of each port in sysfs; 0 (PORT_UNKNOWN) is a port without hardware.
+    """
+    found = []
+    for path in (path for name in BOARD_UARTS for path in DEVICES.glob(f"{name}[0-9]*")):
+        with contextlib.suppress(OSError):
+            if (KERNEL_DEVICES / path.name / "type").read_text().strip() not in ("", "0"):
+                found.append(path)
+    return found
 
 
 def _describe_port(port: object) -> str:

@@ -269,6 +269,41 @@ def test_given_the_ports_of_this_machine_then_each_can_be_shown() -> None:
     assert all(port.path and port.description for port in ports.find_ports())
 
 
+def test_given_a_board_then_its_present_uarts_are_listed_after_those_of_pyserial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder stands for /dev and sysfs: of the 8250 ports only ttyS0 has hardware, and console is no UART."""
+    devices, kernel = tmp_path / "dev", tmp_path / "tty"
+    types = {
+        "ttyTHS1": "20",
+        "ttymxc2": "62",
+        "ttyAMA10": "30",
+        "ttySC0": "84",
+        "ttyLP3": "91",
+        "ttyS0": "4",
+        "ttyS1": "0",
+    }
+    for name, kind in {**types, "ttyGS0": "4", "ttyS9": ""}.items():
+        (kernel / name).mkdir(parents=True)
+        (kernel / name / "type").write_text(f"{kind}\n")
+        devices.mkdir(exist_ok=True)
+        (devices / name).touch()
+    (devices / "ttySclk").touch()
+    monkeypatch.setattr(ports, "DEVICES", devices)
+    monkeypatch.setattr(ports, "KERNEL_DEVICES", kernel)
+    monkeypatch.setattr(ports.list_ports, "comports", list)
+    found = ports.find_ports()
+    present = ["ttyAMA10", "ttyLP3", "ttyS0", "ttySC0", "ttyTHS1", "ttymxc2"]
+    assert [Path(port.path).name for port in found] == present
+    assert {port.description for port in found} == {"UART of the board"}
+
+
+def test_given_the_unit_of_a_driver_then_it_may_use_the_ports_that_are_listed() -> None:
+    unit = (Path(__file__).parents[3] / "config" / "systemd" / "modelserver-driver@.service").read_text()
+    allowed = {line.removeprefix("DeviceAllow=char-") for line in unit.splitlines() if line.startswith("DeviceAllow=")}
+    assert allowed == {f"{name} rw" for name in (*ports.BOARD_UARTS, "ttyUSB", "ttyACM")}
+
+
 # --- TCP ----------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import pytest
 from support_recordings import write_log
 from support_view import record_drive
 
-pytest.importorskip("foxglove", reason="the extra foxglove is not installed: pip install 'modelserver[foxglove]'")
+pytest.importorskip("foxglove", reason="the extra foxglove is not installed: pip install -e '.[foxglove]'")
 
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory

@@ -13,6 +13,7 @@ import pytest
 from support_bags import START_NS, Ros
 
 from modelserver.errors import RecordingError
+from modelserver.extras import make_install_command
 from modelserver.formats import load_model
 from modelserver.messages import Direction, FixType, ImuSample, OrientationReference, WheelsSample, YawSource
 from modelserver.transforms import Pose
@@ -448,7 +449,7 @@ def test_given_no_rosbags_when_imported_then_the_pip_command_is_reported(
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     code, _, err = run(capsys, "import-bag", bag, tmp_path / "a.lcm")
     assert code == 1
-    assert "pip install 'modelserver[bags]'" in err
+    assert make_install_command("bags") in err
     assert err.count("\n") == 1
 
 

@@ -6,11 +6,16 @@ import os
 import re
 import shutil
 import stat
+import subprocess
+import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from modelserver import extras
+from modelserver.config import vehicle_file
 from modelserver.errors import ConfigError, ModelServerError, Severity
 from modelserver.key_files import generate_key, write_key
 from mstools import deployment as install_steps
@@ -231,12 +236,12 @@ def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> Non
 
 def test_given_an_installation_that_the_units_do_not_see_then_it_is_rejected_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.INSTALL_HINT)
+        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.make_install_hint())
 
 
 def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
     with pytest.raises(ConfigError) as caught:
-        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.INSTALL_HINT)
+        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.make_install_hint())
     (problem,) = caught.value.problems
     assert problem.message == (
         "its Python is /root/x, its package is /tmp/y, which the hardened units cannot access "
@@ -246,11 +251,18 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
     assert "sudo /usr/bin/python3 -m venv --clear /opt/modelserver" in problem.fix
 
 
+@pytest.mark.parametrize("port", ["/dev/ttyTHS1", "/dev/ttymxc0", "/dev/ttyAMA10", "/dev/ttySC0", "/dev/ttyS0"])
+def test_given_a_uart_of_the_board_then_nobody_is_asked_to_plug_it_in(port: str) -> None:
+    assert render_udev_rules([SerialDriver("gps", port)], {}, SystemFacts()) == ([], [])
+    writes, _ = render_udev_rules([SerialDriver("gps", port)], {"gps": "usb-A"}, SystemFacts())
+    assert len(writes) == 1
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/deployment.md"])
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
     way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
-    assert way in install_steps.INSTALL_HINT
+    assert way in install_steps.make_install_hint()
     # the README has the Debian package only
     assert way in text or page == "README.md"
     assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
@@ -530,3 +542,131 @@ def test_given_a_vehicle_that_any_host_can_drive_then_it_is_installed_only_if_th
     _, problems = check_vehicle(str(vehicle))
     found = [each.severity for each in problems if "can drive the vehicle" in each.message]
     assert found == ([] if url == LOCAL or "key_file" in commands else [NOTE if commands else WARNING])
+
+
+# --- folders of state and journal -------------------------------------------------------------------------------
+
+
+def write_state_folders(folder: Path, state: str, journal: str) -> Path:
+    """Write a copy of the Raptor's files with these folders; return the vehicle file."""
+    shutil.copytree(RAPTOR, folder)
+    vehicle = folder / "vehicle.yaml"
+    text = vehicle.read_text()
+    assert "state_directory" not in text
+    assert "journal:" not in text
+    added = f"state_directory: {state}\njournal: {{directory: {journal}, megabytes: 256}}\n"
+    vehicle.write_text(text + added)
+    return vehicle
+
+
+def test_given_a_vehicle_of_new_then_it_is_installed_as_it_is(run: Callable[..., Output], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["new", str(tmp_path / "rover"), "--yes"])
+    assert not ended.value.code
+    code, output, errors = run("install", "--vehicle", str(tmp_path / "rover" / "vehicle.yaml"))
+    assert (code, errors) == (0, "")
+    assert "state_directory" not in output
+    assert "journal.directory" not in output
+
+
+def test_given_the_installed_vehicle_file_then_relative_folders_are_the_units_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert vehicle_file.INSTALLED_FOLDER == install_steps.CONFIGURATION
+    assert install_steps.STATE[0] == vehicle_file.STATE_FOLDER
+    vehicle = write_state_folders(tmp_path / "etc", "state", "journal")
+    beside = vehicle_file.load_config(vehicle)
+    assert (beside.state_directory, beside.journal.directory) == (f"{tmp_path}/etc/state", f"{tmp_path}/etc/journal")
+    monkeypatch.setattr(vehicle_file, "INSTALLED_FOLDER", str(tmp_path / "etc"))
+    monkeypatch.setattr(vehicle_file, "STATE_FOLDER", "/var/lib/none")
+    installed = vehicle_file.load_config(vehicle)
+    assert (installed.state_directory, installed.journal.directory) == ("/var/lib/none/state", "/var/lib/none/journal")
+    assert Path(installed.geometry).parent == tmp_path / "etc"
+    absolute = vehicle_file.load_config(write_state_folders(tmp_path / "b", "/data/state", "/data/journal"))
+    assert (absolute.state_directory, absolute.journal.directory) == ("/data/state", "/data/journal")
+
+
+@pytest.mark.parametrize("folder", ["/data/x", "~/x", "../x", "/var/lib/modelserver2"])
+def test_given_folders_that_the_unit_cannot_write_then_each_is_rejected_and_the_advice_is_a_fix(
+    run: Callable[..., Output], tmp_path: Path, folder: str
+) -> None:
+    vehicle = write_state_folders(tmp_path / "a", f'"{folder}"', f'"{folder}"')
+    code, _, errors = run("install", "--vehicle", str(vehicle))
+    assert code != 0
+    advice = re.findall(r"write (state_directory|journal\.directory): (\w+), a folder below it", errors)
+    assert advice == [("state_directory", "state"), ("journal.directory", "journal")]
+    fixed = write_state_folders(tmp_path / "b", advice[0][1], advice[1][1])
+    code, _, errors = run("install", "--vehicle", str(fixed))
+    assert (code, errors) == (0, "")
+
+
+@pytest.mark.parametrize("folder", ["state", "a/b", "/var/lib/modelserver", "/var/lib/modelserver/a", "./a/../b"])
+def test_given_folders_below_the_state_directory_then_they_are_accepted(
+    run: Callable[..., Output], tmp_path: Path, folder: str
+) -> None:
+    code, _, errors = run("install", "--vehicle", str(write_state_folders(tmp_path / "a", folder, folder)))
+    assert (code, errors) == (0, "")
+
+
+# --- from a clone -----------------------------------------------------------------------------------------------
+
+
+def explain_missing_system() -> str:
+    """Return why the advice cannot be followed here without changing this machine, empty where it can."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        return "needs root and unshare"
+    if not Path("/usr/bin/python3").exists() or find_spec("hatchling") is None:
+        return "needs /usr/bin/python3 and hatchling"
+    version = subprocess.run(
+        ["/usr/bin/python3", "-c", "import sys, ensurepip; print(*sys.version_info[:2])"],
+        capture_output=True,
+        text=True,
+        check=False,
+    ).stdout
+    return (
+        "" if version.split() == [str(each) for each in sys.version_info[:2]] else "/usr/bin/python3 is another version"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(explain_missing_system()), reason=explain_missing_system())
+def test_given_a_clone_that_the_units_cannot_access_then_the_advice_in_one_command_installs_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The advice is run as it is, in a mount namespace with an /opt of its own; dependencies are those of the tests."""
+    source = Path(__file__).parents[3]
+    clone = {"url": source.as_uri(), "dir_info": {"editable": True}}
+    monkeypatch.setattr(extras, "read_installation", lambda: ("pip", clone))
+    monkeypatch.setattr(install_steps, "HIDDEN_FOLDERS", {os.path.dirname(sys.executable): "ProtectHome"})
+    with pytest.raises(ConfigError) as caught:
+        install_steps.check_installation()
+    fixes = {problem.fix for problem in caught.value.problems}
+    (command,) = (fix.partition("install the units from there: ")[2] for fix in fixes if "/opt" in fix)
+    root, sudo = tmp_path / "root", tmp_path / "bin" / "sudo"
+    sudo.parent.mkdir()
+    sudo.write_text('#!/bin/sh\nexec "$@"\n')
+    sudo.chmod(0o755)
+    root.mkdir()
+    assert command.endswith(" install --vehicle FILE")
+    command = command.replace("FILE", f"{RAPTOR}/vehicle.yaml --root {root}")
+    packages = str(Path(pytest.__file__).parents[1])
+    environment = {
+        "PATH": f"{sudo.parent}:/usr/sbin:/usr/bin:/sbin:/bin",
+        "PYTHONPATH": packages,
+        "HOME": str(tmp_path),
+    }
+    environment |= {"PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_NO_INDEX": "1", "PIP_QUIET": "1"}
+    script = f"mount -t tmpfs tmpfs /opt && {command}"
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-ec", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done
+    unit = (root / "etc/systemd/system/modelserver.service").read_text()
+    assert "\nExecStart=/opt/modelserver/bin/modelserver run " in unit
+    assert not Path("/opt/modelserver").exists()

@@ -16,6 +16,7 @@ from support_recordings import HUSKY, drive, write_log
 from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
 from modelserver.errors import ModelServerError
+from modelserver.extras import make_install_command
 from modelserver.simulation import EncoderModel, WheelsModel
 from mstools import cli
 from mstools.report import charts
@@ -213,5 +214,5 @@ def test_given_no_plotly_then_the_error_has_the_command(monkeypatch: pytest.Monk
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(charts, "files", find)
-    with pytest.raises(ModelServerError, match=r"pip install 'modelserver\[report\]'"):
+    with pytest.raises(ModelServerError, match=re.escape(make_install_command("report"))):
         charts.render_page("a", "b")

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -337,3 +338,23 @@ def test_given_a_report_then_the_status_has_how_many_measurements_were_used() ->
     assert "215/217" in row
     (data,) = (each for each in as_data(health)["channels"] if each["channel"] == "sensor:wheels")
     assert (data["measured"], data["used"]) == (217, 215)
+
+
+# --- documented keys ------------------------------------------------------------------------------------------
+
+
+def test_given_the_documented_keys_of_json_then_they_are_those_of_a_report() -> None:
+    data = as_data(FULL, DRIVERS[1:])
+    of = {"report": data, "`localization`": data["localization"], "`stability`": data["stability"]}
+    of |= {f"`{name}[]`": data[name][0] for name in ("channels", "rejected", "drivers")}
+    page = (Path(__file__).parents[3] / "docs" / "monitoring.md").read_text(encoding="utf-8")
+    rows = dict(
+        re.findall(r"^\| (\S+) \| (`[^|]+`) \|$", page.partition("| object | keys |")[2].partition("\n\n")[0], re.M)
+    )
+    assert rows.keys() == of.keys()
+    for name, keys in rows.items():
+        assert re.findall(r"`(\w+)`", keys) == list(of[name]), name
+    # a report without values has the same keys
+    bare = as_data(BARE)
+    assert list(bare) == list(data)
+    assert list(bare["localization"]) == list(data["localization"])

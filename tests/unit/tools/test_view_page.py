@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 import viser
 from viser._messages import ShareUrlRequest

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 import yaml
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from modelserver.transforms.pose import Pose
 from mstools.commands.demo import find_vehicle_file

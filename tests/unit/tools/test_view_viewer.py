@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("viser", reason="the extra view is not installed: pip install 'modelserver[view]'")
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import MirrorState

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from modelserver.extras import describe_missing
 from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
@@ -126,6 +127,8 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
         typer.echo("\n5. The camera in the world")
         typer.echo(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM")))
     typer.echo(f"\nDone. Next: modelserver run -c {find_vehicle_file()}, and in another shell: modelserver tree --live")
+    if missing := describe_missing():
+        typer.echo(missing)
 
 
 class PoseListener(HealthListener):

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
+from modelserver.extras import make_install_command
 from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.terminal.options import PrefixOption, UrlOption, option
@@ -45,7 +46,7 @@ def command(
 
     It has the frames (/tf), the pose (/pose, /pose/fix), fixes (/fix/SOURCE), the shapes of the bodies (/model), health
     (/diagnostics) and events (/events) in Foxglove's schemas, and the LCM messages as they are (/lcm/CHANNEL). It needs
-    the extra foxglove: pip install 'modelserver[foxglove]'. import-bag makes the log of it again.
+    the extra foxglove; without it, the error names the command that adds it. import-bag makes the log of it again.
 
     With --live the topics are the same, without /lcm. Foxglove: Open connection, Foxglove WebSocket,
     ws://127.0.0.1:8765. Everyone who reaches the port can read what the service publishes, and change nothing.
@@ -147,4 +148,4 @@ def serve_live(bind: str, port: int, seconds: float, url: str, prefix: str) -> N
 def check_foxglove() -> None:
     """Raise ModelServerError if the extra `foxglove` is not installed."""
     if importlib.util.find_spec("foxglove") is None:
-        raise ModelServerError("this needs foxglove-sdk, which is not installed: pip install 'modelserver[foxglove]'")
+        raise ModelServerError(f"this needs foxglove-sdk, which is not installed: {make_install_command('foxglove')}")

@@ -111,6 +111,12 @@ def make_plan(
             gathered.add("commands.drive", text, f"{KEY_HINT}; or write drive: unsigned to accept it")
         with gathered.collect("--serial"):
             deployment.check_serial(serial, made.serial_of(names))
+        for key, given in made.get_state_folders().items():
+            if not deployment.is_unit_state(given):
+                why = f"the unit cannot write {quote(given)}, only {deployment.STATE[0]}"
+                name = key.rpartition("_" if "_" in key else ".")[0]
+                fix = f"write {key}: {name}, a folder below it, or leave it out"
+                gathered.add(key, why, fix)
     gathered.raise_any()
     assert made is not None
     return _build_plan(copied, made, names, serial, root, start)
@@ -150,13 +156,6 @@ def _build_plan(
             "the units may use this machine's and private addresses only (IPAddressAllow); if the vehicle's network "
             "is another one: sudo systemctl edit modelserver, and there [Service] IPAddressAllow=NETWORK"
         )
-    if made.config.state_directory:
-        notes.append("the vehicle file sets state_directory; without it the state is in the unit's directory")
-    if made.config.journal.directory:
-        notes.append(
-            "the vehicle file sets journal.directory, which the unit can write only inside "
-            f"{deployment.STATE[0]}; without it (megabytes only) the journal is written there"
-        )
     return deployment.plan_install(writes, started, facts, notes, start)
 
 
@@ -191,6 +190,14 @@ class CheckedVehicle:
     def installed_key(self) -> str:
         """The path of the installed key file; empty for none."""
         return os.path.normpath(os.path.join(deployment.CONFIGURATION, self.key_file)) if self.key_file else ""
+
+    def get_state_folders(self) -> dict[str, str]:
+        """Return the folders of state and journal that the file has, as written, by their keys."""
+        named = {
+            "state_directory": self.content.get("state_directory"),
+            "journal.directory": (self.content.get("journal") or {}).get("directory"),
+        }
+        return {key: str(given) for key, given in named.items() if given}
 
     def hosts_of(self, names: Iterable[str]) -> list[str]:
         """Return the hosts of the named drivers' network devices."""

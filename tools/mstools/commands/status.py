@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_patt
 from modelserver.wire.codec import decode
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
+from mstools.terminal import health_metrics
 from mstools.terminal.health_text import as_data, format_report, is_healthy
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
@@ -67,6 +69,9 @@ def command(
     ] = None,
     watch: Annotated[bool, option("--watch -w", "Show each report, until Ctrl-C.")] = False,
     spy: Annotated[bool, option("--spy", "Show all channels decoded, in lcm-spy.")] = False,
+    metrics: Annotated[
+        str, option("--metrics [HOST:]PORT", "Serve the health to Prometheus, until Ctrl-C; on loopback by default.")
+    ] = "",
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
@@ -85,12 +90,16 @@ def command(
 
     With LOG it shows the last report in a log. With -c too the localization runs on the log first.
 
+    --metrics serves the reports as OpenMetrics text at http://127.0.0.1:PORT/metrics instead, in a process of its own,
+    also while there is no daemon.
+
     Exit code: 0 the daemon runs with a valid pose, 3 it runs without one, 1 no report was received, 2 wrong usage.
 
     \b
     Examples:
       modelserver status --watch
       modelserver status --spy
+      modelserver status --metrics 9464
     """
     drivers: tuple[str, ...] = ()
     if config is not None:
@@ -100,13 +109,18 @@ def command(
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         drivers = tuple(vehicle.drivers)
     if log is not None:
-        if watch or spy or url:
-            raise typer.BadParameter("goes without --watch, --spy and --url", param_hint="LOG")
+        if watch or spy or metrics or url:
+            raise typer.BadParameter("goes without --watch, --spy, --metrics and --url", param_hint="LOG")
         show_last_report(log, config, prefix, as_json)
         return
     if spy:
         run_spy(url)
     provider = resolve_url(url)
+    if metrics:
+        if watch or as_json:
+            raise typer.BadParameter("excludes --watch and --json", param_hint="--metrics")
+        follow_metrics(MetricsListener(open_lcm(provider), prefix), metrics)
+        return
     listener = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
     if not listener.listen(timeout, lambda: listener.health is not None):
@@ -289,6 +303,50 @@ def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: b
                 typer.echo(f"no report for {silent:.0f} s", err=True)
             is_new = listener.wait_for_report(1.0 if is_screen else SILENT_S, stop)
             last = time.monotonic() if is_new else last
+
+
+# --- metrics
+
+
+class MetricsListener(HealthListener):
+    """Receive health reports with the times when they were received, so that old ones are not taken for current."""
+
+    def __init__(self, bus: lcm.LCM, prefix: str):
+        self._times: dict[str, float] = {}
+        super().__init__(bus, prefix)
+
+    def _on_health(self, health: Health) -> None:
+        super()._on_health(health)
+        self._times[HEALTH] = time.monotonic()
+
+    def _on_driver(self, health: DriverHealth) -> None:
+        super()._on_driver(health)
+        self._times[f"driver {health.source}"] = time.monotonic()
+
+    def render(self) -> str:
+        """Return the metrics of the current reports."""
+        now = time.monotonic()
+        age = now - self._times.get(HEALTH, -math.inf)
+        times = dict(self._times)
+        drivers = [
+            each
+            for name, each in dict(self.drivers).items()
+            if now - times.get(f"driver {name}", -math.inf) <= health_metrics.MAX_AGE_S
+        ]
+        return health_metrics.format_metrics(self.health, age, drivers)
+
+
+def follow_metrics(listener: MetricsListener, address: str) -> None:
+    """Serve metrics until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
+    server = health_metrics.serve_metrics(address, listener.render)
+    host, port = server.server_address[:2]
+    typer.echo(f"http://{host!s}:{port}/metrics (Ctrl-C ends it)")
+    sys.stdout.flush()
+    with catch_signals() as stop:
+        while not stop.is_set():
+            listener.listen(SILENT_S, stop.is_set)
+    server.shutdown()
+    server.server_close()
 
 
 # --- lcm-spy

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError
+from modelserver.extras import make_install_command
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from mstools.terminal.options import (
     KeyOption,
@@ -67,8 +68,8 @@ def command(
     uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
     --config the localization runs on a log that has no poses, such as an imported one. With
     --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
-    to the running service, signed with --key. It needs the extra view: pip install 'modelserver[view]'. Nothing is
-    loaded from the internet.
+    to the running service, signed with --key. It needs the extra view; without it, the error names the
+    command that adds it. Nothing is loaded from the internet.
 
     \b
     Examples:
@@ -126,7 +127,7 @@ def has_screen() -> bool:
 def check_installed() -> None:
     """Raise ModelServerError if the extra `view` is not installed."""
     if importlib.util.find_spec("viser") is None:
-        raise ModelServerError("the viewer needs viser, which is not installed: pip install 'modelserver[view]'")
+        raise ModelServerError(f"the viewer needs viser, which is not installed: {make_install_command('view')}")
 
 
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:

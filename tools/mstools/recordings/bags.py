@@ -23,6 +23,7 @@ from typing import IO, Any, Final, TypeVar
 import numpy as np
 
 from modelserver.errors import RecordingError
+from modelserver.extras import make_install_command
 from modelserver.messages import (
     NAN,
     Direction,
@@ -124,7 +125,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise RecordingError(
-            f"reading bags needs the library rosbags ({error}): pip install 'modelserver[bags]'"
+            f"reading bags needs the library rosbags ({error}): {make_install_command('bags')}"
         ) from None
     if path.is_file():
         with path.open("rb") as file:
@@ -245,7 +246,8 @@ def open_mcap(path: Path) -> Iterator[McapLog]:
     try:
         import mcap  # noqa: F401
     except ImportError:
-        raise RecordingError("reading MCAP files needs the library mcap: pip install 'modelserver[bags]'") from None
+        text = f"reading MCAP files needs the library mcap: {make_install_command('bags')}"
+        raise RecordingError(text) from None
     with path.open("rb") as file:
         yield McapLog(path, file)
 

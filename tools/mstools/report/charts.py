@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from modelserver.errors import ModelServerError
+from modelserver.extras import make_install_command
 from modelserver.transforms.so3 import Array
 
 WIDTH = 1060
@@ -329,7 +330,7 @@ def _find_library() -> Any:
     try:
         return files("plotly") / "package_data" / "plotly.min.js"
     except ModuleNotFoundError:
-        text = "reports need plotly, which is not installed: pip install 'modelserver[report]'"
+        text = f"reports need plotly, which is not installed: {make_install_command('report')}"
         raise ModelServerError(text) from None
 
 
