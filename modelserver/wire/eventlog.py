@@ -97,7 +97,8 @@ def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
     end = start + channel_length + data_length
     if end > size:
         return None
-    if end < size and data[end : end + 4] != _SYNC and data.find(_SYNC, at + 4, end) >= 0:
+    # the next event may be cut within its first word
+    if end < size and not _SYNC.startswith(data[end : end + 4]) and data.find(_SYNC, at + 4, end) >= 0:
         return None  # the length is corrupt: the event would contain the ones that follow
     try:
         channel = data[start : start + channel_length].decode("ascii")
