@@ -37,7 +37,6 @@ from modelserver.server.loop import Loop, LoopSettings
 from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import Event
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.receiver import Sender
 
 AIDING = {
     "\nsensors:\n": """
@@ -65,9 +64,6 @@ FORGED: dict[str, Callable[[SensorHeader], Sample | VehicleStatusSample]] = {
     "VEHICLE_STATUS": lambda header: VehicleStatusSample(header),
 }
 """A forged message for each channel of a sensor or controller."""
-
-ATTACKER: Sender = ("192.0.2.1", 7667)
-"""Address of the socket that sends the forged messages."""
 
 
 @dataclass
@@ -160,16 +156,14 @@ class LoopRun:
         """Run until a second of the drive, with the attacks beside the sensors."""
         drive = self.outcome.drive
         end = drive.start_utime + round(until * 1e6)
-        arrivals: list[tuple[int, str, bytes, Sender]] = [
-            (*each, None) for each in self._sensors if self._clock.utime() - self._step_us < each[0] <= end
-        ]
+        arrivals = [each for each in self._sensors if self._clock.utime() - self._step_us < each[0] <= end]
         for attack in attacks:
-            arrivals += [(at, attack.channel, data, ATTACKER) for at, data in attack.events(drive, until)]
-        for at, channel, data, sender in sorted(arrivals, key=lambda each: each[0]):
+            arrivals += [(at, attack.channel, data) for at, data in attack.events(drive, until)]
+        for at, channel, data in sorted(arrivals, key=lambda each: each[0]):
             while at + self._step_us > self._clock.utime():
                 self.loop.run_once()
                 _collect(self._bus, self.outcome)
-            self._bus.sensors.put(channel, data, sender)
+            self._bus.sensors.put(channel, data)
         return self.outcome
 
 

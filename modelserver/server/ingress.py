@@ -2,7 +2,7 @@
 
 For each message on a sensor's channel the loop
 
-1. reads source and utime from the header at a fixed offset (`peek_sample_id`), without decoding the message;
+1. reads source, seq and utime from the header at a fixed offset (`peek_sample_id`), without decoding the message;
 2. drops it if it is from a second publisher, unless configured otherwise (`PublisherConflictMonitor`);
 3. decodes it and subtracts the configured latency of the sensor (`SensorChannel.decode`).
 
@@ -51,10 +51,10 @@ from modelserver.wire.fields import MAX_NAME, MAX_UTIME
 from modelserver.wire.journal import RecordKind
 from modelserver.wire.receiver import Sender
 
-_HEADER: Final = struct.Struct(">8sq32xi")
-"""Start of every sensor message: fingerprint, header.utime, length of header.source, which follows.
+_HEADER: Final = struct.Struct(">8sq24xqi")
+"""Start of every sensor message: fingerprint, header.utime, header.seq, length of header.source, which follows.
 
-Between the two are utime_sigma, host_utime, device_utime and seq (sensor_header_t.lcm).
+Between utime and seq are utime_sigma, host_utime and device_utime (sensor_header_t.lcm).
 """
 
 
@@ -78,11 +78,11 @@ def peek_sample_id(data: bytes, fingerprint: bytes) -> SampleId | None:
     """
     if len(data) <= _HEADER.size:
         return None
-    found, utime, length = _HEADER.unpack_from(data)
+    found, utime, seq, length = _HEADER.unpack_from(data)
     end = _HEADER.size + length
     if found != fingerprint or not 0 < utime < MAX_UTIME or not 0 < length <= MAX_NAME + 1 or end > len(data):
         return None
-    return new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace")))
+    return new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
 
 
 def subtract_latency(sample: Sample | SwitchMode, microseconds: int) -> Sample | SwitchMode:

@@ -35,14 +35,14 @@ class Rig:
         self.loop = Loop(self.bus, self.clock, start_core(ScriptedLocalizer()), settings)
         self.number = 0
 
-    def publish(self, count: int = 1, other: str = "", age_s: float = 0.0, sender: Sender = None) -> None:
+    def publish(self, count: int = 1, other: str = "", age_s: float = 0.0) -> None:
         """Publish IMU samples at 100 Hz, with `other` also those of a second publisher."""
         for _ in range(count):
             self.clock.advance(0.01)
             self.number += 1
             self.put("imu", self.number, self.clock.utime())
             if other:
-                self.put(other, 90_000 + self.number, self.clock.utime() - 1 - round(age_s * 1e6), sender)
+                self.put(other, 90_000 + self.number, self.clock.utime() - 1 - round(age_s * 1e6))
             self.loop.run_once()
 
     def put(self, source: str, seq: int, utime: int, sender: Sender = None) -> None:
@@ -95,8 +95,9 @@ def test_given_another_source_on_the_channel_then_the_first_owns_it(
 def test_given_a_recording_played_beside_the_driver_then_the_warning_suspects_it() -> None:
     rig = Rig()
     rig.publish(50)
-    rig.publish(10, other="imu", age_s=86_400.0, sender=("127.0.0.1", 9))
-    assert rig.loop.state.rejected["IMU", "publisher_conflict"] in (9, 10)
+    rig.publish(10, other="imu", age_s=86_400.0)
+    # its first two samples could be from a restarted driver
+    assert rig.loop.state.rejected["IMU", "publisher_conflict"] in (8, 9)
     text = rig.loop.state.warnings["channel IMU"]
     assert "two publishers with source 'imu'" in text
     assert "86,400 s old: a recording" in text
