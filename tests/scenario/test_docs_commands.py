@@ -269,7 +269,7 @@ def test_given_a_bag_a_urdf_and_an_ekf_then_the_page_leads_to_a_report_and_to_lo
 
 # --- the marks --------------------------------------------------------------------------------------------------------
 
-TESTED = [TUTORIAL, FROM_ROS, *IN_SOURCE, *ON_THE_ROVER, *AFTER_THE_ROVER]
+TESTED = [TUTORIAL, FROM_ROS, DOCS / "operation.md", *IN_SOURCE, *ON_THE_ROVER, *AFTER_THE_ROVER]
 
 
 def test_given_the_pages_then_blocks_that_do_not_run_are_few_and_have_a_known_reason() -> None:

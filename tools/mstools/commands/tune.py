@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -229,18 +229,31 @@ def _open_pool() -> Iterator[Callable[[Sequence[EvaluationJob]], list[Evaluation
     """Yield a function that runs jobs in parallel processes, and returns their results in order."""
     # at most both steps of a setting run at once
     count = min(os.cpu_count() or 1, 2 * len(PARTS))
-    spawn = multiprocessing.get_context("spawn")
-    # Ctrl-C reaches all processes of a terminal: the workers leave it to the one that started them
-    pool = ProcessPoolExecutor(count, spawn, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
     try:
-        yield lambda jobs: list(pool.map(_run, jobs))
+        yield lambda jobs: [future.result() for future in _submit(pool, jobs)]
     except BaseException:
-        # running jobs take seconds and are useless now
-        for each in multiprocessing.active_children():
+        # running jobs take seconds and are useless now. Without workers the pool's thread ends at once; it must have
+        # ended before Python wakes the threads of all pools at exit
+        for each in list((getattr(pool, "_processes", None) or {}).values()):
             each.terminate()
         pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
+
+
+def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Future[EvaluationResult | None]]:
+    """Submit jobs and return their futures. SIGINT is blocked meanwhile, and delivered afterwards.
+
+    Submitting starts workers. One whose start is interrupted would run unknown to the pool, and one that is still
+    importing would print a traceback: Ctrl-C reaches all processes of a terminal. Workers inherit the mask and keep
+    it, so only the process that started them ends by Ctrl-C, and ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return [pool.submit(_run, job) for job in jobs]
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(job: EvaluationJob) -> EvaluationResult | None:
