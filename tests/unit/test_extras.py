@@ -44,8 +44,8 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Install:
 @pytest.mark.parametrize(
     ("url", "requirement"),
     [
-        ({"url": "file:///work/my%20clone", "dir_info": {}}, "/work/my clone[view]"),
-        ({"url": "file:///work/clone", "dir_info": {"editable": True}}, "-e /work/clone[view]"),
+        ({"url": "file:///srv/my%20clone", "dir_info": {}}, "/srv/my clone[view]"),
+        ({"url": "file:///srv/clone", "dir_info": {"editable": True}}, "-e /srv/clone[view]"),
         (
             {"url": "file:///x/modelserver-0.1.0-py3-none-any.whl", "archive_info": {}},
             "/x/modelserver-0.1.0-py3-none-any.whl[view]",
@@ -71,19 +71,19 @@ def test_given_a_pip_installation_then_its_own_pip_installs_the_same_source_with
 
 
 def test_given_an_environment_without_pip_then_its_installer_is_named(install: Install) -> None:
-    install("uv", {"url": "file:///work/clone", "dir_info": {}})
+    install("uv", {"url": "file:///srv/clone", "dir_info": {}})
     assert shlex.split(make_install_command("report")) == [
-        *("uv", "pip", "install", "--python", extras.sys.executable, "/work/clone[report]")
+        *("uv", "pip", "install", "--python", extras.sys.executable, "/srv/clone[report]")
     ]
     Path(extras.sys.executable).with_name("pip").unlink()
-    install("pip", {"url": "file:///work/clone", "dir_info": {}})
+    install("pip", {"url": "file:///srv/clone", "dir_info": {}})
     assert shlex.split(make_install_command("report"))[:4] == [extras.sys.executable, "-m", "pip", "install"]
 
 
 def test_given_an_environment_of_root_then_the_command_has_sudo(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    install("pip", {"url": "file:///work/clone", "dir_info": {}})
+    install("pip", {"url": "file:///srv/clone", "dir_info": {}})
     monkeypatch.setattr(extras.os, "access", lambda *_: False)
     assert make_install_command("report").startswith("sudo ")
 
@@ -126,11 +126,11 @@ def test_given_the_extras_then_they_are_those_of_the_project_for_users() -> None
 def test_given_missing_extras_then_one_line_names_them_and_one_command(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    install("pip", {"url": "file:///work/clone", "dir_info": {"editable": True}})
+    install("pip", {"url": "file:///srv/clone", "dir_info": {"editable": True}})
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name in ("mcap", "viser") else name)
     line = describe_missing()
     assert line.startswith("Extras that are not installed: bags,view. To add them: ")
-    assert line.endswith("/pip' install -e '/work/clone[bags,view]'")
+    assert line.endswith("/pip' install -e '/srv/clone[bags,view]'")
     assert "\n" not in line
     monkeypatch.setattr(extras, "find_spec", lambda name: name)
     assert describe_missing() == ""
