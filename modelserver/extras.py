@@ -89,7 +89,12 @@ def read_installation() -> tuple[str, dict[str, dict[str, object]]]:
         return "", {}
 
 
+def is_installed(extra: str) -> bool:
+    """Return whether the modules of an extra are there."""
+    return all(map(find_spec, EXTRAS[extra]))
+
+
 def describe_missing() -> str:
     """Return a line with the extras that are not installed and the command that adds them, empty if all are there."""
-    missing = ",".join(extra for extra, modules in EXTRAS.items() if not all(map(find_spec, modules)))
+    missing = ",".join(extra for extra in EXTRAS if not is_installed(extra))
     return f"Extras that are not installed: {missing}. To add them: {make_install_command(missing)}" if missing else ""

@@ -21,6 +21,12 @@ from typing import BinaryIO, Final
 EXAMINED_BYTES: Final = 1 << 20
 """Bytes of a file that are examined."""
 
+INSTALLED_FOLDER: Final = "/etc/modelserver"
+"""Folder of the installed vehicle file."""
+
+STATE_FOLDER: Final = "/var/lib/modelserver"
+"""Folder of the installed service's state: `StateDirectory=` of its unit."""
+
 
 class FileKind(Enum):
     """What a file is; the value is the text of messages."""

@@ -59,3 +59,11 @@ def drive(seconds: float, prefix: str = "") -> list[tuple[int, str, bytes]]:
             )
             events.append((utime + LATENCY, f"{prefix}GPS", encode(fix)))
     return events
+
+
+def write_forward_vehicle(folder: Path) -> Path:
+    """Write the Husky's vehicle file for `drive`, which starts at speed without wheels: a setting has the direction."""
+    (folder / "geometry.yaml").write_bytes(HUSKY.with_name("geometry.yaml").read_bytes())
+    path = folder / "vehicle.yaml"
+    path.write_text(HUSKY.read_text().replace("  filter:\n", "  filter:\n    reverse_speed: 1.5\n"))
+    return path

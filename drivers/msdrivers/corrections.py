@@ -17,7 +17,6 @@ checksums. Without an answer, or after the connection was lost, the thread conne
 from __future__ import annotations
 
 import contextlib
-import difflib
 import logging
 import math
 import re
@@ -29,7 +28,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
-from modelserver.errors import quote
+from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import NAN, FixType, GpsSample, Sample
 from modelserver.version import __version__
 from msdrivers.devices.gps import DAY, nmea
@@ -106,8 +105,8 @@ class MissingMountpointError(NtripError):
             what = f"the caster lists mountpoint {quote(mountpoint)} and does not send it: its station is off the air, "
             super().__init__(f"{what}or the user may not read it; try again later, or check user and password")
             return
-        near = difflib.get_close_matches(mountpoint.casefold(), [name.casefold() for name in names], 3)
-        hints = [", ".join(quote(name) for name in names if name.casefold() in near)]
+        near = find_nearest_names(mountpoint, names)
+        hints = [", ".join(map(quote, near))]
         if place is not None and (around := sorted((_find_distance_km(each, place), each.name) for each in streams)):
             listed = ", ".join(f"{quote(name)} ({km:.0f} km)" for km, name in around[:3] if km < math.inf)
             hints.append(listed and f"nearest to the rover: {listed}")

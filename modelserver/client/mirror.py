@@ -44,7 +44,7 @@ from modelserver.messages import (
     PoseDemand,
     TimeQuery,
 )
-from modelserver.query.answers import check_demand, compute_answer
+from modelserver.query.answers import check_demand, complete_names, compute_answer
 from modelserver.query.batch import lookup_batch
 from modelserver.query.view import WORLD_FRAMES, PlatformView, complete
 from modelserver.transforms.transformation import Transformation
@@ -91,7 +91,7 @@ class LocalPlatform(PlatformClient):
         return answer._replace(unmet=unmet, unmet_reason=reason) if unmet else answer
 
     def _query(self, request: Any, reply_type: type[R]) -> R:
-        time = IN_HISTORY
+        request, time = complete_names(request), IN_HISTORY
         ends: tuple[str, ...] = (names.WORLD_UTM, "")
         if isinstance(request, GetHistory):
             _check_utimes(request.start_utime, request.end_utime)

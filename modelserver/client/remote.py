@@ -277,8 +277,7 @@ class FrameClient(ABC):
         unknown (nan). Raises as `get_transformation`.
         """
         time = TimeQuery(to_utime(at), policy, wait_ms)
-        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
-        request = GetMotion(self._header(), *ends, names.complete(expressed_in), time)
+        request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
         return require_answer(self._query(request, MotionReply).answer)
 
     def explain(
@@ -295,8 +294,7 @@ class FrameClient(ABC):
         Raises as `get_transformation`.
         """
         time = TimeQuery(to_utime(at), policy, wait_ms)
-        ends = names.complete(frame_of_interest), names.complete(frame_of_reference)
-        request = GetExplanation(self._header(), *ends, time)
+        request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
         return require_answer(self._query(request, ExplanationReply).answer)
 
     def get_dynamics(
@@ -314,8 +312,7 @@ class FrameClient(ABC):
         in World:ENU. Needs the section `dynamics` of the vehicle file; `PlatformMirror` has none. Raises as
         `get_transformation`; ForbiddenError where it is not configured.
         """
-        time = TimeQuery(to_utime(at), policy)
-        request = GetDynamics(self._header(), names.complete(frame), equations, floating, time)
+        request = GetDynamics(self._header(), frame, equations, floating, TimeQuery(to_utime(at), policy))
         return require_answer(self._query(request, DynamicsReply).answer)
 
     def _header(self) -> RequestHeader:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict
 
@@ -21,7 +21,15 @@ from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import MagnetometerCalibration
-from modelserver.files import PROCESS_FIX, FileKind, NotRegularFileError, detect_file_kind, read_start
+from modelserver.files import (
+    INSTALLED_FOLDER,
+    PROCESS_FIX,
+    STATE_FOLDER,
+    FileKind,
+    NotRegularFileError,
+    detect_file_kind,
+    read_start,
+)
 from modelserver.geometry import names
 from modelserver.messages import Mode
 
@@ -513,13 +521,6 @@ _FIXES: dict[FileKind, str] = {
     FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
     FileKind.BINARY: "give the vehicle file, which is YAML",
 }
-
-
-INSTALLED_FOLDER: Final = "/etc/modelserver"
-"""Folder of the installed vehicle file."""
-
-STATE_FOLDER: Final = "/var/lib/modelserver"
-"""Folder of the installed service's state: `StateDirectory=` of its unit."""
 
 
 def _read_bytes(path: Path) -> bytes:

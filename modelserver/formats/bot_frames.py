@@ -26,7 +26,6 @@ from modelserver.errors import Location, Suggestion, SyntaxProblemError, has_err
 from modelserver.formats.common import (
     MAX_POSITION,
     MAX_SUGGESTIONS,
-    ORIGIN,
     ElementReader,
     find_cycles,
     label,
@@ -35,6 +34,7 @@ from modelserver.formats.common import (
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, Joint, JointType
+from modelserver.geometry.names import ORIGIN
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion

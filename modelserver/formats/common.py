@@ -27,9 +27,6 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 
 T = TypeVar("T")
 
-ORIGIN = "Origin"
-"""Frame of a body for a frame, instance or link of a format without frames in bodies."""
-
 MAX_SUGGESTIONS = 50
 """Unknown names of a file for which suggestions are searched."""
 

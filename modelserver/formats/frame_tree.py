@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING
 from modelserver.errors import Location, Severity, Suggestion, find_suggestion, quote, suggest_name
 from modelserver.formats.common import (
     MAX_SUGGESTIONS,
-    ORIGIN,
     ElementReader,
     find_cycles,
     label,
@@ -42,6 +41,7 @@ from modelserver.formats.common import (
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name
 from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.names import ORIGIN
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:

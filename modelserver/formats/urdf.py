@@ -29,7 +29,6 @@ from modelserver.errors import Suggestion, quote, suggest_name
 from modelserver.formats.common import (
     MAX_POSITION,
     MAX_SUGGESTIONS,
-    ORIGIN,
     ElementReader,
     SavedModel,
     find_cycles,
@@ -46,6 +45,7 @@ from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.geometry.inertia import RigidInertia, Rows, from_spatial_inertia
 from modelserver.geometry.joint import FIXED, TYPES_WITH_AXIS, Coordinates, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
+from modelserver.geometry.names import ORIGIN
 from modelserver.geometry.parts import DIMENSIONS, Material, Shape, ShapeKind
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.transforms import so3

@@ -216,19 +216,16 @@ def serve(vehicle: Vehicle, log: Iterable[LogEvent], axis: StampAxis) -> Iterato
     """Yield what would be on the bus if the service ran while a recording is played: its messages, and the service's.
 
     The loop is the daemon's, on a fake bus and clock. What a service published in the recording is left out. `axis`
-    gets how the stamps are off the log's times.
+    gets how the stamps are off the log's times. A message of the service has number and end of the event that follows.
     """
     channels = vehicle.sensor_channels()
     clock = FakeClock()
     bus = _OfflineBus(clock)
     loop: Loop | None = None
-    count = 0
 
-    def pop_published(end: int) -> Iterator[LogEvent]:
-        nonlocal count
+    def pop_published(event: LogEvent) -> Iterator[LogEvent]:
         for channel, data in bus.published:
-            yield LogEvent(count, clock.utime(), channel, data, end)
-            count += 1
+            yield event._replace(utime=clock.utime(), channel=channel, data=data)
         bus.published.clear()
 
     for event in align(log, channels, axis):
@@ -242,15 +239,14 @@ def serve(vehicle: Vehicle, log: Iterable[LogEvent], axis: StampAxis) -> Iterato
         bus.limit_ns = now.monotonic_ns
         while clock.monotonic_ns() < now.monotonic_ns:
             loop.run_once()
-            yield from pop_published(event.end)
+            yield from pop_published(event)
         clock.set(now)
-        yield event._replace(number=count)
-        count += 1
+        yield event
         if event.channel.endswith(SIGNED):
             event = _unwrap_mode_command(event, channels)
         bus.sensors.put(event.channel, event.data)
         loop.run_once()
-        yield from pop_published(event.end)
+        yield from pop_published(event)
 
 
 def _unwrap_mode_command(event: LogEvent, channels: Mapping[str, SensorChannel]) -> LogEvent:

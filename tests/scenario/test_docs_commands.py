@@ -37,7 +37,6 @@ REASONS = (
     "needs root",
     "needs a device",
     "needs systemd units",
-    "needs a ROS bag",
     "needs a recording of a magnetometer",
     "needs a signed vehicle; tests/scenario/test_joint_motion.py runs it",
     "needs a signed vehicle; tests/scenario/test_pose_set.py runs it",
@@ -45,7 +44,7 @@ REASONS = (
     "needs that copy; tests/scenario/test_demo.py runs it",
     "takes minutes",
 )
-MOST_NOT_RUN = 17
+MOST_NOT_RUN = 16
 
 TUTORIAL = DOCS / "tutorial.md"
 IN_SOURCE = [ROOT / "README.md", DOCS / "quick-start.md", DOCS / "own-device.md", DOCS / "dynamics.md"]

@@ -28,16 +28,17 @@ import typer
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
 from modelserver.extras import SYSTEM_ENVIRONMENT, make_requirement, make_system_command
+from modelserver.files import INSTALLED_FOLDER, STATE_FOLDER
 from modelserver.wire.provider import group_of
 from mstools.terminal.output import ProblemCollector, escape, make_error
 
-CONFIGURATION: Final = "/etc/modelserver"
+CONFIGURATION: Final = INSTALLED_FOLDER
 VEHICLE: Final = f"{CONFIGURATION}/vehicle.yaml"
 MANIFEST: Final = f"{CONFIGURATION}/installed.json"
 UNITS: Final = "/etc/systemd/system"
 RULES: Final = "/etc/udev/rules.d/90-modelserver.rules"
 SYSCTL: Final = "/etc/sysctl.d/60-modelserver.conf"
-STATE: Final = ("/var/lib/modelserver", "/var/lib/private/modelserver")
+STATE: Final = (STATE_FOLDER, "/var/lib/private/modelserver")
 """State directory of a service with a dynamic user: a link, and the folder that it leads to."""
 
 SERVICE: Final = "modelserver.service"

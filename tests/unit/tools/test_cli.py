@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,24 @@ def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -
     assert not COMMAND_ALIASES.keys() & COMMANDS.keys()
 
 
+Complete = Callable[[str], tuple[object, list[str]]]
+
+
+@pytest.fixture
+def complete(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Complete:
+    """A function that completes the last of some words as bash asks; it returns exit code and names."""
+
+    def run(words: str) -> tuple[object, list[str]]:
+        monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+        with pytest.raises(SystemExit) as ended:
+            main([])
+        return ended.value.code, capsys.readouterr().out.split()
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -60,20 +79,11 @@ def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -
     ],
 )
 def test_given_a_vehicle_file_then_the_shell_completes_its_names(
-    words: str,
-    expected: list[str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words: str, expected: list[str], tmp_path: Path, complete: Complete, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_vehicle(tmp_path, VEHICLE + "drivers: {front: {device: gpsd, address: 'localhost:2947'}}\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
-    monkeypatch.setenv("COMP_WORDS", words)
-    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
-    with pytest.raises(SystemExit) as ended:
-        main([])
-    assert (ended.value.code, capsys.readouterr().out.split()) == (0, expected)
+    assert complete(words) == (0, expected)
 
 
 @pytest.mark.parametrize(
@@ -87,11 +97,6 @@ def test_given_a_vehicle_file_then_the_shell_completes_its_names(
     ],
 )
 def test_given_a_shell_that_completes_then_commands_and_their_options_are_offered(
-    words: str, expected: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    words: str, expected: list[str], complete: Complete
 ) -> None:
-    monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
-    monkeypatch.setenv("COMP_WORDS", words)
-    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
-    with pytest.raises(SystemExit) as ended:
-        main([])
-    assert (ended.value.code, capsys.readouterr().out.split()) == (0, expected)
+    assert complete(words) == (0, expected)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support_recordings import HUSKY, drive, write_log
+from support_recordings import HUSKY, drive, write_forward_vehicle, write_log
 
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
@@ -24,12 +24,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Husky's vehicle file for `drive`, which starts at speed without wheels, with the direction in a setting."""
-    folder = tmp_path_factory.mktemp("husky")
-    (folder / "geometry.yaml").write_bytes(HUSKY.with_name("geometry.yaml").read_bytes())
-    path = folder / "vehicle.yaml"
-    path.write_text(HUSKY.read_text().replace("  filter:\n", "  filter:\n    reverse_speed: 1.5\n"))
-    return path
+    return write_forward_vehicle(tmp_path_factory.mktemp("husky"))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,18 @@ from typing import Any
 import lcm
 import pytest
 from support_lcm import reserved_url
-from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
+from support_recordings import (
+    EASTING,
+    HEIGHT,
+    HUSKY,
+    LATENCY,
+    NORTHING,
+    SPEED,
+    START,
+    drive,
+    write_forward_vehicle,
+    write_log,
+)
 from support_samples import ScriptedLocalizer
 from support_tuning import write_raw_mode_vehicle
 
@@ -69,12 +80,7 @@ def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def forward(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Husky's vehicle file for `drive`, which starts at speed without wheels, with the direction in a setting."""
-    folder = tmp_path_factory.mktemp("husky")
-    (folder / "geometry.yaml").write_bytes(HUSKY.with_name("geometry.yaml").read_bytes())
-    path = folder / "vehicle.yaml"
-    path.write_text(HUSKY.read_text().replace("  filter:\n", "  filter:\n    reverse_speed: 1.5\n"))
-    return path
+    return write_forward_vehicle(tmp_path_factory.mktemp("husky"))
 
 
 @pytest.fixture(scope="session")

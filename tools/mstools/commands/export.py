@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 import time
@@ -12,13 +11,22 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from modelserver.extras import make_install_command
 from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.terminal.options import PrefixOption, UrlOption, option
-from mstools.terminal.output import catch_signals, check_writable, format_count, load_given_model, show_progress
+from mstools.terminal.output import (
+    catch_signals,
+    check_writable,
+    format_count,
+    load_given_model,
+    require_extra,
+    show_progress,
+    write_beside,
+)
 
 PROGRESS_EVENTS = 5_000
+
+NEEDS_FOXGLOVE = "this needs foxglove-sdk"
 
 DEFAULT_PORT = 8765
 """Port of Foxglove's websocket by its documentation."""
@@ -60,7 +68,7 @@ def command(
     if live:
         if log is not None or force or not raw or model is not None or config is not None:
             raise typer.BadParameter("excludes LOG, OUT, --model, --config, --force and --no-raw", param_hint="--live")
-        check_foxglove()
+        require_extra("foxglove", NEEDS_FOXGLOVE)
         serve_live(bind, port, seconds, url, prefix)
         return
     if log is None or out is None:
@@ -69,15 +77,15 @@ def command(
         raise typer.BadParameter("goes with --live", param_hint="--bind, --port, --seconds, --url")
     if model is not None and config is not None:
         raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
-    check_foxglove()
+    require_extra("foxglove", NEEDS_FOXGLOVE)
     from mstools.recordings.localized import open_localized
 
     check_writable(str(out), force)
     with open_localized(log, config) as localized:
-        write_mcap(localized, out, raw, prefix, force, model)
+        write_mcap(localized, out, raw, prefix, model)
 
 
-def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool, model: Path | None = None) -> None:
+def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None = None) -> None:
     """Write the MCAP file of a log, whole or not at all; `model`: geometry in place of the log's.
 
     Raises ModelServerError, RecordingError, OSError.
@@ -86,17 +94,13 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool, model:
 
     from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
 
-    check_writable(str(out), force)
-    # written beside it first: an export that is interrupted leaves no half file under this name
-    part = out.with_name(f".{out.name}.part")
-    part.unlink(missing_ok=True)
     count = 0
-    try:
+    with write_beside(out) as draft:
         context = foxglove.Context()
         with (
             LogFile(log) as events,
             show_progress(f"exporting {log.name}", events.size) as show,
-            foxglove.open_mcap(part, context=context),
+            foxglove.open_mcap(draft, context=context),
         ):
             given = None if model is None else load_given_model(model, {})
             writer = FoxgloveWriter(context, prefix, find_definitions() if raw else None, given)
@@ -111,9 +115,6 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, force: bool, model:
                     "for a channel prefix use --prefix. Or give the geometry with --model FILE, or the vehicle file, "
                     "with which the localization runs too: -c FILE"
                 )
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
     typer.echo(f"{out}: {format_count(count, 'message')}, {out.stat().st_size / 1e6:.1f} MB")
     for damage in events.damage:
         typer.echo(f"modelserver: note: {log}: {damage}", err=True)
@@ -143,9 +144,3 @@ def serve_live(bind: str, port: int, seconds: float, url: str, prefix: str) -> N
             follow_bus(bus, prefix, writer.feed, lambda: stop.is_set() or time.monotonic() >= end)
     finally:
         server.stop()
-
-
-def check_foxglove() -> None:
-    """Raise ModelServerError if the extra `foxglove` is not installed."""
-    if importlib.util.find_spec("foxglove") is None:
-        raise ModelServerError(f"this needs foxglove-sdk, which is not installed: {make_install_command('foxglove')}")

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import statistics
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,7 +37,7 @@ from mstools.recordings.bags import (
 )
 from mstools.recordings.tf_tree import TF_TYPES, TfTree
 from mstools.terminal.options import JsonOption, argument, option
-from mstools.terminal.output import check_writable, escape, show_progress, write_file
+from mstools.terminal.output import check_writable, escape, show_progress, write_beside, write_file
 
 
 def command(
@@ -170,8 +168,7 @@ def import_bag(
     if not log_path.parent.is_dir():
         raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
     check_links(log_path)
-    with tempfile.TemporaryDirectory(prefix=f".{log_path.name}.", dir=log_path.parent) as draft:
-        part = Path(draft) / log_path.name
+    with write_beside(log_path) as part:
         if is_lcm_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
         else:
@@ -184,7 +181,6 @@ def import_bag(
                 reports = list(of_topic.values())
             if geometry is not None:
                 write_file(str(geometry), text, replace=force)
-        os.replace(part, log_path)
     return ImportReport(str(log_path), reports, seconds, "" if geometry is None else str(geometry))
 
 

@@ -469,8 +469,10 @@ class FileAnswers(FrameClient):
 
     def _query(self, request: Any, reply_type: type[R]) -> R:
         from modelserver.estimation.history import History
-        from modelserver.query.answers import compute_answer
+        from modelserver.query.answers import complete_names, compute_answer
         from modelserver.query.view import PlatformView
+
+        request = complete_names(request)
 
         if isinstance(request, GetMotion):
             raise ModelServerError("a geometry file has no motion; query the daemon")

@@ -8,14 +8,14 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
-import lcm
 import typer
 
 from modelserver.errors import ModelServerError, WireError, find_nearest_names
 from modelserver.files import check_links
 from modelserver.wire.codec import decode, type_name_of
+from modelserver.wire.eventlog import encode_event
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.recordings.drive import follow_bus
 from mstools.terminal.options import ChannelsOption, JsonOption, PrefixOption, UrlOption, argument, option
@@ -129,13 +129,13 @@ class Recorder:
     channels: dict[str, RecordedChannel] = field(default_factory=dict)
     others: set[str] = field(default_factory=set)
     count: int = 0
-    written: float = 0.0
-    parts: list[tuple[Path, float]] = field(default_factory=list)
+    written: int = 0
+    parts: list[tuple[Path, int]] = field(default_factory=list)
     """The files that are there, with their sizes."""
     deleted: int = 0
     _number: int = 0
-    _log: lcm.EventLog | None = None
-    _size: float = 0.0
+    _file: BinaryIO | None = None
+    _size: int = 0
 
     @property
     def is_split(self) -> bool:
@@ -166,22 +166,21 @@ class Recorder:
                 decode(type_name, data)
             except WireError:
                 found.damaged += 1
-        size = 28 + len(channel.encode()) + len(data)  # of an event: its header of 28 bytes, channel and data
-        if self._log is None or self._size + size > self.split_bytes:
-            self._begin_part()
-        assert self._log is not None
+        event = encode_event(self.count, now, channel.encode(), data)
         try:
-            self._log.write_event(now, channel, data)
+            if self._file is None or self._size + len(event) > self.split_bytes:
+                self._file = self._begin_part()
+            self._file.write(event)
         except OSError as error:
             raise ModelServerError(f"{self.path}: {error.strerror or error}; recorded until then") from None
         self.count += 1
-        self._size += size
-        self.written += size
+        self._size += len(event)
+        self.written += len(event)
 
     def _name_part(self, number: int) -> Path:
         return self.path.with_stem(f"{self.path.stem}-{number:04d}") if self.is_split else self.path
 
-    def _begin_part(self) -> None:
+    def _begin_part(self) -> BinaryIO:
         self.close()
         path = self._name_part(self._number)
         self._number += 1
@@ -189,14 +188,15 @@ class Recorder:
             oldest, _ = self.parts.pop(0)
             oldest.unlink(missing_ok=True)
             self.deleted += 1
-        self._log, self._size = lcm.EventLog(str(path), "w", overwrite=True), 0.0
+        self._size = 0
+        return path.open("wb")
 
     def close(self) -> None:
         """Finish the file."""
-        if self._log is not None:
-            self._log.close()
+        if self._file is not None:
+            self._file.close()
             self.parts.append((self._name_part(self._number - 1), self._size))
-            self._log = None
+            self._file = None
 
     def describe(self, seconds: float) -> str:
         files = ""
@@ -226,7 +226,7 @@ class Recorder:
             "files": [str(path) for path, _ in self.parts],
             "deleted": self.deleted,
             "messages": self.count,
-            "bytes": round(self.written),
+            "bytes": self.written,
             "channels": {
                 name: {"type": each.type_name, "messages": each.count, "damaged": each.damaged}
                 for name, each in sorted(self.channels.items())

@@ -24,7 +24,15 @@ from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.terminal.completion import complete_frame
 from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, option
-from mstools.terminal.output import check_writable, escape, format_count, open_atomic, show_progress, to_json
+from mstools.terminal.output import (
+    check_writable,
+    escape,
+    format_count,
+    open_atomic,
+    show_progress,
+    to_json,
+    write_beside,
+)
 
 if TYPE_CHECKING:
     from modelserver.server.journal.verify import Difference, VerificationReport
@@ -151,12 +159,8 @@ def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
     from mstools.recordings.localized import write_localized
 
     _check_outputs({"log": str(out)}, [log, config])
-    part = out.with_name(f".{out.name}.part")
-    try:
-        counts = write_localized(log, config, part)
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
+    with write_beside(out) as draft:
+        counts = write_localized(log, config, draft)
     if as_json:
         typer.echo(json.dumps(counts))
         return

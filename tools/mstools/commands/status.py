@@ -137,8 +137,10 @@ def command(
 
 def show_report(health: Health, reports: Iterable[DriverHealth], drivers: tuple[str, ...], as_json: bool) -> None:
     """Print a report, and exit with EXIT_UNHEALTHY where it has no valid pose."""
-    text = format_report(health, reports, drivers)
-    typer.echo(json.dumps(as_data(health, reports), indent=2) if as_json else replace_unencodable(text))
+    if as_json:
+        typer.echo(json.dumps(as_data(health, reports), indent=2))
+    else:
+        typer.echo(replace_unencodable(format_report(health, reports, drivers)))
     if not is_healthy(health):
         raise typer.Exit(EXIT_UNHEALTHY)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 import sys
@@ -14,8 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ModelServerError
-from modelserver.extras import make_install_command
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
 from mstools.terminal.options import (
     KeyOption,
@@ -26,7 +23,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import catch_signals, check_writable, escape, show_progress
+from mstools.terminal.output import catch_signals, check_writable, escape, require_extra, show_progress
 
 if TYPE_CHECKING:
     from mstools.view.editor import Editing
@@ -126,8 +123,7 @@ def has_screen() -> bool:
 
 def check_installed() -> None:
     """Raise ModelServerError if the extra `view` is not installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise ModelServerError(f"the viewer needs viser, which is not installed: {make_install_command('view')}")
+    require_extra("view", "the viewer needs viser")
 
 
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,20 +21,20 @@ from mstools.terminal.output import escape, show_progress
 PROGRESS_EVENTS = 500
 
 
-def write_localized(log: Path, config: Path, out: Path) -> dict[str, int]:
+def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
     """Write the log with the service's messages; return the number of messages by channel.
 
     Notes of the log go to stderr. Raises ConfigError, GeometryError, RecordingError, OSError.
     """
     vehicle = load_vehicle(load_config(config), str(config))
     axis = StampAxis()
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     writer = lcm.EventLog(str(out), "w", overwrite=True)
     try:
         with LogFile(log) as events, show_progress(f"localizing {log.name}", events.size) as show:
             for number, event in enumerate(serve(vehicle, events, axis)):
                 writer.write_event(event.utime, event.channel, event.data)
-                counts[event.channel] = counts.get(event.channel, 0) + 1
+                counts[event.channel] += 1
                 if number % PROGRESS_EVENTS == 0:
                     show(event.end)
     finally:

@@ -14,10 +14,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final, TypeAlias
 
-from modelserver.core import RUNNING
 from modelserver.errors import ModelServerError
 from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health, Invalid, Mode, Phase
-from mstools.terminal.health_text import STATE_NAMES
+from mstools.terminal.health_text import STATE_NAMES, is_healthy
 
 MAX_AGE_S: Final = 5.0
 """Age of a report, seconds, from which its sender counts as gone: five periods."""
@@ -85,7 +84,7 @@ def _format_health(health: Health, age: float) -> Iterator[str]:
         ("alignment_phase", "Phase of the filter's alignment.", phases),
     ):
         yield from _format_family(name, "stateset", what, _make_states(name, values))
-    valid = local.mode is not None and not health.invalid_reasons and health.state == RUNNING
+    valid = local.mode is not None and is_healthy(health)
     latency = (("0.5", health.tick_latency_p50), ("0.9", health.tick_latency_p90), ("0.99", health.tick_latency_p99))
     quantiles = [({"quantile": name}, value) for name, value in (*latency, ("1", health.tick_latency_max))]
     yield from _format_family(

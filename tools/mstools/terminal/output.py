@@ -27,6 +27,7 @@ from modelserver.errors import (
     Severity,
     find_nearest_names,
 )
+from modelserver.extras import is_installed, make_install_command
 from modelserver.files import check_links
 from modelserver.geometry.model import Model
 
@@ -171,6 +172,24 @@ def open_atomic(path: str, replace: bool) -> Iterator[TextIO]:
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(draft)
+
+
+def require_extra(extra: str, what: str) -> None:
+    """Raise ModelServerError with the command that adds an extra unless it is installed; `what` needs a library."""
+    if not is_installed(extra):
+        raise ModelServerError(f"{what}, which is not installed: {make_install_command(extra)}")
+
+
+@contextmanager
+def write_beside(path: Path) -> Iterator[Path]:
+    """Give the path of a draft beside a file, for a library that writes files by itself.
+
+    The draft becomes the file at the end of the block; what is interrupted leaves no half file under that name.
+    """
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        draft = Path(folder) / path.name
+        yield draft
+        draft.replace(path)
 
 
 def _find_target(path: str) -> str:
