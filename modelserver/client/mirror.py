@@ -84,9 +84,10 @@ class LocalPlatform(PlatformClient):
         interest, reference, time = names.complete(interest), names.complete(reference), _make_time(at, policy, wait_ms)
         state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
-        if _is_static(view, interest, reference) and len(state.static_answers) < CACHE_SIZE:
+        if _is_static(view, interest, reference) and len(state.static_transforms) < CACHE_SIZE:
             # cached in the state of this geometry, so that a new geometry drops it
             state.static_answers[interest, reference] = answer
+            state.static_transforms[interest, reference] = answer.transformation
         unmet, reason = check_demand(view, answer, demand, time, now)
         return answer._replace(unmet=unmet, unmet_reason=reason) if unmet else answer
 
@@ -276,7 +277,8 @@ class PlatformMirror(LocalPlatform):
         self._clock = clock
         self._receiver = MirrorReceiver(channel_prefix)
         self._state = self._receiver.state
-        # the cache of the state, emptied when it is out of date
+        # caches of the state, emptied when it is out of date
+        self._static_transforms: dict[tuple[str, str], Transformation] = {}
         self._static_answers: dict[tuple[str, str], PoseAnswer] = {}
         self._changed = threading.Condition()
         self._stop = threading.Event()
@@ -295,7 +297,7 @@ class PlatformMirror(LocalPlatform):
         self._stop.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(JOIN_TIMEOUT_S)
-        self._static_answers = {}
+        self._static_transforms, self._static_answers = {}, {}
         with self._changed:
             self._changed.notify_all()
 
@@ -313,7 +315,7 @@ class PlatformMirror(LocalPlatform):
         Raises OutOfDateError where the replica is incomplete or too old, and the QueryErrors of `Platform`.
         """
         try:
-            return self._static_answers[frame_of_interest, frame_of_reference].transformation
+            return self._static_transforms[frame_of_interest, frame_of_reference]
         except KeyError:
             return self._query_pose(frame_of_interest, frame_of_reference, to_utime(at), policy, wait_ms).transformation
 
@@ -369,7 +371,9 @@ class PlatformMirror(LocalPlatform):
             knowledge.feed(channel, data, now)
         known, before = knowledge.state, self._state
         self._state = known
-        self._static_answers = known.static_answers if self.is_fresh(known, now) else {}
+        self._static_transforms, self._static_answers = (
+            (known.static_transforms, known.static_answers) if self.is_fresh(known, now) else ({}, {})
+        )
         if known is not before:
             with self._changed:
                 self._changed.notify_all()

@@ -292,11 +292,11 @@ class Ages(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MirrorState:
-    """The replica at one time. Immutable, except for the cache `static_answers`.
+    """The replica at one time. Immutable, except for the caches `static_transforms` and `static_answers`.
 
     view: answers queries, None before the first complete snapshot. `*_received`: receive time, or NEVER.
     clock_offset: the server's clock minus the receive clock, microseconds. other_revision: the revision in the
-    newest pose where it is not that of the snapshot. static_answers: those without a world and without a moving joint.
+    newest pose where it is not that of the snapshot. static_*: answers without a world and without a moving joint.
     """
 
     view: PlatformView | None = None
@@ -309,6 +309,7 @@ class MirrorState:
     joints_received: int = NEVER
     clock_offset: int = 0
     other_revision: str = ""
+    static_transforms: dict[tuple[str, str], Transformation] = field(default_factory=dict)
     static_answers: dict[tuple[str, str], PoseAnswer] = field(default_factory=dict)
 
     def get_ages(self, now: int) -> Ages:
@@ -423,6 +424,7 @@ class MirrorReceiver:
             history=history,
             joints=joints,
             other_revision="",
+            static_transforms={},
             static_answers={},
         )
 
