@@ -17,7 +17,7 @@ probability `limit_risk`. A relation within the vehicle has its own covariance a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -38,7 +38,7 @@ from modelserver.messages import (
     MAX_REQUEST_INSTANTS,
     MET,
     NAN,
-    Acknowledgement,
+    REPLY_OF,
     DynamicsReply,
     Estimate,
     ExplanationReply,
@@ -60,14 +60,10 @@ from modelserver.messages import (
     PoseBatch,
     PoseBatchReply,
     PoseDemand,
-    ReloadModel,
-    ReloadReply,
     Reply,
     ReplyHeader,
     Request,
     RequestHeader,
-    SetHTransform,
-    SetStateVector,
     StateVectorReply,
     TimeQuery,
     TransformReply,
@@ -92,9 +88,7 @@ class DeferredAnswer(NamedTuple):
         try:
             return (yield from _answer_in_steps(view, request, utime))
         except QueryError as error:
-            return [
-                make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
-            ]
+            return _explain_error(view, request, error, utime)
 
 
 _FRAME_FIELDS: Final[Mapping[type, tuple[str, ...]]] = {
@@ -136,7 +130,7 @@ def effort_of(request: Request) -> float:
 
 def is_deferred(request: Request) -> bool:
     """Return whether the answer to a request may take long, so that it is computed in steps."""
-    return type(request) in _DEFERRED_ANSWERS and effort_of(request) > DEFERRED_EFFORT
+    return type(request) in _LONG and effort_of(request) > DEFERRED_EFFORT
 
 
 def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Reply]:
@@ -171,7 +165,14 @@ def _list_names(header: ReplyHeader, parts: Sequence[Body | BodyFrame]) -> NameL
 
 def _answer_in_steps(view: PlatformView, request: Request, utime: int) -> Steps[list[Reply]]:
     header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
-    return (yield from _DEFERRED_ANSWERS[type(request)](view, request, header))
+    match request:
+        case GetHistory(_, start, end, rate_hz):
+            return [HistoryReply(header, (yield from view.vehicle_history(start, end, rate_hz)))]
+        case GetDynamics():
+            return [DynamicsReply(header, (yield from compute_dynamics(view, request, utime)))]
+        case GetTransformations():
+            return (yield from _get_transformations(view, request, header))
+    raise TypeError(f"{type(request).__name__} has no answer by the view")
 
 
 def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Reply]:
@@ -179,7 +180,11 @@ def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Re
     try:
         return compute_answer(view, request, utime)
     except QueryError as error:
-        return [make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
+        return _explain_error(view, request, error, utime)
+
+
+def _explain_error(view: PlatformView, request: Request, error: QueryError, utime: int) -> list[Reply]:
+    return [make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
 
 
 def make_error_reply(
@@ -191,16 +196,7 @@ def make_error_reply(
     utime: int,
     nearest: tuple[str, ...] = (),
 ) -> Reply:
-    return _REPLY_TYPES[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
-
-
-def _get_history(view: PlatformView, request: GetHistory, header: ReplyHeader) -> Steps[list[Reply]]:
-    span = (request.start_utime, request.end_utime, request.rate_hz)
-    return [HistoryReply(header, (yield from view.vehicle_history(*span)))]
-
-
-def _get_dynamics(view: PlatformView, request: GetDynamics, header: ReplyHeader) -> Steps[list[Reply]]:
-    return [DynamicsReply(header, (yield from compute_dynamics(view, request, header.utime)))]
+    return REPLY_OF[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
 
 
 def _get_transformations(view: PlatformView, request: GetTransformations, header: ReplyHeader) -> Steps[list[Reply]]:
@@ -249,27 +245,7 @@ demand, of dynamics."""
 DEFERRED_EFFORT: Final = 11.0
 """Effort beyond which an answer is deferred: about a millisecond."""
 
-_DEFERRED_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Steps[list[Reply]]]]] = {
-    GetHistory: _get_history,
-    GetTransformations: _get_transformations,
-    GetDynamics: _get_dynamics,
-}
-
-_REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
-    GetTransformation: TransformReply,
-    GetBodyList: NameListReply,
-    GetBodyFrameList: NameListReply,
-    GetStateVector: StateVectorReply,
-    GetHTransform: TransformReply,
-    GetHistory: HistoryReply,
-    GetTransformations: PoseBatchReply,
-    GetMotion: MotionReply,
-    GetExplanation: ExplanationReply,
-    GetDynamics: DynamicsReply,
-    ReloadModel: ReloadReply,
-    SetStateVector: Acknowledgement,
-    SetHTransform: Acknowledgement,
-}
+_LONG: Final = frozenset((GetHistory, GetTransformations, GetDynamics))
 
 
 # --- demands ----------------------------------------------------------------------------------------------------------
