@@ -51,10 +51,10 @@ from modelserver.dynamics.tree import (
 )
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.extras import make_install_command
-from modelserver.geometry.inertia import RigidInertia, to_rows
 from modelserver.geometry.joint import JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import format_names
+from modelserver.geometry.parts import RigidInertia, to_rows
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array

@@ -140,7 +140,7 @@ def _pause_garbage_collector() -> Iterator[None]:
 
 
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    from modelserver.formats import frame_tree, miro, urdf, xml_document
+    from modelserver.formats import miro, urdf, xml_document
     from modelserver.formats.common import label
 
     root = xml_document.parse(content, builder, file)
@@ -158,8 +158,8 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
         builder.add_error(_OTHER_XML["config_group"], first, "give the file with BodyName and ConstraintName in it")
         return
     before = len(builder.problems)
-    if next(frame_tree.find_instances(root), None) is not None:
-        frame_tree.load(root, builder, file, variables)
+    if next(miro.find_instances(root), None) is not None:
+        miro.load_frame_tree(root, builder, file, variables)
         if not miro.has_bodies(root):
             return
         # one configuration may hold both

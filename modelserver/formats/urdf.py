@@ -42,11 +42,10 @@ from modelserver.formats.common import (
 from modelserver.formats.xml_document import get_line, get_name, get_tag, iterate_children
 from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
-from modelserver.geometry.inertia import RigidInertia, Rows, from_spatial_inertia
 from modelserver.geometry.joint import FIXED, TYPES_WITH_AXIS, Coordinates, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import ORIGIN
-from modelserver.geometry.parts import DIMENSIONS, Material, Shape, ShapeKind
+from modelserver.geometry.parts import DIMENSIONS, Body, Material, RigidInertia, Shape, ShapeKind
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -554,13 +553,13 @@ def _format_shape(key: str, shape: Shape, materials: dict[str, Material]) -> Ite
     return format_element(key, inside, **({"name": shape.name} if shape.name else {}))
 
 
-def _format_inertial(inertia: Rows | None) -> Iterator[str]:
+def _format_inertial(body: Body) -> Iterator[str]:
     """Yield the inertial of a body, along the axes of its link; nothing if it is not that of a rigid body."""
-    found = None if inertia is None else from_spatial_inertia(inertia)
+    found = body.rigid_inertia
     if found is None:
         return
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = found.about_center
-    greatest = max(abs(value) for row in inertia or () for value in row)
+    greatest = max(abs(value) for row in body.inertia or () for value in row)
     x, y, z = (_round_off(value, max(map(abs, found.center))) for value in found.center)
     moments = {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
     inside = [*_format_origin(Pose((x, y, z))), *format_element("mass", value=found.mass)]
@@ -596,7 +595,7 @@ def save(model: Model) -> SavedModel:
         parts: list[str] = []
         if body:
             found = model.body(body)
-            parts += _format_inertial(found.inertia)
+            parts += _format_inertial(found)
             for key, shapes in (("visual", found.visuals), ("collision", found.collisions)):
                 parts += [line for shape in shapes for line in _format_shape(key, shape, materials)]
         inside += format_element("link", parts, name=name)
@@ -726,8 +725,7 @@ class _UrdfWriter:
         """Yield the features that are dropped, and the frames that become links."""
         model = self.model
         yield from list_text_and_sigma_features(model)
-        inertias = [(body.name, body.inertia) for body in model.bodies if body.inertia is not None]
-        if odd := [name for name, inertia in inertias if from_spatial_inertia(inertia) is None]:
+        if odd := [each.name for each in model.bodies if each.inertia is not None and each.rigid_inertia is None]:
             yield f"the inertia of {format_names(odd)}: not that of a rigid body with mass"
         if posed := [body.name for body in model.bodies if body.pose is not None]:
             yield f"the own transform of {format_names(posed)}"

@@ -22,9 +22,8 @@ from modelserver.formats.common import (
     parse_number,
 )
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.geometry.inertia import RigidInertia, Rows
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
-from modelserver.geometry.parts import Sigma
+from modelserver.geometry.parts import RigidInertia, Rows, Sigma
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3

@@ -300,7 +300,7 @@ class _ModelReview:
                 body = replace(body, inertia=draft.inertia)
             except ValueError as error:
                 self.report(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
-            if fault := body.find_inertia_error():
+            if (rigid := body.rigid_inertia) is not None and (fault := rigid.find_error()):
                 self.report(
                     f"{label}: {fault}", draft.source, "look for a wrong sign or digit, or leave the inertia out"
                 )

@@ -22,7 +22,7 @@ from modelserver import errors
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import CoreState, ModelLoaded
 from modelserver.geometry import Model
-from modelserver.geometry.difference import describe_changes
+from modelserver.geometry.model import describe_changes
 from modelserver.messages import LoadModel
 from modelserver.server.vehicle import Vehicle, find_disconnected, load_vehicle
 

@@ -84,8 +84,8 @@ TERMS = {
     "slerp": "modelserver/transforms/so3.py",
     "spanning tree": "modelserver/geometry/topology.py",
     "loop closure": "modelserver/geometry/topology.py",
-    "inertia tensor": "modelserver/geometry/inertia.py",
-    "parallel axis": "modelserver/geometry/inertia.py",
+    "inertia tensor": "modelserver/geometry/parts.py",
+    "parallel axis": "modelserver/geometry/parts.py",
     "twist": "modelserver/geometry/kinematic_path.py",
     # robot_localization
     "map frame": "modelserver/query/view.py",
@@ -97,7 +97,7 @@ TERMS = {
     # service and drivers
     "rate limit": "modelserver/server/ingress.py",
     "round robin": "modelserver/server/requests.py",
-    "duplicate publisher": "modelserver/core/publisher_conflict.py",
+    "duplicate publisher": "modelserver/server/ingress.py",
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",
     "watchdog": "modelserver/server/supervision.py",
