@@ -30,52 +30,11 @@ import numpy as np
 
 from modelserver import messages
 from modelserver.core.health import report_if_due
-from modelserver.core.state import (
-    DEGRADED,
-    LATE_LIMIT_S,
-    RUNNING,
-    SAMPLE_FUTURE_LIMIT_S,
-    START,
-    START_REPORT_NS,
-    STARTING,
-    AllOutputs,
-    CoreSettings,
-    CoreState,
-    ExpectedSensor,
-    Instant,
-    Outputs,
-    SourceTraffic,
-    StepResult,
-    TimedRequest,
-    WaitingRequest,
-    count_decision,
-    count_message,
-    count_rejection,
-    handle_rejected,
-    handle_warning,
-    is_clock_off,
-    mark_received,
-    note_offset,
-    start,
-)
+from modelserver.core.state import *
 from modelserver.errors import Status
 from modelserver.estimation.history import Localizer, LocalizerEvent, PersistentLocalizer
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.messages import (
-    CHANNEL_OF,
-    MAX_CHANNEL_LENGTH,
-    Denied,
-    GetExplanation,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    Output,
-    Request,
-    RequestHeader,
-    SendReply,
-)
 from modelserver.named_tuples import new_tuple
 from modelserver.query.answers import DeferredAnswer, complete_names, compute_replies, is_deferred, make_error_reply
 from modelserver.query.view import PlatformView
@@ -88,18 +47,24 @@ def step(state: CoreState, event: messages.Event | ModelLoaded, now: Instant) ->
 
 # --- requests ---------------------------------------------------------------------------------------------------------
 
-_TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)
+_TIMED: Final = (
+    messages.GetTransformation,
+    messages.GetStateVector,
+    messages.GetHTransform,
+    messages.GetMotion,
+    messages.GetExplanation,
+)
 """Requests that name a time, and may wait for its data."""
 
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
-def is_answerable(header: RequestHeader, prefix: str) -> bool:
+def is_answerable(header: messages.RequestHeader, prefix: str) -> bool:
     """Return whether a server may reply on the request's reply channel: within its prefix, plain, not too long."""
     channel = header.reply_channel
     # the length first: what is looked up is cached
-    return len(channel) <= MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
+    return len(channel) <= messages.MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
 
 
 @lru_cache(maxsize=1024)
@@ -107,17 +72,17 @@ def _is_plain(channel: str, prefix: str) -> bool:
     return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
 
 
-def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:
+def handle_request(state: CoreState, request: messages.Request, now: Instant) -> tuple[CoreState, AllOutputs]:
     """Answer a request, defer a long answer, or let the request wait until the data it asks for arrive."""
     if not is_answerable(request.header, state.settings.reply_prefix):
-        return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+        return count_rejection(state, messages.CHANNEL_OF[type(request)], "reply_channel"), ()
     request = complete_names(request)
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
         if len(state.waiting) < state.settings.waiting_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
             waiting = WaitingRequest(request, now.monotonic_ns + wait_ms * 1_000_000)
             return state._replace(waiting=(*state.waiting, waiting)), ()
-        state = count_rejection(state, CHANNEL_OF[type(request)], "overload")
+        state = count_rejection(state, messages.CHANNEL_OF[type(request)], "overload")
         why = f"{len(state.waiting)} requests wait already, the limit (limits.waiting_requests); ask without wait_ms"
         return state, reply_error(state, type(request), request.header, Status.OVERLOADED, why, now)
     # a third of the cost of `_replace`, for every request
@@ -130,15 +95,15 @@ def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[Co
 def _must_wait(state: CoreState, request: TimedRequest) -> bool:
     """Return whether the data that a request asks for are yet to come, and it may wait for them."""
     ends = (names.WORLD_UTM, state.view.base_frame)
-    if isinstance(request, (GetTransformation, GetMotion, GetExplanation)):
+    if isinstance(request, (messages.GetTransformation, messages.GetMotion, messages.GetExplanation)):
         ends = (request.frame_of_interest, request.frame_of_reference)
     return state.view.is_awaiting_data(request.time, *ends)
 
 
-def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[Output]]:
+def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[messages.Output]]:
     """Answer the waiting requests whose data have arrived or whose deadline has passed."""
     remaining: list[WaitingRequest] = []
-    replies: list[Output] = []
+    replies: list[messages.Output] = []
     for request in state.waiting:
         if now.monotonic_ns < request.deadline_ns and _must_wait(state, request.request):
             remaining.append(request)
@@ -149,23 +114,23 @@ def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[Outp
     return state, replies
 
 
-def _make_replies(state: CoreState, request: Request, now: Instant) -> tuple[SendReply, ...]:
+def _make_replies(state: CoreState, request: messages.Request, now: Instant) -> tuple[messages.SendReply, ...]:
     channel = request.header.reply_channel
-    return tuple([SendReply(channel, reply) for reply in compute_replies(state.view, request, now.utime)])
+    return tuple([messages.SendReply(channel, reply) for reply in compute_replies(state.view, request, now.utime)])
 
 
-def reply_overloaded(state: CoreState, request: Request, now: Instant) -> Outputs:
+def reply_overloaded(state: CoreState, request: messages.Request, now: Instant) -> Outputs:
     message = "the server is overloaded and dropped the request; try again later"
     return reply_error(state, type(request), request.header, Status.OVERLOADED, message, now)
 
 
-def reply_internal_error(state: CoreState, request: Request, now: Instant) -> Outputs:
+def reply_internal_error(state: CoreState, request: messages.Request, now: Instant) -> Outputs:
     """Reply to a request whose handling raised an exception in the server."""
     message = "internal error of the server; its log has the traceback"
     return reply_error(state, type(request), request.header, Status.INTERNAL, message, now)
 
 
-def handle_denied(state: CoreState, command: Denied, now: Instant) -> StepResult:
+def handle_denied(state: CoreState, command: messages.Denied, now: Instant) -> StepResult:
     """Count a denied command, and reply with the reason to a sender whose signature is verified."""
     state = count_rejection(state, command.channel, command.reason)
     if command.request_type is None or command.header is None:
@@ -178,12 +143,21 @@ def handle_denied(state: CoreState, command: Denied, now: Instant) -> StepResult
 
 
 def reply_error(
-    state: CoreState, kind: type[Request], header: RequestHeader, status: Status, message: str, now: Instant
+    state: CoreState,
+    kind: type[messages.Request],
+    header: messages.RequestHeader,
+    status: Status,
+    message: str,
+    now: Instant,
 ) -> Outputs:
     """Reply with an error and its reason; without output if the reply channel is not permitted."""
     if not is_answerable(header, state.settings.reply_prefix):
         return ()
-    return (SendReply(header.reply_channel, make_error_reply(state.view, kind, header, status, message, now.utime)),)
+    return (
+        messages.SendReply(
+            header.reply_channel, make_error_reply(state.view, kind, header, status, message, now.utime)
+        ),
+    )
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------
@@ -574,21 +548,3 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreSta
     messages.HealthWarning: handle_warning,
     messages.Denied: handle_denied,
 }
-
-__all__ = [
-    "DEGRADED",
-    "RUNNING",
-    "STARTING",
-    "AllOutputs",
-    "CoreSettings",
-    "CoreState",
-    "ExpectedSensor",
-    "Instant",
-    "get_state_to_persist",
-    "is_answerable",
-    "reply_error",
-    "reply_internal_error",
-    "reply_overloaded",
-    "start",
-    "step",
-]

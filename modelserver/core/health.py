@@ -47,7 +47,7 @@ def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant
     inputs = state.health_inputs
     if not is_full and now.monotonic_ns < inputs.due_ns:
         return state, ()
-    stability, warning = _find_stability(state, now)
+    stability, warning = find_stability(state.view, now.utime)
     conditions = evaluate_conditions(state, now, is_unstable=bool(warning))
     if gauges is not None:
         cpu_share = messages.NAN
@@ -105,13 +105,6 @@ def _find_unusable(state: CoreState, now: Instant) -> Iterator[tuple[str, str, s
         elif traffic.dropped >= MIN_DROPPED and not _is_silent(name, traffic, now):
             counts = f"{traffic.count} received, {traffic.used} of {traffic.measured} measurements used"
             yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
-
-
-def _find_stability(state: CoreState, now: Instant) -> tuple[messages.StabilityHealth, str]:
-    """Return the tip-over stability and its warning; nothing is loaded for it unless it is configured."""
-    if state.view.dynamics is None or not state.view.dynamics.contacts:
-        return messages.StabilityHealth(), ""
-    return find_stability(state.view, now.utime)
 
 
 def _is_silent(name: str, traffic: SourceTraffic, now: Instant) -> bool:

@@ -26,22 +26,9 @@ from modelserver.files import (
     find_geometry_path,
     read_regular,
 )
-from modelserver.formats.common import SavedModel
+from modelserver.formats.common import SavedModel as SavedModel
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
-
-__all__ = [
-    "FORMATS",
-    "MAX_BYTES",
-    "FileExamination",
-    "SavedModel",
-    "check_file",
-    "examine_file",
-    "format_of_path",
-    "load_model",
-    "parse_model",
-    "save_model",
-]
 
 _WRITERS = {"yaml": "yaml_geometry", "miro": "miro", "urdf": "urdf"}
 

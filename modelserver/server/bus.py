@@ -17,17 +17,15 @@ import contextlib
 import errno
 import logging
 import math
-import re
 import select
 import socket
-import struct
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
 from modelserver.server.clock import FakeClock
-from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, parse_udp_address, resolve_url
 from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, Sender, open_receiver
 
 log = logging.getLogger(__name__)
@@ -35,19 +33,17 @@ log = logging.getLogger(__name__)
 RENEW_S: Final = 1.0
 """Period of renewing the membership: one system call."""
 
-_GROUP: Final = re.compile(r"udpm://(\d{1,3}(?:\.\d{1,3}){3})(?::\d+)?(?:\?.*)?\Z")
-
 
 class MulticastMembership:
     """Membership in the multicast group of an LCM URL; without effect for other providers."""
 
     def __init__(self, url: str):
-        found = _GROUP.match(url)
         self._request = b""
-        if found:
+        address = parse_udp_address(url)
+        if address is not None and address.group in url:
             # the interface is that of the group's route, as for LCM
             with contextlib.suppress(OSError):  # no address: LCM reports it
-                self._request = struct.pack("=4s4s", socket.inet_aton(found[1]), socket.inet_aton("0.0.0.0"))
+                self._request = socket.inet_aton(address.group) + socket.inet_aton("0.0.0.0")
         self._socket: socket.socket | None = None
         self._joined = False
         self._has_warned = False

@@ -378,36 +378,26 @@ LARGE_BYTES: Final = 100_000
 def probe_delivery(url: str, seconds: float = ECHO_TIMEOUT_S) -> tuple[bool, bool]:
     """Return whether a short and a long own message come back. Raises BusError."""
     sender, receiver = open_lcm(url), open_lcm(url)
-    echoed: list[bool] = []
-    for size in (8, LARGE_BYTES):
-        echoed.append(_is_echoed(sender, receiver, secrets.token_bytes(size), seconds if all(echoed) else 0.0))
-    return echoed[0], echoed[1]
+    is_short_echoed = _is_echoed(sender, receiver, 8, seconds)
+    return is_short_echoed, is_short_echoed and _is_echoed(sender, receiver, LARGE_BYTES, seconds)
 
 
-def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, payload: bytes, seconds: float) -> bool:
-    matches: list[bool] = []
+def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, size: int, seconds: float) -> bool:
+    payload, matches = secrets.token_bytes(size), list[bool]()
     subscription = receiver.subscribe(
         to_subscription_pattern(PROBE_CHANNEL), lambda _, data: matches.append(data == payload)
     )
-    deadline = time.monotonic() + seconds
+    send_at = time.monotonic()
+    deadline = send_at + seconds
     try:
-        while time.monotonic() < deadline:
-            sender.publish(PROBE_CHANNEL, payload)
-            if _receive_until(receiver, min(RESEND_S, seconds), lambda: any(matches)):
-                return True
+        while not any(matches) and (now := time.monotonic()) < deadline:
+            if now >= send_at:
+                sender.publish(PROBE_CHANNEL, payload)
+                send_at = now + RESEND_S
+            handle_message(receiver, int((min(send_at, deadline) - now) * 1e3) + 1)
     finally:
         receiver.unsubscribe(subscription)
-    return False
-
-
-def _receive_until(receiver: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + seconds
-    while not until():
-        left = deadline - time.monotonic()
-        if left <= 0.0:
-            return False
-        handle_message(receiver, int(left * 1e3) + 1)
-    return True
+    return any(matches)
 
 
 SERVERS_SUBJECT: Final = "servers"

@@ -43,24 +43,10 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from modelserver import messages
 from modelserver.core import COMMANDS as SIGNED_KINDS
 from modelserver.core import Instant
 from modelserver.errors import WireError, quote
-from modelserver.messages import (
-    CHANNEL_OF,
-    Denied,
-    Envelope,
-    Event,
-    HealthWarning,
-    JointsSample,
-    Rejected,
-    RelativePoseSample,
-    Request,
-    Sample,
-    SensorHeader,
-    SignedCommand,
-    SwitchMode,
-)
 from modelserver.named_tuples import new_tuple
 from modelserver.server.journal import JournalQueue
 from modelserver.server.log import RateLimitedLog
@@ -85,9 +71,9 @@ class SensorChannel:
     type_name: str
     latency_us: int = 0
 
-    def decode(self, data: bytes) -> Sample | SwitchMode:
+    def decode(self, data: bytes) -> messages.Sample | messages.SwitchMode:
         """Decode a sample or a mode command. Raises WireError."""
-        value: Sample | SwitchMode = decode(self.type_name, data)
+        value: messages.Sample | messages.SwitchMode = decode(self.type_name, data)
         return subtract_latency(value, self.latency_us) if self.latency_us else value
 
 
@@ -105,10 +91,12 @@ def peek_sample_id(data: bytes, fingerprint: bytes) -> SampleId | None:
     return new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
 
 
-def subtract_latency(sample: Sample | SwitchMode, microseconds: int) -> Sample | SwitchMode:
+def subtract_latency(
+    sample: messages.Sample | messages.SwitchMode, microseconds: int
+) -> messages.Sample | messages.SwitchMode:
     """Subtract a latency from the measurement times of a sample; its host_utime stays."""
     header = replace(sample.header, utime=max(1, sample.header.utime - microseconds))
-    if isinstance(sample, RelativePoseSample):
+    if isinstance(sample, messages.RelativePoseSample):
         return replace(sample, header=header, since_utime=max(1, sample.since_utime - microseconds))
     return replace(sample, header=header)
 
@@ -146,7 +134,7 @@ class RejectionCounter:
     Channels and reasons are the server's own, so memory is bounded.
     """
 
-    def __init__(self, step: Callable[[Rejected, Instant], None], journal: JournalQueue):
+    def __init__(self, step: Callable[[messages.Rejected, Instant], None], journal: JournalQueue):
         self._step = step
         self._journal = journal
         self._records, self._events = RateLimiter(), RateLimiter()
@@ -162,7 +150,7 @@ class RejectionCounter:
         """Count a message in the core, at once or with the next `flush`; return whether at once."""
         key = (channel, reason)
         if self._events.try_acquire(key, now.monotonic_ns):
-            self._step(Rejected(channel, reason), now)
+            self._step(messages.Rejected(channel, reason), now)
             return True
         self._waiting[key] = self._waiting.get(key, 0) + 1
         return False
@@ -178,7 +166,7 @@ class RejectionCounter:
             return
         waiting, self._waiting, self._flushed_ns = self._waiting, {}, now.monotonic_ns
         for (channel, reason), count in waiting.items():
-            self._step(Rejected(channel, reason, count), now)
+            self._step(messages.Rejected(channel, reason, count), now)
 
 
 PUBLISHER_TIMEOUT_NS: Final = 3_000_000_000
@@ -222,7 +210,7 @@ class SampleId(NamedTuple):
 
 
 _MASK: Final = REORDER_WINDOW - 1
-_NO_SAMPLE: Final = SensorHeader(0, seq=-1 << 64)
+_NO_SAMPLE: Final = messages.SensorHeader(0, seq=-1 << 64)
 
 
 class PublisherConflictDetector:
@@ -247,12 +235,12 @@ class PublisherConflictDetector:
         """Source of the last conflicting sample; empty without one."""
         self.conflict_ns = 0
         """Receipt of the last conflicting sample, monotonic nanoseconds."""
-        self._received: list[SensorHeader | SampleId] = []
+        self._received: list[messages.SensorHeader | SampleId] = []
         self._last = self._last_ns = self._interval_ns = self._outlier_ns = self._repeats = self._outliers = 0
         self._is_counting = self._continued = False
         self._restart(_NO_SAMPLE, -PUBLISHER_TIMEOUT_NS - 1, None)
 
-    def is_conflicting(self, header: SensorHeader | SampleId, now_ns: int, sender: object = None) -> bool:
+    def is_conflicting(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object = None) -> bool:
         """Process a sample; return whether it is from a second publisher. `sender`: its address, where it is known."""
         seq = header.seq
         ahead = seq - self._last
@@ -286,7 +274,7 @@ class PublisherConflictDetector:
         self._received[seq & _MASK] = header
         return False
 
-    def _check_outlier(self, header: SensorHeader | SampleId, now_ns: int) -> bool:
+    def _check_outlier(self, header: messages.SensorHeader | SampleId, now_ns: int) -> bool:
         """Process a sample that does not continue the sequence; return whether it is from a second publisher."""
         if self._may_be_restarted(now_ns):
             self._restart(header, now_ns, self._sender)
@@ -301,7 +289,7 @@ class PublisherConflictDetector:
             self._continued = False
         return self._outliers > MAX_OUTLIERS and self._set_conflict(header.source, now_ns)
 
-    def _check_other(self, header: SensorHeader | SampleId, now_ns: int, sender: object) -> bool:
+    def _check_other(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object) -> bool:
         """Process a sample of another publisher; return whether it stays the second one."""
         is_restarted = header.source == self.source and self._may_be_restarted(now_ns)
         is_named = header.source in self._names and self.source not in self._names
@@ -331,7 +319,7 @@ class PublisherConflictDetector:
         self.other_source, self.conflict_ns = source, now_ns
         return True
 
-    def _restart(self, header: SensorHeader | SampleId, now_ns: int, sender: object) -> None:
+    def _restart(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object) -> None:
         self._sender, self._second, self._slow_ns = sender, None, now_ns - CONTEST_NS
         self.source, self._last, self._last_ns = header.source, header.seq, now_ns
         self._is_counting, self._repeats, self._outliers, self._continued = False, 0, 0, True
@@ -366,7 +354,7 @@ class PublisherConflictMonitor:
 
     def __init__(
         self,
-        step: Callable[[Event, Instant], None],
+        step: Callable[[messages.Event, Instant], None],
         count: Callable[[str, str, Instant], object],
         log: RateLimitedLog,
         rule: str,
@@ -410,7 +398,7 @@ class PublisherConflictMonitor:
 
         Returns the message without the joints that another publisher has; empty if it has them all. Raises WireError.
         """
-        sample: JointsSample = decode("joints_t", data)
+        sample: messages.JointsSample = decode("joints_t", data)
         joints = tuple([each for each in sample.joints if self._has_joint(channel, each.name, sample_id, now, sender)])
         if len(joints) == len(sample.joints):
             return data
@@ -433,7 +421,7 @@ class PublisherConflictMonitor:
             return
         self._active[subject] = detector
         text = self._format_warning(subject, detector, (now.utime - sample_id.utime) * 1e-6)
-        self._step(HealthWarning(f"channel {subject}", text), now)
+        self._step(messages.HealthWarning(f"channel {subject}", text), now)
         self._log.warning(f"{channel}:publisher_conflict", "%s", text)
 
     def clear_expired(self, now: Instant) -> None:
@@ -441,7 +429,7 @@ class PublisherConflictMonitor:
         for subject, detector in list(self._active.items()):
             if now.monotonic_ns - detector.conflict_ns > CONFLICT_TIMEOUT_NS:
                 del self._active[subject]
-                self._step(HealthWarning(f"channel {subject}"), now)
+                self._step(messages.HealthWarning(f"channel {subject}"), now)
 
     def _format_warning(self, subject: str, detector: PublisherConflictDetector, age: float) -> str:
         first, second = quote(detector.source, 40), quote(detector.other_source, 40)
@@ -453,7 +441,7 @@ class PublisherConflictMonitor:
         return f"{who} publish on {subject} at once, and {done}{old}: stop one of them"
 
 
-COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in SIGNED_KINDS}
+COMMANDS: Final[Mapping[str, type[messages.Request]]] = {messages.CHANNEL_OF[kind]: kind for kind in SIGNED_KINDS}
 """Request types that must be signed, by channel."""
 
 MODE_TYPE: Final = "localization_mode_t"
@@ -470,27 +458,27 @@ class CommandVerifier:
         self._started_ns = started_ns
         self._freshness = Freshness()
 
-    def verify(self, data: bytes, now: Instant) -> SignedCommand | Denied:
+    def verify(self, data: bytes, now: Instant) -> messages.SignedCommand | messages.Denied:
         """Return the command in an envelope, or why it is denied. Raises WireError if `data` is no envelope."""
-        envelope: Envelope = decode("signed_t", data)
+        envelope: messages.Envelope = decode("signed_t", data)
         key = self._keys.get(envelope.key_name)
         if key is None:
-            return Denied(f"{self._prefix}{SIGNED}", "unknown_key")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "unknown_key")
         if not has_valid_signature(key, self._prefix, envelope):
-            return Denied(f"{self._prefix}{SIGNED}", "bad_signature")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "bad_signature")
         # from here on the sender knows the key
         kind = COMMANDS.get(envelope.channel)
         if kind is None and (not self._mode_channel or envelope.channel != self._mode_channel):
-            return Denied(f"{self._prefix}{SIGNED}", "channel")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "channel")
         source = f"{self._prefix}{envelope.channel}"
         header = read_request_header(envelope.payload) if kind is not None else None
         uptime_us = (now.monotonic_ns - self._started_ns) // 1000
         check = check_freshness(self._freshness, envelope, now.utime, uptime_us, self._window_us)
         self._freshness = check.freshness
         if check.reason:
-            return Denied(source, check.reason, check.message, kind, header)
+            return messages.Denied(source, check.reason, check.message, kind, header)
         try:
             command = decode(MODE_TYPE if kind is None else BY_NAME[envelope.channel].type_name, envelope.payload)
         except WireError as error:
-            return Denied(source, error.reason, str(error), kind, header, is_malformed=True)
-        return SignedCommand(command, envelope.sender)
+            return messages.Denied(source, error.reason, str(error), kind, header, is_malformed=True)
+        return messages.SignedCommand(command, envelope.sender)
