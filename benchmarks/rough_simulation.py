@@ -14,7 +14,7 @@ Limits: waves shorter than a few wheelbases are steeper for this vehicle than fo
 Read top-down: `make_motion` -> `GroundMotion.at` -> `SlipAngle.at`, `Terrain.evaluate`, `_Slope`.
 
 `RoughSimulation` is the product's `Simulation` with these options. Aiding sensors (absolute poses, visual odometry,
-ranges) are true up to the noise that they state.
+ranges) are true up to the noise that they state. `EncoderModel` and `TriadModel` are faults of the product's sensors.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from modelserver.geometry.model import Model
-from modelserver.messages import AbsolutePoseSample, Origin, RangeSample, RelativePoseSample
+from modelserver.messages import AbsolutePoseSample, Direction, Origin, RangeSample, RelativePoseSample, WheelSample
 from modelserver.simulation import Event, Simulation
-from modelserver.simulation.noise import Intervals, NoiseSource, Run, Timing, is_within
+from modelserver.simulation.imu import apply_rows
+from modelserver.simulation.noise import GaussMarkov, Intervals, NoiseSource, Run, Timing, is_within
 from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
+from modelserver.simulation.wheels import Encoder, WheelsModel
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
@@ -482,3 +484,119 @@ class RoughSimulation(Simulation):
             more_sensors=aiding,
             **more,
         )
+
+
+# --- faults of encoders, gyros and accelerometers ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderModel:
+    """Faults of the wheels and encoders; by default none.
+
+    Attributes
+    ----------
+    burst_rate, burst_seconds, burst_excess : wheel spin of each wheel: starts per second, duration, share of excess
+        travel
+    stuck : (wheel, time): from then on the encoder gives no pulses
+    swapped : wheels that count backward when they roll forward
+    """
+
+    burst_rate: float = 0.0
+    burst_seconds: float = 1.0
+    burst_excess: float = 0.5
+    stuck: tuple[tuple[str, float], ...] = ()
+    swapped: frozenset[str] = frozenset()
+
+    def __call__(self, model: WheelsModel, name: str, noise: NoiseSource, run: Run) -> FaultyEncoder:
+        return FaultyEncoder(self, model, name, noise, run)
+
+
+class FaultyEncoder(Encoder):
+    """One encoder with faults, which draw from a generator of the wheel's own."""
+
+    def __init__(self, faulty: EncoderModel, model: WheelsModel, name: str, noise: NoiseSource, run: Run):
+        super().__init__(model, name, noise, run)
+        self._faulty, self._faults = faulty, run.noise(f"wheels/wheels/{name}").generator
+        self._stuck_from = min((t for wheel, t in faulty.stuck if wheel == name), default=math.inf)
+        self._sign = -1.0 if name in faulty.swapped else 1.0
+        self._burst = self._faults.exponential(1.0 / faulty.burst_rate) if faulty.burst_rate else math.inf
+        self._travel = 0.0
+
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+        if self._is_spinning(t):
+            excess *= 1.0 + self._faulty.burst_excess
+        found = super().sample(t, rolled, speed, excess, steering)
+        if t >= self._stuck_from:
+            found = replace(found, travel=self._travel, speed=0.0, direction=Direction.STOPPED)
+        self._travel = found.travel
+        if self._sign > 0.0:
+            return found
+        back = {Direction.FORWARD: Direction.BACKWARD, Direction.BACKWARD: Direction.FORWARD}
+        direction = back.get(found.direction, found.direction)
+        return replace(found, travel=-found.travel, speed=-found.speed, direction=direction)
+
+    def _is_spinning(self, t: float) -> bool:
+        faulty = self._faulty
+        while t >= self._burst + faulty.burst_seconds:
+            self._burst += faulty.burst_seconds + self._faults.exponential(1.0 / faulty.burst_rate)
+        return t >= self._burst
+
+
+_MOVING_SPEED = 0.05
+"""Speed in m/s above which the vehicle vibrates."""
+
+
+@dataclass(frozen=True, slots=True)
+class TriadModel:
+    """Errors of three gyros or accelerometers beyond white noise and constant bias, in rad/s or m/s2; 0 for none.
+
+    Attributes
+    ----------
+    scale_sigma : standard deviation of each axis's scale error, drawn once
+    misalignment_sigma : standard deviation of the misalignment between two axes, rad, drawn once
+    instability : standard deviation of the in-run bias, a Gauss-Markov process of `instability_time` seconds
+    walk : random walk of the bias, unit/sqrt(s)
+    vibration : standard deviation of each sample's vibration while the vehicle moves
+    """
+
+    scale_sigma: float = 0.0
+    misalignment_sigma: float = 0.0
+    instability: float = 0.0
+    instability_time: float = 300.0
+    walk: float = 0.0
+    vibration: float = 0.0
+
+    def __call__(self, rate_hz: float, noise: NoiseSource) -> Callable[[Vector3, float], Vector3]:
+        return Triad(self, rate_hz, noise).measure
+
+
+class Triad:
+    """One simulated triad of gyros or accelerometers: y = M x + b_walk(t) + b_instability(t) + vibration.
+
+    M has scale errors and misalignment drawn once, b_walk is a random walk, b_instability a first-order Gauss-Markov
+    process.
+    """
+
+    def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
+        self._model = model
+        self._noise = noise.prefetch()
+        misalignment = [noise.vector(model.misalignment_sigma) for _ in range(3)]
+        scale = noise.vector(model.scale_sigma)
+        x, y, z = ([1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)] for i in range(3))
+        self._rows = (so3.to_vector3(x), so3.to_vector3(y), so3.to_vector3(z))
+        self._instability = [GaussMarkov(model.instability, model.instability_time, noise) for _ in range(3)]
+        self._walk = (0.0, 0.0, 0.0)
+        self._drift = model.walk / math.sqrt(rate_hz)
+        self._period = 1.0 / rate_hz
+
+    def measure(self, true: Vector3, speed: float) -> Vector3:
+        """Return the measured vector for a true one at the vehicle's `speed`, m/s."""
+        model = self._model
+        if self._drift:
+            self._walk = so3.add(self._walk, self._noise.vector(self._drift))
+        errors = [self._walk]
+        if model.instability:
+            errors.append(so3.to_vector3(each.step(self._period) for each in self._instability))
+        if model.vibration and abs(speed) > _MOVING_SPEED:
+            errors.append(self._noise.vector(model.vibration))
+        return so3.add(apply_rows(self._rows, true), so3.add(*errors))

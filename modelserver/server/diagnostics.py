@@ -232,7 +232,10 @@ def read_gauges(queued: int, statm: Path = STATM) -> Gauges:
 
 def read_resident_bytes(statm: Path = STATM) -> int:
     """Read the resident memory of this process, bytes; 0 if unknown."""
-    return (_read_int(statm, 1) or 0) * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return int(statm.read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
 
 
 _SIOCGIFFLAGS: Final = 0x8913
@@ -342,13 +345,6 @@ def count_dropped(port: int, proc: Path = PROC) -> int | None:
     rows = [line.split() for line in lines]
     dropped = sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
     return min(dropped, int(dict(zip(names, values, strict=True)).get("RcvbufErrors", dropped)))
-
-
-def _read_int(path: Path, word: int = 0) -> int | None:
-    try:
-        return int(path.read_bytes().split()[word])
-    except (OSError, ValueError, IndexError):
-        return None
 
 
 _TIMEX: Final = struct.Struct("@I4li")

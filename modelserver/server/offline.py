@@ -37,11 +37,6 @@ CSV_HEADER: Final = (
     "horizontal_level,heading_level,limit_risk"
 )
 
-_NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
-_NO_BOUNDS: Final = (NAN, NAN)
-_NO_SIGMAS: Final = (NAN, NAN, NAN, NAN)
-_NO_PLACE: Final = (NAN, NAN, NAN)
-_NO_LEVELS: Final = (NAN, NAN, NAN)
 _UNCERTAINTY: Final = "%.4f,%.6f,%.4f,%.4f,%.4f,%.6f,%.9f,%.9f,%.5f,%.4f,%.6f,%.3g"
 """Format of the last columns: to 0.1 mm, a microradian, a nanodegree."""
 
@@ -61,13 +56,13 @@ class TrackRow:
     easting: float = NAN
     northing: float = NAN
     up: float = NAN
-    rotation: Quaternion = _NO_ROTATION
+    rotation: Quaternion = (NAN, NAN, NAN, NAN)
     valid: bool = False
     invalid: int = 0
-    bounds: tuple[float, float] = _NO_BOUNDS
-    sigmas: tuple[float, float, float, float] = _NO_SIGMAS
-    place: tuple[float, float, float] = _NO_PLACE
-    levels: tuple[float, float, float] = _NO_LEVELS
+    bounds: tuple[float, float] = (NAN, NAN)
+    sigmas: tuple[float, float, float, float] = (NAN, NAN, NAN, NAN)
+    place: tuple[float, float, float] = (NAN, NAN, NAN)
+    levels: tuple[float, float, float] = (NAN, NAN, NAN)
 
     def to_csv(self) -> str:
         """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian.
@@ -126,7 +121,9 @@ class OfflineRun:
         for event in align(self.log, channels, self.axis):
             if self._state is None:
                 self.first_utime = event.utime
-                self._state = self._start(_instant(event.utime))
+                state = self.vehicle.start_core(_instant(event.utime))
+                settings = replace(state.settings, publish_decisions=self.on_decision is not None)
+                self._state = state._replace(settings=settings)
                 due = event.utime if ticks is None else next(ticks, None)
             while due is not None and due <= event.utime:
                 yield self._estimate_row(due)
@@ -139,10 +136,6 @@ class OfflineRun:
             yield self._estimate_row(due)
             due = next(ticks, None)
 
-    def _start(self, now: Instant) -> CoreState:
-        state = self.vehicle.start_core(now)
-        return state._replace(settings=replace(state.settings, publish_decisions=self.on_decision is not None))
-
     def _process(self, event: LogEvent, channel: SensorChannel | None) -> None:
         assert self._state is not None
         self.events += 1
@@ -152,18 +145,16 @@ class OfflineRun:
             self.unconfigured_channels.add(event.channel)
             return
         self.samples += 1
-        now = _instant(event.utime)
         sample: Event
         try:
             sample = channel.decode(event.data)
         except WireError as error:
             sample = Rejected(event.channel, error.reason)
-        self._state, outputs = core.step(self._state, sample, now)
-        if self.on_decision is not None:
-            for output in outputs:
-                if isinstance(output, PublishDecisions):
-                    for decision in output.decisions:
-                        self.on_decision(decision)
+        self._state, outputs = core.step(self._state, sample, _instant(event.utime))
+        for output in outputs:
+            if isinstance(output, PublishDecisions) and self.on_decision is not None:
+                for decision in output.decisions:
+                    self.on_decision(decision)
         self.rejected = self._state.rejected
         if self.on_sample is not None and self._state.localizer is not None:
             self.on_sample(sample, self._state.localizer)
@@ -185,9 +176,8 @@ class OfflineRun:
             return TrackRow(utime, invalid=int(found.invalid_reasons))
         x, y, z = found.pose.xyz
         easting, northing, up = origin.easting + x, origin.northing + y, origin.height + z
-        P, sigmas, geodetic = found.covariance_numbers, _NO_SIGMAS, answer.geodetic
-        if P is not None:
-            sigmas = (math.sqrt(P[0]), math.sqrt(P[7]), math.sqrt(P[14]), math.sqrt(P[35]))
+        P, geodetic = found.covariance_numbers, answer.geodetic
+        x2, y2, z2, yaw2 = (NAN, NAN, NAN, NAN) if P is None else (P[0], P[7], P[14], P[35])
         return TrackRow(
             utime,
             easting,
@@ -197,8 +187,10 @@ class OfflineRun:
             found.is_valid,
             int(found.invalid_reasons),
             (answer.horizontal_protection_level, answer.heading_protection_level),
-            sigmas,
-            _NO_PLACE if geodetic is None else (geodetic.latitude_deg, geodetic.longitude_deg, geodetic.heading_deg),
+            (math.sqrt(x2), math.sqrt(y2), math.sqrt(z2), math.sqrt(yaw2)),
+            (NAN, NAN, NAN)
+            if geodetic is None
+            else (geodetic.latitude_deg, geodetic.longitude_deg, geodetic.heading_deg),
             (answer.horizontal_level, answer.heading_level, answer.limit_risk),
         )
 

@@ -2,12 +2,11 @@
 
 Measurement of the gyros and accelerometers, along the sensor axes (`_SimulatedImu`):
 
-    y = M x + b + b_walk(t) + b_instability(t) + vibration + n
+    y = x + b + b_walk(t) + n
 
 x is the true angular rate (with the Earth's, if `earth_rotation`) or the specific force f = a + 2 w_e x v - g (Groves
-(2013) 5.4), M scale errors and misalignment drawn once, b a constant bias, b_walk a random walk, b_instability a
-first-order Gauss-Markov process, n white noise of density N: sigma = N sqrt(rate). Terms as in Allan-variance data
-sheets (IEEE Std 952-1997, annex C).
+(2013) 5.4), b a constant bias, b_walk a random walk of the gyros, n white noise of density N: sigma = N sqrt(rate).
+Terms as in Allan-variance data sheets (IEEE Std 952-1997, annex C). Further errors of x: `TriadErrors`.
 Orientation: tilt is true up to an error drawn once plus noise. Without a yaw source, yaw starts anywhere and integrates
 the measured rate about up, so it drifts with the gyro bias and the Earth's rotation (vertical gyro, as 3DM-GX1). With
 one it is relative to magnetic or true north.
@@ -19,14 +18,13 @@ by 16 microradians.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from modelserver import earth
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation.noise import (
-    GaussMarkov,
     Intervals,
     NoiseSource,
     Run,
@@ -72,10 +70,10 @@ class MagnetometerModel:
     def measure(self, t: float, q_SE: Quaternion, noise: NoiseSource) -> Vector3:
         """Return the sample along the sensor axes; `q_SE` rotates east, north, up to them."""
         ambient = so3.rotate(q_SE, self.ambient_field(t))
-        return so3.add(_apply(self.soft_iron, ambient), self.hard_iron, noise.vector(self.noise))
+        return so3.add(apply_rows(self.soft_iron, ambient), self.hard_iron, noise.vector(self.noise))
 
 
-def _apply(M: Rows, v: Vector3) -> Vector3:
+def apply_rows(M: Rows, v: Vector3) -> Vector3:
     x, y, z = v
     a, b, c = M
     return (
@@ -83,59 +81,6 @@ def _apply(M: Rows, v: Vector3) -> Vector3:
         b[0] * x + b[1] * y + b[2] * z,
         c[0] * x + c[1] * y + c[2] * z,
     )
-
-
-_MOVING_SPEED = 0.05
-"""Speed in m/s above which the vehicle vibrates."""
-
-
-@dataclass(frozen=True, slots=True)
-class TriadModel:
-    """Errors of three gyros or accelerometers beyond white noise and constant bias, in rad/s or m/s2; 0 for none.
-
-    Attributes
-    ----------
-    scale_sigma : standard deviation of each axis's scale error, drawn once
-    misalignment_sigma : standard deviation of the misalignment between two axes, rad, drawn once
-    instability : standard deviation of the in-run bias, a Gauss-Markov process of `instability_time` seconds
-    walk : random walk of the bias, unit/sqrt(s)
-    vibration : standard deviation of each sample's vibration while the vehicle moves
-    """
-
-    scale_sigma: float = 0.0
-    misalignment_sigma: float = 0.0
-    instability: float = 0.0
-    instability_time: float = 300.0
-    walk: float = 0.0
-    vibration: float = 0.0
-
-
-class Triad:
-    """One simulated triad of gyros or accelerometers."""
-
-    def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
-        self._model = model
-        self._noise = noise.prefetch()
-        misalignment = [noise.vector(model.misalignment_sigma) for _ in range(3)]
-        scale = noise.vector(model.scale_sigma)
-        x, y, z = ([1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)] for i in range(3))
-        self._rows = (so3.to_vector3(x), so3.to_vector3(y), so3.to_vector3(z))
-        self._instability = [GaussMarkov(model.instability, model.instability_time, noise) for _ in range(3)]
-        self._walk = (0.0, 0.0, 0.0)
-        self._drift = model.walk / math.sqrt(rate_hz)
-        self._period = 1.0 / rate_hz
-
-    def measure(self, true: Vector3, speed: float) -> Vector3:
-        """Return the measured vector for a true one at the vehicle's `speed`, m/s."""
-        model = self._model
-        if self._drift:
-            self._walk = so3.add(self._walk, self._noise.vector(self._drift))
-        errors = [self._walk]
-        if model.instability:
-            errors.append(so3.to_vector3(each.step(self._period) for each in self._instability))
-        if model.vibration and abs(speed) > _MOVING_SPEED:
-            errors.append(self._noise.vector(model.vibration))
-        return so3.add(_apply(self._rows, true), so3.add(*errors))
 
 
 _HALF = math.sqrt(0.5)
@@ -148,7 +93,10 @@ _REFERENCE: dict[OrientationReference, Quaternion] = {
 
 _TIMING = Timing(100.0, latency=0.004, jitter=0.001)
 _PROMPT = Timing(100.0)
-_IDEAL = TriadModel()
+
+TriadErrors = Callable[[float, NoiseSource], Callable[[Vector3, float], Vector3]]
+"""Draws the errors of three gyros or accelerometers that give `rate_hz` samples a second; the result returns the
+measured vector for a true one at the vehicle's speed, m/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +112,7 @@ class ImuModel:
     yaw_offset : initial yaw, None for a random one
     reference : frame that its orientation refers to; NONE for a unit without orientation
     earth_rotation : include the Earth's rotation in the gyros and its Coriolis term in the accelerometers
-    gyro, accelerometer : further errors; `magnetometer` None for none
+    gyro, accelerometer : further errors; as for `magnetometer`, None for none
     yaw_source : reference of its yaw. Then the yaw error is `yaw_offset` (None for 0) plus one drawn once with
         `yaw_sigma` plus `yaw_noise` in each sample, and magnetic disturbances also act on a magnetic yaw. Without a
         magnetometer magnetic north is true north
@@ -183,8 +131,8 @@ class ImuModel:
     yaw_offset: float | None = None
     reference: OrientationReference = OrientationReference.NED
     earth_rotation: bool = True
-    gyro: TriadModel = _IDEAL
-    accelerometer: TriadModel = _IDEAL
+    gyro: TriadErrors | None = None
+    accelerometer: TriadErrors | None = None
     magnetometer: MagnetometerModel | None = None
     yaw_source: YawSource = YawSource.NONE
     yaw_sigma: float = 0.0
@@ -251,10 +199,9 @@ class _SimulatedImu:
         self.orientation_covariance = diagonal_covariance(tilt_sigma, tilt_sigma, yaw_sigma)
         self.gyro_covariance = _covariance(self.gyro_sigma, model.gyro_bias_sigma)
         self.force_covariance = _covariance(self.accelerometer_sigma, model.accelerometer_bias_sigma)
-        # None for speed: most units have no such errors
         self.gyro, self.accelerometer = (
-            None if triad == _IDEAL else Triad(triad, rate, run.noise(f"imu/imu/{name}"))
-            for name, triad in (("gyro", model.gyro), ("accelerometer", model.accelerometer))
+            None if draw is None else draw(rate, run.noise(f"imu/imu/{name}"))
+            for name, draw in (("gyro", model.gyro), ("accelerometer", model.accelerometer))
         )
         self.magnetometer_noise = run.noise("imu/imu/magnetometer").prefetch()
 
@@ -270,9 +217,9 @@ class _SimulatedImu:
         acceleration, velocity = motion.acceleration_at(lever), motion.velocity_at(lever)
         force = so3.rotate(q_SE, _specific_force(acceleration, velocity, turning, self.up))
         if self.gyro is not None:
-            rate = self.gyro.measure(rate, motion.speed)
+            rate = self.gyro(rate, motion.speed)
         if self.accelerometer is not None:
-            force = self.accelerometer.measure(force, motion.speed)
+            force = self.accelerometer(force, motion.speed)
         rate = so3.add(rate, self.gyro_bias, noise.vector(self.gyro_sigma))
         force = so3.add(force, self.accelerometer_bias, noise.vector(self.accelerometer_sigma))
         orientation = None

@@ -4,45 +4,52 @@ Kinematics: the speed of a contact point at (x, y, z) of the rolling frame is v_
 and for a steered wheel the speed along the wheel, which is steered for
 level ground without side slip. Travel is its integral: closed form on level ground without slip, else Gauss-Legendre
 with three nodes per sample.
-Encoder: travel is quantized to pulses; scale error per wheel; slip proportional to traction; bursts
-of wheel spin; stuck and swapped encoders (`EncoderModel`).
+Encoder: travel is quantized to pulses; scale error per wheel; slip proportional to traction.
 Limits: side slip is not measured by a wheel; the wheels follow the slope of the ground without suspension.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 
 from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
 from modelserver.simulation.noise import NoiseSource, Run, Timing, quantize
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms.so3 import Vector3
 
-
-@dataclass(frozen=True, slots=True)
-class EncoderModel:
-    """Faults of the wheels and encoders; by default none.
-
-    Attributes
-    ----------
-    burst_rate, burst_seconds, burst_excess : wheel spin of each wheel: starts per second, duration, share of excess
-        travel
-    stuck : (wheel, time): from then on the encoder gives no pulses
-    swapped : wheels that count backward when they roll forward
-    """
-
-    burst_rate: float = 0.0
-    burst_seconds: float = 1.0
-    burst_excess: float = 0.5
-    stuck: tuple[tuple[str, float], ...] = ()
-    swapped: frozenset[str] = frozenset()
-
-
 _GRAVITY = 9.81
 _NODES = ((0.5 - math.sqrt(0.15), 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + math.sqrt(0.15), 5.0 / 18.0))
 """Gauss-Legendre nodes and weights on [0, 1]."""
+
+
+class Encoder:
+    """One simulated encoder; each call of `sample` follows the last."""
+
+    def __init__(self, model: WheelsModel, name: str, noise: NoiseSource, run: Run):
+        """Draw the errors of a wheel's encoder; `noise` is shared by the wheels, `run` has others for more."""
+        self._model, self._name, self._noise = model, name, noise
+        self._scale = 1.0 + noise.normal(model.scale_sigma)
+        self._rotated = 0.0
+
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+        """Return the encoder's sample at `t` seconds.
+
+        `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
+        """
+        model, seen = self._model, self._scale * excess
+        error = self._noise.normal(model.speed_sigma) if abs(speed) > model.stationary_speed else 0.0
+        self._rotated += rolled * seen
+        return WheelSample(
+            self._name,
+            travel=quantize(self._rotated, model.travel_step),
+            travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4),
+            speed=speed * seen + error,
+            speed_sigma=max(model.speed_sigma, 1e-4),
+            direction=_direction(speed, model.stationary_speed),
+            steering=steering,
+        )
 
 
 _TIMING = Timing(20.0, latency=0.01, jitter=0.002)
@@ -62,7 +69,7 @@ class WheelsModel:
     stationary_speed : speed below which an encoder measures none
     steered : names of the wheels that steer into the direction of motion of their contact points
     unstated_latency : age of a sample at its utime, s
-    encoder : faults of the encoders
+    encoder : makes the encoder of a wheel by model, name, the noise that the wheels share, and the run
     """
 
     timing: Timing = _TIMING
@@ -73,60 +80,12 @@ class WheelsModel:
     stationary_speed: float = 0.02
     steered: frozenset[str] = frozenset()
     unstated_latency: float = 0.0
-    encoder: EncoderModel = field(default_factory=EncoderModel)
+    encoder: Callable[[WheelsModel, str, NoiseSource, Run], Encoder] = Encoder
 
     @classmethod
     def noise_free(cls, timing: Timing = _PROMPT, steered: frozenset[str] = frozenset()) -> WheelsModel:
         """Return encoders without error."""
         return cls(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
-
-
-class Encoder:
-    """One simulated encoder; each call of `sample` follows the last."""
-
-    def __init__(self, model: WheelsModel, name: str, noise: NoiseSource, faults: NoiseSource):
-        """Draw the errors of a wheel's encoder; `noise` is shared by the wheels, `faults` is the wheel's own."""
-        self._model, self._faulty = model, model.encoder
-        self._name = name
-        self._scale = 1.0 + noise.normal(model.scale_sigma)
-        self._noise, self._faults = noise, faults.generator
-        self._stuck_from = min((t for wheel, t in self._faulty.stuck if wheel == name), default=math.inf)
-        self._sign = -1.0 if name in self._faulty.swapped else 1.0
-        self._rotated = 0.0
-        rate = self._faulty.burst_rate
-        self._burst = self._faults.exponential(1.0 / rate) if rate else math.inf
-
-    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
-        """Return the encoder's sample at `t` seconds.
-
-        `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
-        """
-        model, faulty = self._model, self._faulty
-        seen = self._scale * excess
-        if self._is_spinning(t):
-            seen *= 1.0 + faulty.burst_excess
-        error = self._noise.normal(model.speed_sigma) if abs(speed) > model.stationary_speed else 0.0
-        measured = speed * seen + error
-        if t >= self._stuck_from:
-            measured = speed = 0.0
-        else:
-            self._rotated += rolled * seen
-        sign = self._sign
-        return WheelSample(
-            self._name,
-            travel=sign * quantize(self._rotated, model.travel_step),
-            travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4),
-            speed=sign * measured,
-            speed_sigma=max(model.speed_sigma, 1e-4),
-            direction=_direction(sign * speed, model.stationary_speed),
-            steering=steering,
-        )
-
-    def _is_spinning(self, t: float) -> bool:
-        faulty = self._faulty
-        while t >= self._burst + faulty.burst_seconds:
-            self._burst += faulty.burst_seconds + self._faults.exponential(1.0 / faulty.burst_rate)
-        return t >= self._burst
 
 
 def _direction(speed: float, stationary_speed: float) -> Direction:
@@ -138,7 +97,7 @@ def _direction(speed: float, stationary_speed: float) -> Direction:
 def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3]) -> Iterator[WheelsSample]:
     """Yield samples without end. `contacts` has each wheel's contact point in the vehicle's moving frame, meters."""
     noise = run.noise("wheels/wheels")
-    encoders = {name: Encoder(model, name, noise, run.noise(f"wheels/wheels/{name}")) for name in contacts}
+    encoders = {name: model.encoder(model, name, noise, run) for name in contacts}
     noise.prefetch()
     rolling = _WheelOdometry(model, run.drive, contacts)
     for header, t in run.generate_headers(model.timing, "wheels/wheels"):

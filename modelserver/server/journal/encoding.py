@@ -113,7 +113,8 @@ def _get_layout(cls: type) -> _Layout:
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
         hints |= inspect.get_annotations(base)
-    slots = [slot for base in cls.__mro__ for slot in _to_tuple(base.__dict__.get("__slots__", ()))]
+    named = [vars(base).get("__slots__", ()) for base in cls.__mro__]
+    slots = [slot for each in named for slot in ((each,) if isinstance(each, str) else each)]
     build: Callable[[list[Any]], Any] = getattr(cls, "_make", lambda values: cls(*values))
     is_constructed = False
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
@@ -131,10 +132,6 @@ def _get_layout(cls: type) -> _Layout:
     text = "\n".join(f"{name}: {_format_hint(hints[name])}" for name in fields)
     get = attrgetter(*fields) if len(fields) > 1 else lambda value: [getattr(value, name) for name in fields]
     return _Layout(cls, text, fields, get, build, is_constructed)
-
-
-def _to_tuple(slots: str | Sequence[str]) -> Sequence[str]:
-    return (slots,) if isinstance(slots, str) else slots
 
 
 def _format_hint(hint: Any) -> str:
@@ -492,8 +489,3 @@ def decode_run(data: bytes) -> RunState:
 def encode_event(event: Event | ModelLoaded, pause: Callable[[], object] = lambda: None) -> bytes:
     """Encode an internal event. Raises EncodingError."""
     return encode_value(event, pause, is_described=False)
-
-
-def decode_event(data: bytes) -> Any:
-    """Decode an internal event. Raises RecordingError."""
-    return decode_value(data)

@@ -8,17 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.rough_simulation import EncoderModel, TriadModel
 from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import Direction, OrientationReference, YawSource
 from modelserver.simulation import (
     DrivePhase,
-    EncoderModel,
     GpsModel,
     ImuModel,
     MagnetometerModel,
     Timing,
     Trajectory,
-    TriadModel,
     WheelsModel,
     straight,
 )
