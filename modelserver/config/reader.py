@@ -83,7 +83,6 @@ def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
 
 
 def get_value(values: Any, at: Path_) -> Any:
-    """Return the value at a path; None if there is none."""
     for step in at:
         values = values.get(step) if isinstance(values, dict) else None
     return values

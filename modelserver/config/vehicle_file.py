@@ -268,7 +268,6 @@ class SensorsConfig:
 
     @property
     def steering(self) -> SteeringConfig | None:
-        """Source of the steering angle; None without one beside the wheels."""
         return self.wheels.steering if self.wheels is not None else None
 
 
@@ -310,7 +309,6 @@ class LocalizationConfig:
 
     @property
     def initial_mode(self) -> Mode:
-        """The mode from the start, as the core represents it."""
         return Mode[self.mode.upper()]
 
 
@@ -380,7 +378,6 @@ class CommandsConfig:
 
     @property
     def is_drive_signed(self) -> bool:
-        """Whether commands to the vehicle controller must be signed."""
         return self.drive == "signed" or (self.drive == "auto" and bool(self.key_file))
 
 

@@ -125,7 +125,6 @@ def reply_overloaded(state: CoreState, request: messages.Request, now: Instant) 
 
 
 def reply_internal_error(state: CoreState, request: messages.Request, now: Instant) -> Outputs:
-    """Reply to a request whose handling raised an exception in the server."""
     message = "internal error of the server; its log has the traceback"
     return reply_error(state, type(request), request.header, Status.INTERNAL, message, now)
 
@@ -173,7 +172,6 @@ WARM_START: Final = "warm_start"
 
 
 def process_sample(state: CoreState, sample: messages.Sample, now: Instant) -> StepResult:
-    """Process a sample of a sensor."""
     header = sample.header
     source = f"sensor:{header.source}"
     state = check_host_clock(state, now, count_message(state.traffic, source, header.host_utime, now))
@@ -207,7 +205,6 @@ def check_host_clock(state: CoreState, now: Instant, traffic: Mapping[str, Sourc
 
 
 def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant) -> StepResult:
-    """Process positions of joints."""
     joints, rejected = state.view.joints.update(sample, now.utime)
     for reason, count in Counter(rejected).items():
         state = count_rejection(state, f"sensor:{sample.header.source}", reason, count)
@@ -221,7 +218,6 @@ def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant
 
 
 def switch_mode(state: CoreState, command: messages.SwitchMode, now: Instant) -> StepResult:
-    """Switch the localization mode."""
     source = f"command:{command.header.source}"
     state = state._replace(traffic=count_message(state.traffic, source, command.header.host_utime, now))
     if command.header.utime > now.utime + COMMAND_FUTURE_LIMIT_S * 1e6:
@@ -282,7 +278,6 @@ def update_localizer(
 
 
 def report_start(state: CoreState, decision: messages.Decision, now: Instant) -> StepResult:
-    """Report what became of the persisted state of an earlier run."""
     if now.monotonic_ns - state.started_ns <= START_REPORT_NS:
         state, _ = handle_warning(state, messages.HealthWarning(START, decision.reason), now)
     return state, (messages.ReportStart(decision.reason),)
@@ -312,7 +307,6 @@ MAX_TICK_LATENCIES: Final = 512
 
 
 def handle_tick(state: CoreState, tick: messages.Tick, now: Instant) -> StepResult:
-    """Do what is due by the clock."""
     outputs: list[messages.Output] = []
     settings, before = state.settings, state.ticks
     state = check_host_clock(state, now, state.traffic)

@@ -117,7 +117,6 @@ def _is_silent(name: str, traffic: SourceTraffic, now: Instant) -> bool:
 
 
 def _update_rates(state: CoreState, now: Instant) -> CoreState:
-    """Compute rates and delays of the period that ends now, and start the next one."""
     elapsed = (now.monotonic_ns - state.health_sent_ns) * 1e-9 if state.health_sent_ns else 0.0
 
     def start_period(each: SourceTraffic) -> SourceTraffic:

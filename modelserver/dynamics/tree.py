@@ -84,7 +84,6 @@ class Tree(NamedTuple):
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The bodies without mass."""
         return tuple(name for name, link in self.links.items() if link.inertia is None)
 
 

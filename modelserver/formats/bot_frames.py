@@ -75,7 +75,6 @@ class ParamBlock:
 
 
 def is_bot_param(content: bytes) -> bool:
-    """Return whether a file is probably a libbot2 parameter file with coordinate frames."""
     return _BEGIN.match(content) is not None and _FRAMES_BLOCK.search(content) is not None
 
 
@@ -148,7 +147,6 @@ class _ParamParser:
                 raise SyntaxProblemError(f"expected = or {{ after {quote(text)}, got {quote(mark[1])}", line, fix)
 
     def parse_value(self, name: str, line: int) -> ParamValue:
-        """Parse the right side of an assignment, including its semicolon."""
         token = self.next_token()
         if token[0] == "cast":
             token = self.next_token()
@@ -186,7 +184,6 @@ _CHANNEL_KEYS = ("update_channel", "pose_update_channel")
 
 
 def load(content: bytes, builder: ModelBuilder, file: str) -> None:
-    """Add the frames of a parameter file, and their problems, to `builder`."""
     root = parse_param_file(content, builder, file)
     if root is not None:
         _BotFramesReader(builder, file).read(root)
@@ -343,7 +340,6 @@ class _BotFramesReader(ElementReader):
             self.frames[name] = _BotFrame(name, parent.texts[0], pose, driven, at.locate(), parent_source)
 
     def check_parents(self, top: str) -> bool:
-        """Report missing parents and cycles; return whether there are none."""
         missing = [each for each in self.frames.values() if each.parent != top and each.parent not in self.frames]
         for number, frame in enumerate(missing):
             near = Suggestion()
@@ -361,7 +357,6 @@ class _BotFramesReader(ElementReader):
         return not self.has_errors
 
     def add_to_model(self, top: str, block: ParamBlock) -> None:
-        """Add the frames as bodies, root first, and their constraints."""
         sources = {top: Location(self.file, block.line, f"frame {label(top)}")}
         sources |= {name: frame.source for name, frame in self.frames.items()}
         bodies = {

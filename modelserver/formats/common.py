@@ -83,7 +83,6 @@ class ElementReader:
         self.place = place
 
     def line_of(self, key: str) -> int:
-        """Return the line of a named value; 0 if it is absent."""
         return 0
 
     def locate(self, at: int | str = 0) -> Location:
@@ -239,7 +238,6 @@ def format_number(value: float) -> str:
 
 
 def escape(value: str) -> str:
-    """Escape a text for an XML attribute."""
     return saxutils.escape(value, {'"': "&quot;"})
 
 
@@ -306,7 +304,6 @@ LARGEST_ANGLE: Final = math.tau + 0.01
 
 
 def is_far(position: Iterable[float]) -> bool:
-    """Return whether a position, m, was hardly meant in meters."""
     return math.hypot(*position) > FARTHEST
 
 

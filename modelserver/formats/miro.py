@@ -106,12 +106,10 @@ _CONTAINERS = ("config", "section", "parameter", "instance")
 
 
 def load(root: Element, builder: ModelBuilder, file: str) -> None:
-    """Add the bodies and constraints below `root`, and their problems, to `builder`."""
     _MiroReader(builder, file).scan(root)
 
 
 def has_bodies(root: Element) -> bool:
-    """Return whether there is a BodyName or a ConstraintName below `root`."""
     return any(get_name(each) in ("BodyName", "ConstraintName") for each in root.iter("{*}parameter"))
 
 
@@ -443,7 +441,6 @@ class _FrameTreeReader(ElementReader):
             self.report_duplicate(first, frame)
 
     def report_duplicate(self, first: _FrameInstance, second: _FrameInstance) -> None:
-        """Report a second frame of a name in the same parent."""
         moved, turned = first.pose.distance(second.pose)
         lines = f"on line {first.source.line} and on line {second.source.line}"
         message = (
@@ -499,7 +496,6 @@ class _FrameTreeReader(ElementReader):
         return filled.strip()
 
     def report_variables(self) -> None:
-        """Report each undefined variable once, at its first use."""
         for name, places in self.undefined.items():
             uses = f" (used {len(places)} times)" if len(places) > 1 else ""
             self.builder.add_warning(
@@ -525,7 +521,6 @@ class _FrameTreeReader(ElementReader):
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether more than `MAX_STEPS` levels were visited."""
         return self.steps > MAX_STEPS
 
     def match(self, path: FramePath, above: list[str]) -> bool:
@@ -646,7 +641,6 @@ class _FrameTreeReader(ElementReader):
         return self.match(path, above) or self.is_exhausted
 
     def report_missing(self, missing: list[str]) -> None:
-        """Report missing parents, each with a suggestion if it is unambiguous."""
         meant: dict[FramePath, str] = {}
         for key in missing:
             frame = self.frames[key]
@@ -685,7 +679,6 @@ class _FrameTreeReader(ElementReader):
         return ("/" if found.is_absolute else "") + "/".join(parts)
 
     def has_no_cycles(self) -> bool:
-        """Report cycles of parents; return whether there are none."""
         is_tree = True
         for cycle in find_cycles(self.frames, lambda key: self.parents.get(key) or None):
             is_tree = False
@@ -697,7 +690,6 @@ class _FrameTreeReader(ElementReader):
         return is_tree
 
     def add_bodies(self) -> None:
-        """Add the bodies, frames and constraints; see the module's description."""
         self.remove_duplicates()
         inner = {parent for parent in self.parents.values() if parent}
         roots = [key for key in self.frames if not self.parents[key]]

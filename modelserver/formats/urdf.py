@@ -77,7 +77,6 @@ _JOINT_ELEMENTS = ("origin", "parent", "child", "axis", "limit", "mimic")
 
 
 def load(root: Element, builder: ModelBuilder, file: str) -> None:
-    """Add the links and joints below `root`, and their problems, to `builder`."""
     reader = _UrdfReader(UrdfElement(builder, file, root))
     if not reader.has_macros():
         reader.read()
@@ -150,7 +149,6 @@ class _UrdfReader:
             self.add_joints(bodies)
 
     def reject(self, at: UrdfElement, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Report an error in the tree of links and joints."""
         at.error(message, fix, nearest=nearest)
         self.has_errors = True
 
@@ -177,7 +175,6 @@ class _UrdfReader:
         self.joints[at.name] = _ParsedJoint(at.name, parent, child, pose, joint, at)
 
     def read_end(self, at: UrdfElement, parts: dict[str, UrdfElement], key: str) -> str | None:
-        """Read the link that a joint names as its parent or child."""
         if key not in parts:
             at.error(f"<{key}> is missing", f'add <{key} link="..."/>')
             return None
@@ -247,7 +244,6 @@ class _UrdfReader:
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=at.locate())
 
     def read_motion(self, at: UrdfElement, parts: dict[str, UrdfElement]) -> Joint | None:
-        """Read the motion of a joint; None, with an error, if it is wrong."""
         name = at.read_text("type", f"add type, one of {', '.join(_JOINT_TYPES)}")
         if name is None:
             return None
@@ -348,7 +344,6 @@ class UrdfElement(ElementReader):
         return (self.enter(child, self.place) for child in iterate_children(self.element))
 
     def get(self, key: str) -> str:
-        """Return the trimmed text of an attribute, empty for none."""
         return (self.element.get(key) or "").strip()
 
     def warn_unknown(self, known: tuple[str, ...]) -> bool:
@@ -609,7 +604,6 @@ def save(model: Model) -> SavedModel:
 
 
 def list_link_names(model: Model) -> dict[str, str]:
-    """Return the link in the file for each written frame of `model`, by full name."""
     return _UrdfWriter(model).link_names
 
 
@@ -722,7 +716,6 @@ class _UrdfWriter:
         self.joints.append(_WrittenJoint(name, parent, child, pose))
 
     def list_unsupported(self) -> Iterator[str]:
-        """Yield the features that are dropped, and the frames that become links."""
         model = self.model
         yield from list_text_and_sigma_features(model)
         if odd := [each.name for each in model.bodies if each.inertia is not None and each.rigid_inertia is None]:

@@ -115,7 +115,6 @@ def get_tag(element: Element) -> str:
 
 
 def get_name(element: Element) -> str:
-    """Return the attribute `name` of an element, empty for none."""
     return (element.get("name") or "").strip()
 
 

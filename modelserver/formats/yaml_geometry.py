@@ -621,7 +621,6 @@ _SETTINGS: Final[dict[str, Callable[[Any], Any]]] = {
 
 
 def encode_snapshot(snapshot: ModelSnapshot) -> bytes:
-    """Encode a snapshot as a zlib stream of JSON."""
     content = {key: getattr(snapshot, key) for key in _SETTINGS}
     content |= {"revision": snapshot.model.revision, "geometry": save(snapshot.model, exact=True).text}
     return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)

@@ -121,7 +121,6 @@ class ModelBuilder:
 
     @property
     def is_empty(self) -> bool:
-        """Whether neither a body nor a constraint was added."""
         return not self.bodies and not self.constraints
 
     def add_body(
@@ -212,7 +211,6 @@ class ModelBuilder:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """The names of all constraints, also of those with errors."""
         return tuple(constraint.name for constraint, _ in self.constraints)
 
     def build(self, repair: bool = False) -> Model:
@@ -277,7 +275,6 @@ class _ModelReview:
         return False
 
     def check_bodies(self) -> dict[str, Body]:
-        """Return the bodies by name, each with its well-formed frames."""
         valid: dict[str, Body] = {}
         fix = "rename one; to duplicate a device, give the copy a name of its own"
         for draft in self.draft.bodies:

@@ -77,7 +77,6 @@ MAX_LISTED = 12
 
 
 def format_first_location(place: Location) -> str:
-    """Return the location of the first of two definitions, for a message about the second."""
     return f" (first at {place})" if str(place) else ""
 
 

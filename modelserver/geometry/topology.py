@@ -362,7 +362,6 @@ class LoopMisclosure(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """Whether it closes within rounding."""
         return self.meters < EXACT_TOLERANCE and self.radians < EXACT_TOLERANCE
 
 

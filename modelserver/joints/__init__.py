@@ -83,7 +83,6 @@ class JointHistory:
         return tuple(self._coordinates)
 
     def coordinate(self, name: str) -> Coordinate:
-        """Return the coordinate of a name. Raises KeyError."""
         return self._coordinates[name]
 
     def update(self, sample: JointsSample, now: int) -> tuple[JointHistory, tuple[str, ...]]:

@@ -203,7 +203,6 @@ class JointTrack:
         return twin
 
     def is_too_old(self, utime: int) -> bool:
-        """Return whether a reading of this time is too old to be stored."""
         if not self._count:
             return False
         return self.last - utime > self._horizon or (self._count >= MAX_READINGS and utime < self.first)
@@ -287,7 +286,6 @@ class JointTrack:
         return number, bisect_right(self._blocks[number].times, utime, 0 if number else self._start, end) - 1
 
     def _after(self, number: int, index: int) -> tuple[int, int]:
-        """Return block and index of the next reading."""
         return (number, index + 1) if index + 1 < self._get_length(number) else (number + 1, 0)
 
     @property

@@ -95,7 +95,6 @@ def effort_of(request: messages.Request) -> float:
 
 
 def is_deferred(request: messages.Request) -> bool:
-    """Return whether the answer to a request may take long, so that it is computed in steps."""
     return type(request) in _LONG and effort_of(request) > DEFERRED_EFFORT
 
 

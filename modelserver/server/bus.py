@@ -121,7 +121,6 @@ class ReceiverInbox:
 
     @property
     def is_queueing(self) -> bool:
-        """Whether messages wait in the queue."""
         return bool(self._queue)
 
     def subscribe(self, channel: str, handler: Handler) -> None:
@@ -251,11 +250,9 @@ class FakeInbox:
         self._queue: deque[tuple[str, bytes, Sender]] = deque()
 
     def subscribe(self, channel: str, handler: Handler) -> None:
-        """Call `handler` with every message of exactly `channel`."""
         self._handlers.setdefault(channel, []).append(handler)
 
     def put(self, channel: str, data: bytes, sender: Sender = None) -> None:
-        """Queue a message for the subscribers of its channel."""
         if channel in self._handlers:
             self._queue.append((channel, data, sender))
 
@@ -276,7 +273,6 @@ class FakeInbox:
 
     @property
     def pending(self) -> int:
-        """Messages that wait to be drained."""
         return len(self._queue)
 
 

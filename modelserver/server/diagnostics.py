@@ -80,7 +80,6 @@ class Diagnosis:
 
 
 def get_worst_level(findings: Iterable[Diagnosis]) -> DiagnosisLevel:
-    """Return the highest level among findings; OK without any."""
     return max((each.level for each in findings), default=DiagnosisLevel.OK)
 
 
@@ -421,11 +420,9 @@ class DuplicateServerMonitor:
         self._warning = ""
 
     def subscribe(self, inbox: Inbox, prefix: str) -> None:
-        """Subscribe to the channel of the own health reports."""
         inbox.subscribe(f"{prefix}MODELSERVER_HEALTH", self.on_health)
 
     def on_health(self, channel: str, data: bytes, sender: Sender = None) -> None:
-        """Process a health report, the own one or another server's."""
         now = self._clock.monotonic_ns()
         if now - self._window_ns >= 1_000_000_000:
             self._window_ns, self._reports = now, 0

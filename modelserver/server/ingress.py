@@ -301,7 +301,6 @@ class PublisherConflictDetector:
         return self._set_conflict(header.source, now_ns)
 
     def _may_be_restarted(self, now_ns: int) -> bool:
-        """Return whether the owner has been silent for so long that its source was restarted."""
         return now_ns - self._last_ns > max(RESTART_GAP_NS, RESTART_GAP_INTERVALS * self._interval_ns)
 
     def _wins_contest(self, second: object, now_ns: int) -> bool:
@@ -369,7 +368,6 @@ class PublisherConflictMonitor:
         self._active: dict[str, PublisherConflictDetector] = {}
 
     def make_detector(self, channel: str) -> PublisherConflictDetector:
-        """Return a detector for a channel, which prefers the sources that the vehicle file names for it."""
         return PublisherConflictDetector(self._names.get(channel, ()))
 
     def is_ignored(

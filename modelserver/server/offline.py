@@ -161,7 +161,6 @@ class OfflineRun:
 
     @property
     def localizer(self) -> Localizer | None:
-        """The localizer after the events read so far; None before the first."""
         return None if self._state is None else self._state.localizer
 
     def _estimate_row(self, utime: int) -> TrackRow:

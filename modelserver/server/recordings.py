@@ -135,5 +135,4 @@ class Player:
 
     @property
     def duration(self) -> float:
-        """Seconds of the recording between the first and the last published message."""
         return (self.last_utime - self.first_utime) * 1e-6

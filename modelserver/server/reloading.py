@@ -81,7 +81,6 @@ class GeometryReader:
         return data if known is model else self._vehicle.encode_snapshot(model)
 
     def close(self) -> None:
-        """End a reading in progress."""
         if self._process is not None:
             self._process.kill()
 

@@ -88,12 +88,10 @@ class Notifier:
 
     @classmethod
     def from_environment(cls) -> Notifier:
-        """Make the notifier that the environment of this process asks for."""
         return cls(open_manager_socket(), get_watchdog_ns())
 
     @property
     def is_active(self) -> bool:
-        """Whether there is a service manager."""
         return self._send is not None
 
     def send(self, *lines: str) -> None:
@@ -136,7 +134,6 @@ class Notifier:
         self._status_due_ns = 0
 
     def notify_stopping(self) -> None:
-        """Report that the service stops."""
         self.send("STOPPING=1", "STATUS=stopping")
 
     def _set_status(self, status: str) -> None:
@@ -145,7 +142,6 @@ class Notifier:
 
 
 def _truncate(text: str) -> str:
-    """Escape and truncate a text to a status line."""
     text = escape_text(text)
     return text if len(text) <= MAX_STATUS_LENGTH else f"{text[: MAX_STATUS_LENGTH - 3]}..."
 

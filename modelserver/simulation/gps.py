@@ -69,7 +69,6 @@ class GpsModel:
 
     @classmethod
     def noise_free(cls, timing: Timing = _PROMPT) -> GpsModel:
-        """Return a receiver without error."""
         return cls(timing, correlated_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0, baseline_sigma=0.0)
 
 

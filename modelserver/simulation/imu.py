@@ -64,7 +64,6 @@ class MagnetometerModel:
     disturbances: tuple[tuple[float, float, Vector3], ...] = ()
 
     def ambient_field(self, t: float) -> Vector3:
-        """Return the field around the vehicle along east, north, up at `t` seconds."""
         return so3.add(self.field, *(field for begin, end, field in self.disturbances if begin <= t < end))
 
     def measure(self, t: float, q_SE: Quaternion, noise: NoiseSource) -> Vector3:
@@ -95,8 +94,8 @@ _TIMING = Timing(100.0, latency=0.004, jitter=0.001)
 _PROMPT = Timing(100.0)
 
 TriadErrors = Callable[[float, NoiseSource], Callable[[Vector3, float], Vector3]]
-"""Draws the errors of three gyros or accelerometers that give `rate_hz` samples a second; the result returns the
-measured vector for a true one at the vehicle's speed, m/s."""
+"""Draws the errors (misalignment, vibration and so on) of three gyros or accelerometers that give `rate_hz` samples a
+second; the result returns the measured vector for a true one at the vehicle's speed, m/s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,6 @@ class NoiseSource:
             yield from self._random.standard_normal(_BLOCK).tolist()
 
     def normal(self, sigma: float = 1.0) -> float:
-        """Return a normal number of standard deviation `sigma`."""
         if self._prefetched is not None:
             return sigma * next(self._prefetched)
         return sigma * float(self._random.standard_normal())
@@ -79,7 +78,6 @@ class GaussMarkov:
         self.value = noise.normal(sigma)
 
     def step(self, dt: float) -> float:
-        """Return the value `dt` seconds later."""
         if dt != self._dt:
             keep = math.exp(-dt / self.time_constant)
             self._dt, self._decay, self._driving_sigma = dt, keep, self.sigma * math.sqrt(1.0 - keep * keep)
@@ -133,7 +131,6 @@ class Run:
     seed: int
 
     def noise(self, name: str) -> NoiseSource:
-        """Return the random generator of a name, by the run's seed."""
         return NoiseSource(self.seed, name)
 
     def generate_headers(

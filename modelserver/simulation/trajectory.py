@@ -87,7 +87,6 @@ class TrajectoryMotion(NamedTuple):
     attitude: Attitude | None = None
 
     def orientation(self) -> Quaternion:
-        """Return the quaternion that rotates the vehicle's axes to east, north, up."""
         if self.attitude is not None:
             return self.attitude.wxyz
         half = self.yaw / 2.0
@@ -170,7 +169,6 @@ class Trajectory:
         """Of the phases so far: each follows from the one before it, and a device needs only those until now."""
 
     def at(self, t: float) -> TrajectoryMotion:
-        """Return the motion `t` seconds after the start."""
         piece, u = self._locate(t)
         return piece.at(u)
 

@@ -84,7 +84,6 @@ class WheelsModel:
 
     @classmethod
     def noise_free(cls, timing: Timing = _PROMPT, steered: frozenset[str] = frozenset()) -> WheelsModel:
-        """Return encoders without error."""
         return cls(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
 
 

@@ -146,7 +146,6 @@ class LogFile:
         return self.read_from(0)
 
     def read_from(self, offset: int) -> Iterator[LogEvent]:
-        """Yield the events from an offset on, such as the `end` of one."""
         self.damage.clear()
         for each in scan(self._data, offset):
             if isinstance(each, LogEvent):

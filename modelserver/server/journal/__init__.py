@@ -90,7 +90,6 @@ class JournalQueue:
         self._put(RecordKind.PUBLISHED, self._last, channel, data)
 
     def poll_warnings(self) -> Sequence[HealthWarning]:
-        """Return the warnings about the journal since the last call, usually none."""
         return [self._warnings.popleft() for _ in range(len(self._warnings))]
 
     def _put(self, kind: RecordKind, now: Instant, channel: str, data: bytes, event: object = None) -> None:
@@ -107,7 +106,6 @@ class JournalQueue:
     # --- called by the writer's thread ---
 
     def pop(self, max_count: int) -> list[JournalEntry]:
-        """Remove and return the oldest records."""
         entries = self._entries
         popped = [entries.popleft() for _ in range(min(max_count, len(entries)))]
         self._popped_bytes += sum(len(entry.data) for entry in popped)

@@ -235,7 +235,6 @@ class _Writer:
         return number
 
     def _flush(self) -> None:
-        """Write the tokens as a block."""
         tokens = self._tokens
         if not tokens:
             return
@@ -258,7 +257,6 @@ def _split_token(token: Any) -> tuple[Any, ...]:
 
 
 def _list_installed() -> frozenset[str]:
-    """Return the packages of the installed measurements."""
     return frozenset(each.__module__.partition(".")[0] for each in REGISTRY.values()) - {"modelserver"}
 
 
@@ -487,5 +485,4 @@ def decode_run(data: bytes) -> RunState:
 
 
 def encode_event(event: Event | ModelLoaded, pause: Callable[[], object] = lambda: None) -> bytes:
-    """Encode an internal event. Raises EncodingError."""
     return encode_value(event, pause, is_described=False)

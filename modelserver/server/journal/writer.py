@@ -83,7 +83,6 @@ def collect_facts() -> Mapping[str, str]:
 
 
 def _read_version(name: str) -> str:
-    """Return the version of an installed package; empty for none."""
     try:
         return version(name)
     except PackageNotFoundError:
@@ -118,12 +117,10 @@ LOCK_NAME: Final = "lock"
 
 
 def list_segments(directory: Path) -> list[Path]:
-    """List the segments in a directory, the oldest first. Raises OSError."""
     return sorted(path for path in directory.iterdir() if SEGMENT_NAME.fullmatch(path.name))
 
 
 def get_number(path: Path) -> int | None:
-    """Return the number in the name of a segment; None for another name."""
     match = SEGMENT_NAME.fullmatch(path.name)
     return int(match[1]) if match else None
 
@@ -183,7 +180,6 @@ class Ring:
         self._lock = FileLock(directory / LOCK_NAME)
 
     def acquire(self) -> None:
-        """Acquire the directory for this writer."""
         create_directory(self.directory)
         self._lock.acquire()
 
@@ -386,7 +382,6 @@ class JournalWriter:
         self.finish()
 
     def finish(self) -> None:
-        """Write the rest and close the segment."""
         with contextlib.suppress(Exception):
             self.run_once()
             self._end_segment()
@@ -562,7 +557,6 @@ def get_journal_directory(config: VehicleConfig, systemd_directory: str | None =
 
 
 def get_max_bytes(config: VehicleConfig) -> int:
-    """Return the size limit of a vehicle's journal, bytes."""
     return (config.journal.megabytes or DEFAULT_MEGABYTES) << 20
 
 
