@@ -58,15 +58,10 @@ def read_partly(
     return found, tuple(sorted(reader.problems, key=lambda each: each.line))
 
 
-_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
-
-
-def get_adapter(schema: type[S]) -> TypeAdapter[S]:
+@cache
+def get_adapter(schema: type) -> TypeAdapter[Any]:
     """Return pydantic's validator of a dataclass, cached: building one takes a hundred times as long as using it."""
-    found = _ADAPTERS.get(schema)
-    if found is None:
-        found = _ADAPTERS[schema] = TypeAdapter(schema)
-    return found
+    return TypeAdapter(schema)
 
 
 def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
@@ -282,9 +277,7 @@ def list_known_keys(schema: Any, at: Path_) -> list[str]:
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
 
 
-@cache
-def _get_type_hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+_get_type_hints = cache(get_type_hints)
 
 
 def make_error(name: str, line: int, message: str, fix: str) -> ConfigError:

@@ -134,10 +134,9 @@ def handle_denied(state: CoreState, command: messages.Denied, now: Instant) -> S
     state = count_rejection(state, command.channel, command.reason)
     if command.request_type is None or command.header is None:
         return state, ()
+    status, why = Status.FORBIDDEN, f"the command is denied: {command.message}"
     if command.is_malformed:
         status, why = Status.MALFORMED, command.message
-    else:
-        status, why = Status.FORBIDDEN, f"the command is denied: {command.message}"
     return state, reply_error(state, command.request_type, command.header, status, why, now)
 
 
@@ -210,10 +209,7 @@ def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant
         state = count_rejection(state, f"sensor:{sample.header.source}", reason, count)
     if joints is state.view.joints:
         return state, ()
-    state = state._replace(view=state.view._replace(joints=joints))
-    if not state.waiting:
-        return state, ()
-    state, replies = answer_waiting(state, now)
+    state, replies = answer_waiting(state._replace(view=state.view._replace(joints=joints)), now)
     return state, tuple(replies)
 
 

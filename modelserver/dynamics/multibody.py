@@ -343,7 +343,10 @@ class Dynamics:
     ) -> Generator[None, None, Array | None]:
         """Return in steps what `center_covariance` does: with many bodies it takes milliseconds."""
         q, sigmas = self._read(q, "q"), self.by_name(self._read(sigma, "sigma"))
-        positions = {each.name: self._position_of(each, q) for each in self.tree.joints}
+        positions = {
+            each.name: tuple((each.multiplier * q[list(each.columns)] + each.offset).tolist())
+            for each in self.tree.joints
+        }
         return iterate_center_covariance(
             self.model, self.tree, frame, positions, sigmas, self.uncertainty, is_frame_exact
         )
@@ -421,10 +424,6 @@ class Dynamics:
                 f"{format_names(self.coordinates)}"
             )
         return found
-
-    def _position_of(self, joint: TreeJoint, q: Array) -> tuple[float, ...]:
-        values = q[list(joint.columns)].tolist()
-        return tuple([joint.multiplier * value + joint.offset for value in values])
 
     def _configure(self, values: Values) -> tuple[Array, Array, list[_Turn]]:
         """Return the coordinates (n,), Pinocchio's configuration, and the blocks of S."""

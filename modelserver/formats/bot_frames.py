@@ -78,18 +78,6 @@ def is_bot_param(content: bytes) -> bool:
     return _BEGIN.match(content) is not None and _FRAMES_BLOCK.search(content) is not None
 
 
-def parse_param_file(content: bytes, builder: ModelBuilder, file: str) -> ParamBlock | None:
-    """Parse a file into one block; None, with an error in `builder`, for a syntax error."""
-    try:
-        return _ParamParser(content.decode("utf-8-sig")).parse()
-    except UnicodeDecodeError as error:
-        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
-        builder.add_error(message, Location(file, content.count(b"\n", 0, error.start) + 1), "save it as UTF-8")
-    except SyntaxProblemError as error:
-        builder.add_error(str(error), Location(file, error.line), error.fix)
-    return None
-
-
 class _ParamParser:
     def __init__(self, text: str):
         self.text = text
@@ -184,9 +172,13 @@ _CHANNEL_KEYS = ("update_channel", "pose_update_channel")
 
 
 def load(content: bytes, builder: ModelBuilder, file: str) -> None:
-    root = parse_param_file(content, builder, file)
-    if root is not None:
-        _BotFramesReader(builder, file).read(root)
+    try:
+        _BotFramesReader(builder, file).read(_ParamParser(content.decode("utf-8-sig")).parse())
+    except UnicodeDecodeError as error:
+        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
+        builder.add_error(message, Location(file, content.count(b"\n", 0, error.start) + 1), "save it as UTF-8")
+    except SyntaxProblemError as error:
+        builder.add_error(str(error), Location(file, error.line), error.fix)
 
 
 class _BlockReader(ElementReader):
@@ -366,14 +358,10 @@ class _BotFramesReader(ElementReader):
         for name, frame in self.frames.items():
             mount = name if name != ORIGIN else f"{ORIGIN}_"
             bodies[frame.parent].add_frame(mount, source=frame.source)
-            pose = Pose.identity() if frame.is_driven else frame.pose
-            joint = _make_floating_joint(frame.pose) if frame.is_driven else FIXED
+            pose, joint = frame.pose, FIXED
+            if frame.is_driven:
+                # the coordinates are the whole transform
+                rest = () if pose == Pose.identity() else (*pose.xyz, *so3.logarithm(pose.wxyz))
+                pose, joint = Pose.identity(), Joint(JointType.FLOATING, default=rest)
             ends = (names.join(frame.parent, mount), names.join(name, ORIGIN))
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=frame.source)
-
-
-def _make_floating_joint(rest: Pose) -> Joint:
-    """Return a joint whose coordinates are the whole transform of a frame, by default `rest`."""
-    if rest == Pose.identity():
-        return Joint(JointType.FLOATING)
-    return Joint(JointType.FLOATING, default=(*rest.xyz, *so3.logarithm(rest.wxyz)))

@@ -685,9 +685,9 @@ class _UrdfWriter:
             return
         full = self.find_intermediate_frame(body)
         last = self.link_names[full] if full else body
-        joint = (
-            each.joint if each.name in self.mimicked_joints or each.joint.mimic is None else _remove_mimic(each.joint)
-        )
+        joint = each.joint
+        if each.name not in self.mimicked_joints:
+            joint = Joint(joint.type, joint.axis, joint.lower, joint.upper, joint.rate_limit)
         if crossing.forward:
             self.joints.append(_WrittenJoint(each.name, parent, last, mount @ each.pose, joint))
         else:
@@ -752,10 +752,6 @@ def _is_movable_in_urdf(crossing: Crossing) -> bool:
     if kind in (JointType.PLANAR, JointType.FLOATING):
         return crossing.forward
     return kind is not JointType.SPHERICAL
-
-
-def _remove_mimic(joint: Joint) -> Joint:
-    return Joint(joint.type, joint.axis, joint.lower, joint.upper, joint.rate_limit)
 
 
 def _format_joint(written: _WrittenJoint) -> Iterator[str]:

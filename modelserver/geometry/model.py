@@ -167,22 +167,21 @@ class Model:
         """
         known = [each.name for each in self.constraints_of(frame)]
         name = full_name(frame)
-        body, root = name.partition(":")[0], self.root.name
+        body, root, source = name.partition(":")[0], self.root.name, Location(element=f"frame {name}")
         problems = []
         if not isinstance(frame, str) and self.frame(name) != frame:
             message = "the model's frame of this name differs from this one"
             fix = "take the frame from this model, or build a model with this frame in it"
-            problems.append((Severity.ERROR, message, fix))
+            problems.append(Problem(Severity.ERROR, message, source, fix))
         if body not in self.assemblies[0]:
             message = f"body {body} is an orphan: no constraints lead to the root body {root}"
             fix = f"add a constraint that joins it to {root} or to what is mounted there"
-            problems.append((Severity.WARNING, message, fix))
+            problems.append(Problem(Severity.WARNING, message, source, fix))
         if len(known) > 1:
             message = f"the frame has {len(known)} constraints, {format_names(known)}; a strict model allows one"
             fix = "give each constraint a frame of its own, if the file has to load with strict"
-            problems.append((Severity.NOTE, message, fix))
-        source = Location(element=f"frame {name}")
-        return tuple([Problem(severity, message, source, fix) for severity, message, fix in problems])
+            problems.append(Problem(Severity.NOTE, message, source, fix))
+        return tuple(problems)
 
     def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
         """Return whether no joint lies between two frames: the report's pose type, static or dynamic.
@@ -331,8 +330,12 @@ class Model:
         if interest.group is reference.group and interest.assembly not in self._assemblies_with_loops:
             return self._compute_rigid(frame_of_interest, frame_of_reference, interest, reference)
         path = self.get_kinematic_path(frame_of_interest, frame_of_reference)
-        covariance = partial(self._default_covariance, path)
-        return self._cache(frame_of_interest, frame_of_reference, path.compute_pose(path.default_positions), covariance)
+        positions = path.default_positions
+
+        def compute_covariance() -> tuple[float, ...] | None:
+            return path.compute_covariance(positions, [self._get_joint_sigma(joint.name) for joint in path.joints])
+
+        return self._cache(frame_of_interest, frame_of_reference, path.compute_pose(positions), compute_covariance)
 
     def _compute_rigid(
         self, frame_of_interest: str, frame_of_reference: str, interest: FrameNode, reference: FrameNode
@@ -354,11 +357,6 @@ class Model:
             self._transformations.popitem(last=False)
         self._transformations[frame_of_interest, frame_of_reference] = answer
         return answer
-
-    def _default_covariance(self, path: KinematicPath) -> tuple[float, ...] | None:
-        return path.compute_covariance(
-            path.default_positions, [self._get_joint_sigma(joint.name) for joint in path.joints]
-        )
 
     def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
         def assembly(body: str) -> str:

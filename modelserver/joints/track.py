@@ -285,9 +285,6 @@ class JointTrack:
             end = len(self._blocks[number].times)
         return number, bisect_right(self._blocks[number].times, utime, 0 if number else self._start, end) - 1
 
-    def _after(self, number: int, index: int) -> tuple[int, int]:
-        return (number, index + 1) if index + 1 < self._get_length(number) else (number + 1, 0)
-
     @property
     def newest(self) -> Reading:
         """The newest reading. Only when not empty."""
@@ -406,7 +403,7 @@ class JointTrack:
         if self._count < 2:
             return None
         number, index = self._before(min(max(utime - 1, self.first), self.last - 1))
-        later, after = self._after(number, index)
+        later, after = (number, index + 1) if index + 1 < self._get_length(number) else (number + 1, 0)
         block, other = self._blocks[number], self._blocks[later]
         return ReadingPair(block.times[index], block.at(index), other.times[after], other.at(after))
 

@@ -171,7 +171,12 @@ def compute_motion(
     motions: list[RigidMotion] = []
     uncertain: list[ChainLink] = []
     for step in path.steps:
-        each, factor = _step_motion(view, step)
+        if step.estimate is not None:
+            each, factor = _vehicle_motion(view, step.X_FT, step.estimate)
+        elif step.edge.joint is not None:
+            each, factor = _joint_motion(view, step, step.edge.joint)
+        else:
+            each, factor = RigidMotion(step.X_FT), _EXACT
         motions.append(each)
         # the vehicle has one motion, in whichever world it is expressed
         source = step.source if step.estimate is None else (EdgeKind.VEHICLE,)
@@ -190,13 +195,10 @@ def compute_motion(
             transformation=answer.transformation.with_invalid_reasons(turned.transformation.invalid_reasons),
             quality=answer.quality | turned.quality,
         )
-    covariance = chain.covariance(uncertain)
-    if covariance is not None and axes != reference:
+    covariances = [chain.covariance(uncertain), second]
+    if axes != reference:
         turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
-        covariance = turn @ covariance @ turn.T
-    if second is not None and axes != reference:
-        turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
-        second = turn @ second @ turn.T
+        covariances = [None if P is None else turn @ P @ turn.T for P in covariances]
     return messages.MotionAnswer(
         answer,
         axes,
@@ -204,8 +206,7 @@ def compute_motion(
         so3.rotate(R, moved.angular_velocity),
         so3.rotate(R, moved.acceleration),
         so3.rotate(R, moved.angular_acceleration),
-        None if covariance is None else tuple(covariance.ravel().tolist()),
-        None if second is None else tuple(second.ravel().tolist()),
+        *(None if P is None else tuple(P.ravel().tolist()) for P in covariances),
     )
 
 
@@ -255,15 +256,6 @@ def _get_vehicle_covariance(view: PlatformView, X_WB: Pose, estimate: messages.E
     C = np.diag([own.acceleration_sigma**2] * 3 + [turning[1]] * 3)
     turn = np.kron(np.eye(2), np.array(so3.matrix_rows(X_WB.wxyz))) @ J
     return np.asarray(turn @ C @ turn.T)
-
-
-def _step_motion(view: PlatformView, step: PathStep) -> tuple[RigidMotion, Array | None]:
-    """Return the motion of a step's far end in its near end, and the factor of that velocity's covariance."""
-    if step.estimate is not None:
-        return _vehicle_motion(view, step.X_FT, step.estimate)
-    if step.edge.joint is None:
-        return RigidMotion(step.X_FT), _EXACT
-    return _joint_motion(view, step, step.edge.joint)
 
 
 def _joint_motion(view: PlatformView, step: PathStep, joint: Joint) -> tuple[RigidMotion, Array | None]:
@@ -331,8 +323,6 @@ _EXACT = np.zeros((6, 1))
 
 # --- explanation ------------------------------------------------------------------------------------------------------
 
-_ZERO = np.zeros((6, 1))
-
 
 def explain(
     view: PlatformView, interest: str, reference: str, time: messages.TimeQuery, now: int
@@ -345,14 +335,14 @@ def explain(
     answer = view.transformation(interest, reference, time, now)
     path = lookup_path(view, interest, reference, time, now)
     known = [
-        link._replace(factor=np.zeros((6, 1)) if link.factor is None else link.factor, source=(number,))
+        link._replace(factor=_EXACT if link.factor is None else link.factor, source=(number,))
         for number, link in enumerate(path.links)
     ]
     shares = chain.contributions(known) or {}
     traces = []
     for link in known:
         share = shares[link.source]
-        large_angle = shares.get((*link.source, chain.LARGE_ANGLE), _ZERO)
+        large_angle = shares.get((*link.source, chain.LARGE_ANGLE), _EXACT)
         traces.append((float(np.sum(share[:3] ** 2) + np.sum(large_angle**2)), float(np.sum(share[3:] ** 2))))
     position, rotation = (sum(each[side] for each in traces) for side in (0, 1))
     return messages.Explanation(

@@ -186,7 +186,9 @@ class Trajectory:
         t = min(max(t, 0.0), self.duration)
         index = max(bisect_right(self._starts, t) - 1, 0)
         while len(self._pieces) <= index:
-            self._pieces.append(self._pieces[-1].continue_with(self._phases[len(self._pieces)]))
+            # from the values at u = 1
+            last, phase = self._pieces[-1], self._phases[len(self._pieces)]
+            self._pieces.append(_Piece(phase, last.last, last.knots[-1], sum(last.yaw), sum(last.distance)))
         return self._pieces[index], (t - self._starts[index]) / self._pieces[index].duration
 
 
@@ -218,10 +220,6 @@ class _Piece:
         self.knots = [start]
         for step in range(steps):
             self.knots.append(self._integrate(self.knots[-1], step / steps, 1.0 / steps))
-
-    def continue_with(self, phase: DrivePhase) -> _Piece:
-        # values at u = 1
-        return _Piece(phase, self.last, self.knots[-1], sum(self.yaw), sum(self.distance))
 
     def _integrate(self, start: tuple[float, float], u: float, share: float) -> tuple[float, float]:
         """Return the position reached from `start`, at share `u`, after a further share of the duration."""
