@@ -20,8 +20,10 @@ from xml.sax import saxutils
 import numpy as np
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_key
+from modelserver.geometry.builder import MAX_POSITION as MAX_POSITION
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
+from modelserver.geometry.parts import BodyFrame, Constraint
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
@@ -52,9 +54,6 @@ ROUNDING_DEVIATION = 1e-3
 
 MAX_DEVIATION = 0.05
 """Rotations with a greater |R'R - I| are rejected: that is a mistake, not rounding."""
-
-MAX_POSITION = 1e9
-"""Greatest coordinate, meters: beyond it the rounding of sums exceeds a micrometer."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
@@ -266,12 +265,12 @@ def format_names(names: list[str], limit: int = 5) -> str:
 
 def list_text_and_sigma_features(model: Model) -> Iterator[str]:
     """Yield how many descriptions and sigmas a format without them drops."""
-    frames = [frame for body in model.bodies for frame in body]
-    texts = [each.description for each in model.bodies] + [each.description for each in frames]
-    texts += [model.description, *(each.description for each in model.constraints)]
+    surveyed: list[BodyFrame | Constraint] = [frame for body in model.bodies for frame in body]
+    surveyed += model.constraints
+    texts = [model.description, *(each.description for each in model.bodies), *(each.description for each in surveyed)]
     if described := sum(map(bool, texts)):
         yield f"{described} descriptions"
-    if sigmas := sum(each is not None for each in (*(f.sigma for f in frames), *(c.sigma for c in model.constraints))):
+    if sigmas := sum(each.sigma is not None for each in surveyed):
         yield f"{sigmas} sigmas"
 
 

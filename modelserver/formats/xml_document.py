@@ -88,8 +88,9 @@ def _read_as_ros(content: bytes) -> Element | None:
 
 
 def _is_doctype_rejected(content: bytes, builder: ModelBuilder, file: str) -> bool:
-    start = _find_doctype(content)
-    if start < 0:
+    before = _BEFORE_DOCTYPE.match(content)
+    start = 0 if before is None else before.end()
+    if not content.startswith(b"<!DOCTYPE", start):
         return False
     declaration = re.compile(rb"[^>\[]*").match(content, start)
     assert declaration is not None
@@ -101,12 +102,6 @@ def _is_doctype_rejected(content: bytes, builder: ModelBuilder, file: str) -> bo
     line = content.count(b"\n", 0, start) + 1
     builder.add_error(message, Location(file, line, "DOCTYPE"), _DOCTYPE_FIX)
     return True
-
-
-def _find_doctype(content: bytes) -> int:
-    """Return the offset of the DOCTYPE before the first element, -1 for none."""
-    found = _BEFORE_DOCTYPE.match(content)
-    return found.end() if found is not None and content.startswith(b"<!DOCTYPE", found.end()) else -1
 
 
 def get_tag(element: Element) -> str:

@@ -55,7 +55,7 @@ MAX_SUGGESTIONS = 100
 
 
 MAX_POSITION = 1e9
-"""Meters or radians; a default position beyond would cost the precision of millimeters."""
+"""Meters or radians; beyond it the rounding of sums exceeds a micrometer."""
 
 
 MAX_ANGLE = 2.0 * math.tau
@@ -575,8 +575,9 @@ class _ModelReview:
                 fix = f"add a constraint that joins it to {root[0]} or to what is mounted there"
                 self.add_problem(Severity.WARNING, message, self.locations[body], fix)
         closures = tuple(topology.find_loop_closures())
+        full_frames = {each.full_name: each for body in bodies.values() for each in body} if closures else {}
         for closing in closures:
-            found = compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
+            found = compute_misclosure(closing.path, lambda full: full_frames[full])
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
             self.add_problem(
                 Severity.WARNING if bad else Severity.NOTE,
@@ -603,11 +604,6 @@ class _ModelReview:
             bodies = {name: body for name, body in bodies.items() if name in valid}
             constraints = tuple(each for each in constraints if names.split(each.from_)[0] in valid)
         return bodies, constraints
-
-
-def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
-    body, frame = names.split(name)
-    return bodies[body].frame(frame)
 
 
 def _describe_misclosure(found: LoopMisclosure) -> str:

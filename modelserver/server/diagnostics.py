@@ -277,7 +277,7 @@ def read_bus_facts(
         interfaces,
         delivered,
         delivered_large,
-        get_granted_buffer(address.buffer or RECEIVE_BUFFER_BYTES),
+        get_granted_buffer(address.buffer),
         count_dropped(address.port, proc),
     )
 

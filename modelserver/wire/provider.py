@@ -177,7 +177,7 @@ class UdpAddress:
     group: str = GROUP
     port: int = 7667
     ttl: int = 0
-    buffer: int = 0
+    buffer: int = RECEIVE_BUFFER_BYTES
 
 
 def leaves_machine(url: str) -> bool:
@@ -198,7 +198,7 @@ def parse_udp_address(url: str) -> UdpAddress | None:
             parts.hostname or default.group,
             parts.port or default.port,
             int(options.get("ttl", default.ttl)),
-            int(options.get("recv_buf_size", 0)),
+            int(options.get("recv_buf_size", 0)) or default.buffer,
         )
     except ValueError:
         return None

@@ -91,9 +91,6 @@ _FRAGMENT_HEADER: Final = struct.Struct(">4sIIIHH")
 MAX_PACKET: Final = 1 << 16
 """Bytes of the longest UDP packet, rounded up."""
 
-BUFFER_BYTES: Final = 4 << 20
-"""Receive buffer that is requested if the URL has no recv_buf_size: messages wait there while one is handled."""
-
 MAX_IGNORED: Final = 64
 """Packets without a message that one call of `receive` reads, so that a flood of them does not hold it."""
 
@@ -197,7 +194,7 @@ class UdpReceiver:
             set_channel_filter(self._socket, ())  # before the first packet
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             # Linux grants up to net.core.rmem_max of it
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, address.buffer or BUFFER_BYTES)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, address.buffer)
             self._socket.bind((address.group, address.port))
             # the interface is that of the group's route, as for liblcm
             membership = socket.inet_aton(address.group) + socket.inet_aton("0.0.0.0")
