@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from modelserver.geometry.model import Model
 from modelserver.messages import AbsolutePoseSample, Direction, Origin, RangeSample, RelativePoseSample, WheelSample
-from modelserver.simulation import Event, Simulation
+from modelserver.simulation import Event, GpsModel, ImuModel, Simulation
 from modelserver.simulation.imu import apply_rows
 from modelserver.simulation.noise import GaussMarkov, Intervals, NoiseSource, Run, Timing, is_within
 from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
@@ -600,3 +600,37 @@ class Triad:
         if model.vibration and abs(speed) > _MOVING_SPEED:
             errors.append(self._noise.vector(model.vibration))
         return so3.add(apply_rows(self._rows, true), so3.add(*errors))
+
+
+# --- sensors without errors -------------------------------------------------------------------------------------------
+
+
+def make_noise_free_gps(timing: Timing = Timing(4.0)) -> GpsModel:  # noqa: B008 - immutable
+    return GpsModel(timing, correlated_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0, baseline_sigma=0.0)
+
+
+def make_noise_free_wheels(
+    timing: Timing = Timing(20.0),  # noqa: B008 - immutable
+    steered: frozenset[str] = frozenset(),
+) -> WheelsModel:
+    return WheelsModel(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
+
+
+def make_noise_free_imu(
+    timing: Timing = Timing(100.0),  # noqa: B008 - immutable
+    yaw_offset: float = 0.0,
+    earth_rotation: bool = True,
+) -> ImuModel:
+    """Return a unit without error; its yaw still starts at `yaw_offset` and integrates its gyros."""
+    return ImuModel(
+        timing,
+        gyro_bias_sigma=0.0,
+        gyro_walk=0.0,
+        gyro_noise=0.0,
+        accelerometer_bias_sigma=0.0,
+        accelerometer_noise=0.0,
+        tilt_sigma=0.0,
+        tilt_noise=0.0,
+        yaw_offset=yaw_offset,
+        earth_rotation=earth_rotation,
+    )

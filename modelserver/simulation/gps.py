@@ -26,7 +26,6 @@ _MIN_SIGMA = 1e-3
 
 
 _TIMING = Timing(4.0, latency=0.06, jitter=0.01)
-_PROMPT = Timing(4.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +65,6 @@ class GpsModel:
     sigma_factor: float = 1.0
     has_velocity: bool = True
     baseline_sigma: float = 0.003
-
-    @classmethod
-    def noise_free(cls, timing: Timing = _PROMPT) -> GpsModel:
-        return cls(timing, correlated_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0, baseline_sigma=0.0)
 
 
 def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector3 | None = None) -> Iterator[GpsSample]:

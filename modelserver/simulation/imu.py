@@ -91,7 +91,6 @@ _REFERENCE: dict[OrientationReference, Quaternion] = {
 
 
 _TIMING = Timing(100.0, latency=0.004, jitter=0.001)
-_PROMPT = Timing(100.0)
 
 TriadErrors = Callable[[float, NoiseSource], Callable[[Vector3, float], Vector3]]
 """Draws the errors (misalignment, vibration and so on) of three gyros or accelerometers that give `rate_hz` samples a
@@ -138,22 +137,6 @@ class ImuModel:
     yaw_noise: float = 0.0
     frozen_from: float | None = None
     outages: Intervals = ()
-
-    @classmethod
-    def noise_free(cls, timing: Timing = _PROMPT, yaw_offset: float = 0.0, earth_rotation: bool = True) -> ImuModel:
-        """Return a unit without error; its yaw still starts at `yaw_offset` and integrates its gyros."""
-        return cls(
-            timing,
-            gyro_bias_sigma=0.0,
-            gyro_walk=0.0,
-            gyro_noise=0.0,
-            accelerometer_bias_sigma=0.0,
-            accelerometer_noise=0.0,
-            tilt_sigma=0.0,
-            tilt_noise=0.0,
-            yaw_offset=yaw_offset,
-            earth_rotation=earth_rotation,
-        )
 
 
 def simulate_imu(model: ImuModel, run: Run, X_VS: Pose) -> Iterator[ImuSample]:

@@ -53,7 +53,6 @@ class Encoder:
 
 
 _TIMING = Timing(20.0, latency=0.01, jitter=0.002)
-_PROMPT = Timing(20.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +80,6 @@ class WheelsModel:
     steered: frozenset[str] = frozenset()
     unstated_latency: float = 0.0
     encoder: Callable[[WheelsModel, str, NoiseSource, Run], Encoder] = Encoder
-
-    @classmethod
-    def noise_free(cls, timing: Timing = _PROMPT, steered: frozenset[str] = frozenset()) -> WheelsModel:
-        return cls(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
 
 
 def _direction(speed: float, stationary_speed: float) -> Direction:
