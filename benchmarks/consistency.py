@@ -54,7 +54,7 @@ from modelserver.simulation import (
     WheelsModel,
     city,
 )
-from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.sensors import NoiseSource
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 

@@ -27,10 +27,18 @@ from typing import Any, NamedTuple
 from modelserver.geometry.model import Model
 from modelserver.messages import AbsolutePoseSample, Direction, Origin, RangeSample, RelativePoseSample, WheelSample
 from modelserver.simulation import Event, GpsModel, ImuModel, Simulation
-from modelserver.simulation.imu import apply_rows
-from modelserver.simulation.noise import GaussMarkov, Intervals, NoiseSource, Run, Timing, is_within
+from modelserver.simulation.sensors import (
+    Encoder,
+    GaussMarkov,
+    Intervals,
+    NoiseSource,
+    Run,
+    Timing,
+    WheelsModel,
+    apply_rows,
+    is_within,
+)
 from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
-from modelserver.simulation.wheels import Encoder, WheelsModel
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3

@@ -19,11 +19,8 @@ from dataclasses import dataclass
 from modelserver import messages
 from modelserver.earth.geodesy import Geodesy
 from modelserver.geometry.model import Model
-from modelserver.simulation.gps import *
-from modelserver.simulation.imu import *
-from modelserver.simulation.noise import *
+from modelserver.simulation.sensors import *
 from modelserver.simulation.trajectory import *
-from modelserver.simulation.wheels import *
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3, conjugate, rotate
 

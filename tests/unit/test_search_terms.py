@@ -60,7 +60,7 @@ TERMS = {
     "left Jacobian": "modelserver/transforms/so3.py",
     "adjoint": "modelserver/transforms/chain.py",
     "quantization": "tools/mstools/calibration/allan.py",
-    "misalignment": "modelserver/simulation/imu.py",
+    "misalignment": "modelserver/simulation/sensors.py",
     # PX4 EKF2
     "out-of-sequence": f"{FILTER}/localizer.py",
     "delayed measurement": f"{FILTER}/localizer.py",
@@ -71,7 +71,7 @@ TERMS = {
     "covariance inflation": f"{FILTER}/warm_start.py",
     "warm start": f"{FILTER}/warm_start.py",
     "sensor timeout": "modelserver/core/health.py",
-    "wheel slip": "modelserver/simulation/wheels.py",
+    "wheel slip": "modelserver/simulation/sensors.py",
     # tf2
     "time travel": "modelserver/query/view.py",
     "lookup": "modelserver/query/path.py",

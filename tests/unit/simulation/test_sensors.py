@@ -33,7 +33,7 @@ from modelserver.simulation import (
     figure_eight,
     straight,
 )
-from modelserver.simulation.noise import Timing
+from modelserver.simulation.sensors import Timing
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
