@@ -42,10 +42,9 @@ import msgspec
 import numpy as np
 
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.core import CoreState, ModelLoaded
+from modelserver.core import CoreState
 from modelserver.errors import RecordingError
 from modelserver.estimation.filter.measurements import REGISTRY
-from modelserver.messages import Event
 
 HISTORY_S: Final = 2.0
 """Seconds of the pose history that are written; all of it would be fifty times as much."""
@@ -482,7 +481,3 @@ def decode_run(data: bytes) -> RunState:
     if type(found) is not tuple or list(map(type, found)) != [VehicleConfig, CoreState]:
         raise RecordingError("it is no state of a run")
     return RunState(*found)
-
-
-def encode_event(event: Event | ModelLoaded, pause: Callable[[], object] = lambda: None) -> bytes:
-    return encode_value(event, pause, is_described=False)

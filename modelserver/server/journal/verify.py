@@ -19,6 +19,7 @@ from __future__ import annotations
 import hmac
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
@@ -534,8 +535,7 @@ class _Verifier:
                 report.skipped[record.channel] += 1
             return
         if record.kind is RecordKind.PUBLISHED:
-            if self._group is None:
-                self._group = _Group(self._path, record, [])
+            self._group = self._group or _Group(self._path, record, [])
             self._group.recorded.append(record)
             return
         report.handled += 1
@@ -553,20 +553,16 @@ class _Verifier:
             self._add_finding(f"at byte {record.at}: {error}", is_damage=True)
             self._stop()
             return
-        if self._group is None:
-            self._group = _Group(self._path, record, published)
-        else:
-            self._group.replayed += published
+        self._group = self._group or _Group(self._path, record, [])
+        self._group.replayed += published
 
     @staticmethod
     def _is_interleaved(record: JournalRecord) -> bool:
         """Return whether a record may come between outputs of one step: a publishing or persisting error."""
-        if record.kind is not RecordKind.EVENT:
-            return False
-        try:
-            return isinstance(encoding.decode_value(record.data), (Rejected, HealthWarning))
-        except RecordingError:
-            return False
+        with suppress(RecordingError):
+            is_event = record.kind is RecordKind.EVENT
+            return is_event and isinstance(encoding.decode_value(record.data), (Rejected, HealthWarning))
+        return False
 
     def _compare(self) -> None:
         """Compare the recorded and the replayed outputs of the group, and count them by channel."""

@@ -409,28 +409,25 @@ class JournalWriter:
     def _write(self, entries: list[JournalEntry]) -> None:
         """Write entries: a batch for the records between two segment starts."""
         records: list[journal.JournalRecord] = []
-        for number, entry in enumerate(entries):
-            if isinstance(entry.event, SegmentStart):
+        for number, (kind, now, channel, data, event) in enumerate(entries):
+            if isinstance(event, SegmentStart):
                 try:
                     self._write_batch(records)
                     records = []
-                    self._begin_segment(entry.event, entry.now)
+                    self._begin_segment(event, now)
                 except Exception:
                     self._lost += len(entries) - number - 1
                     raise
-            elif self._segment is None:
+                continue
+            if self._segment is None:
                 self._lost += 1
-            else:
-                records.append(self._record(entry))
+                continue
+            if kind is journal.RecordKind.EVENT:
+                data = encoding.encode_value(event, self._pause, is_described=False)
+            elif kind is journal.RecordKind.REQUEST and type(event) not in CHANNEL_OF:
+                kind = journal.RecordKind.SAMPLE
+            records.append(journal.JournalRecord(kind, now.monotonic_ns, now.utime, channel, data))
         self._write_batch(records)
-
-    def _record(self, entry: JournalEntry) -> journal.JournalRecord:
-        kind, data = entry.kind, entry.data
-        if kind is journal.RecordKind.EVENT:
-            data = encoding.encode_event(entry.event, self._pause)
-        elif kind is journal.RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
-            kind = journal.RecordKind.SAMPLE
-        return journal.JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
 
     def _write_batch(self, records: list[journal.JournalRecord]) -> None:
         if not records or self._segment is None:
@@ -456,8 +453,7 @@ class JournalWriter:
             facts |= self._facts
             facts["key"] = "" if self._key is None else self._key.name
             facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
-            self._previous = ""
-            self._segment, self._batch = segment, 0
+            self._previous, self._segment, self._batch = "", segment, 0
             segment.append(journal.encode_head(facts, now.utime))
             segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
@@ -478,12 +474,11 @@ class JournalWriter:
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
-                end = journal.SegmentEnd(
-                    True, segment.digest.digest(), seal_segment(self._key, segment.digest.digest())
-                )
-                segment.append(journal.encode_end(end.digest, self._clock.utime(), end.mac))
+                digest = segment.digest.digest()
+                mac = seal_segment(self._key, digest)
+                segment.append(journal.encode_end(digest, self._clock.utime(), mac))
                 segment.sync()
-                self._previous = end.seal.hex()
+                self._previous = (mac or digest).hex()
                 self._write_newest(segment.number)
             finally:
                 segment.close()
