@@ -159,36 +159,28 @@ class ElementReader:
 
         `where` names the rows for the fix, e.g. `Row1 to Row3`.
         """
-        (a, b, c), (d, e, f), (g, h, i) = rows
-        if (a, b, c, d, e, f, g, h, i) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0):
+        R = np.array(rows)
+        if np.array_equal(R, np.eye(3)):
             return so3.IDENTITY
-        products = (
-            a * a + d * d + g * g - 1.0,
-            b * b + e * e + h * h - 1.0,
-            c * c + f * f + i * i - 1.0,
-            a * b + d * e + g * h,
-            a * c + d * f + g * i,
-            b * c + e * f + h * i,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            deviation = float(np.abs(R.T @ R - np.eye(3)).max())
         # a product that overflowed to nan must fail this test
-        if not all(abs(value) <= MAX_DEVIATION for value in products):
-            worst = max((abs(value) for value in products), key=lambda value: math.inf if math.isnan(value) else value)
-            message = f"this is not a rotation: |R'R - I| is {worst:.3g}, more than {MAX_DEVIATION:g}"
+        if not deviation <= MAX_DEVIATION:
+            message = f"this is not a rotation: |R'R - I| is {deviation:.3g}, more than {MAX_DEVIATION:g}"
             fix = f"look for a wrong digit or sign in {where}: each row and column has length 1, at right angles"
             self.error(message, fix, line)
             return None
-        if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        if np.linalg.det(R) < 0.0:
             fix = f"turn the sign of one row or column in {where}; axes are right-handed"
             self.error(
                 "this is a reflection, not a rotation (determinant -1): one axis points the wrong way", fix, line
             )
             return None
-        deviation = max(abs(value) for value in products)
         if deviation < 1e-14:
             return so3.from_matrix(rows)
         matrix, deviation = so3.nearest_rotation(rows)
         if deviation > ROUNDING_DEVIATION:
-            moved = float(np.abs(matrix - np.asarray(rows)).max())
+            moved = float(np.abs(matrix - R).max())
             self.warning(
                 f"this is not quite a rotation: |R'R - I| is {deviation:.2g}, more than {ROUNDING_DEVIATION:g}; "
                 f"replaced by the nearest one, entries changed by up to {moved:.2g}",
