@@ -392,36 +392,30 @@ class _YamlJointReader:
         A coordinate that a mapping omits has the value `omitted`; None if it must have all.
         """
         at = self.at
-        plain, degrees = at.fields.get(key), at.fields.get(f"{key}_deg")
-        if degrees is None:
-            if plain is None:
-                return {}
-            if len(self.names) > 1:
-                return self.read_by_coordinate(key, plain, read, omitted)
-        elif plain is not None:
-            at.error(f"{key} and {key}_deg are both given", "keep one of the two", degrees.line)
+        given = [(name, at.fields[name]) for name in (key, f"{key}_deg") if name in at.fields]
+        if not given:
             return {}
+        name, node = given[-1]
+        is_degrees, is_angle = name != key, self.is_angle.get("", False)
+        if len(given) > 1:
+            at.error(f"{key} and {name} are both given", "keep one of the two", node.line)
+        elif len(self.names) > 1 and not is_degrees:
+            return self.read_by_coordinate(key, node, read, omitted)
         elif len(self.names) > 1:
-            first = next(name for name, angle in self.is_angle.items() if angle)
+            first = next(each for each, angle in self.is_angle.items() if angle)
             fix = f"write {key}: {{{first}_deg: ...}}, by coordinate"
-            at.error(f"{key}_deg: a {self.kind} joint has several coordinates", fix, degrees.line)
-            return {}
-        elif not self.is_angle[""]:
-            at.error(f"{key}_deg: a {self.kind} joint moves in meters", f"write {key}: in meters", degrees.line)
-            return {}
-        node, name = (degrees, f"{key}_deg") if plain is None else (plain, key)
-        value = None if node is None else read(node, name)
-        if value is not None and degrees is not None:
-            check_unit(at, value, name, degrees.line)
-        value = value if degrees is None else _to_radians(value)
-        if key == "sigma" and value and self.is_angle[""] and value[0] >= LARGEST_SIGMA:
-            line = 0 if node is None else node.line
-            at.warning(
-                f"a sigma of {value[0]:g} rad ({math.degrees(value[0]):.0f} deg) of a joint",
-                "write sigma_deg where degrees are meant",
-                line,
-            )
-        return {} if value is None else {"": value}
+            at.error(f"{name}: a {self.kind} joint has several coordinates", fix, node.line)
+        elif is_degrees and not is_angle:
+            at.error(f"{name}: a {self.kind} joint moves in meters", f"write {key}: in meters", node.line)
+        elif (value := read(node, name)) is not None:
+            if is_degrees:
+                check_unit(at, value, name, node.line)
+                value = tuple(map(math.radians, value))
+            if key == "sigma" and is_angle and value[0] >= LARGEST_SIGMA:
+                size = f"{value[0]:g} rad ({math.degrees(value[0]):.0f} deg)"
+                at.warning(f"a sigma of {size} of a joint", "write sigma_deg where degrees are meant", node.line)
+            return {"": value}
+        return {}
 
     def read_by_coordinate(self, key: str, node: YamlNode, read: _Read, omitted: _Values | None) -> dict[str, _Values]:
         at = self.at
@@ -440,8 +434,8 @@ class _YamlJointReader:
                 at.error(f"{key}: {each} is a length, not an angle", f"write {name}: in meters", inside.line)
             elif name in found:
                 at.error(f"{name} and {name}_deg are both given", "keep one of the two", inside.line)
-            value = read(inside, each)
-            found[name] = (_to_radians(value) if is_degrees else value) or omitted or ()
+            value = read(inside, each) or omitted or ()
+            found[name] = tuple(map(math.radians, value)) if is_degrees else value
         missing = [name for name in self.names if name not in found]
         if missing and omitted is None:
             fix = "state it of each coordinate; 0 is exact"
@@ -520,7 +514,3 @@ class _YamlJointReader:
             elif not self.is_angle[""]:
                 at.error(f"offset_deg: a {self.kind} joint moves in meters", "write offset: in meters", line)
         return None if not name or multiplier is None or offset is None else Mimic(name, multiplier, offset)
-
-
-def _to_radians(degrees: _Values | None) -> _Values | None:
-    return None if degrees is None else tuple(map(math.radians, degrees))

@@ -361,18 +361,14 @@ class JointTrack:
             raise TooNewError(
                 self._describe_span(utime, "after") + f"; joints are predicted {PREDICTION_LIMIT_S:g} s at most"
             )
-        rate = newest.rate
+        rate, rate_sigma0 = newest.rate, newest.rate_sigma
         limit = rate_limit if math.isfinite(rate_limit) and rate_limit > 0.0 else NAN
-        rate_sigma0 = newest.rate_sigma
         if rate != rate:
-            rate = self._slope() if slope is None else slope
-            if limit == limit:
-                # a rate of nan stays nan
-                rate = min(max(rate, -limit), limit) if rate == rate else rate
-            if rate != rate:
-                rate, rate_sigma0 = 0.0, limit
-            else:
-                rate_sigma0 = 0.1 * abs(rate)
+            rate, rate_sigma0 = self._slope() if slope is None else slope, NAN
+            if limit == limit and rate == rate:
+                rate = min(max(rate, -limit), limit)
+        if rate != rate:
+            rate, rate_sigma0 = 0.0, limit
         elif rate_sigma0 != rate_sigma0:
             rate_sigma0 = 0.1 * abs(rate)
         change = limit if limit == limit else max(2.0 * abs(rate), MIN_ACCELERATION)
