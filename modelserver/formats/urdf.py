@@ -634,14 +634,10 @@ class _UrdfWriter:
             crossing.constraint.name for crossing in self.crossings.values() if not _is_movable_in_urdf(crossing)
         ]
         """Movable joints that are written as fixed."""
-        joints = {crossing.constraint.name: crossing.constraint.joint for crossing in self.crossings.values()}
-        movable = {name for name, joint in joints.items() if joint.is_movable and name not in self.fixed_joints}
-        self.mimicked_joints = {
-            name: joint.mimic.joint
-            for name, joint in joints.items()
-            if joint.mimic is not None and name in movable and joint.mimic.joint in movable
-        }
-        """The joint that each joint with a written <mimic> follows."""
+        movable = self.joint_names & {*model.joints} - {*self.fixed_joints}
+        leaders = {name: mimic.joint for name in movable if (mimic := model.joints[name].joint.mimic) is not None}
+        self.mimicking_joints = {name for name, leader in leaders.items() if leader in movable}
+        """Joints that are written with a <mimic>."""
         for body in self.bodies:
             self.add_frame_links(body.name)
             if body.name in self.crossings:
@@ -686,7 +682,7 @@ class _UrdfWriter:
         full = self.find_intermediate_frame(body)
         last = self.link_names[full] if full else body
         joint = each.joint
-        if each.name not in self.mimicked_joints:
+        if each.name not in self.mimicking_joints:
             joint = Joint(joint.type, joint.axis, joint.lower, joint.upper, joint.rate_limit)
         if crossing.forward:
             self.joints.append(_WrittenJoint(each.name, parent, last, mount @ each.pose, joint))
@@ -725,7 +721,7 @@ class _UrdfWriter:
         if self.fixed_joints:
             yield f"the motion of {format_names(self.fixed_joints)}; written as fixed at the default position"
         movable = {name: each.joint for name, each in model.joints.items() if name not in self.fixed_joints}
-        if free := [n for n, joint in movable.items() if joint.mimic is not None and n not in self.mimicked_joints]:
+        if free := [n for n, joint in movable.items() if joint.mimic is not None and n not in self.mimicking_joints]:
             yield f"which joint {format_names(free)} follows"
         # the default of a joint that follows another is that of the other one
         if defaults := [name for name, joint in movable.items() if joint.default and joint.mimic is None]:

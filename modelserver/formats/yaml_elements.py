@@ -481,13 +481,6 @@ class _YamlJointReader:
             return None
         return value
 
-    def read_joint_name(self, at: YamlMapping, key: str) -> str:
-        """Return the name of the joint that this one follows; empty, with an error, if there is none."""
-        name = at.read_text(key)
-        if at.fields[key].kind is NodeKind.SCALAR and not name:
-            self.at.error(f"{key} names no joint", f"write {key}: NAME, of another constraint", key)
-        return name
-
     def read_mimic(self) -> Mimic | None:
         at, node = self.at, self.at.fields.get("mimic")
         if node is None:
@@ -496,15 +489,17 @@ class _YamlJointReader:
             fix = "remove mimic; what follows another is revolute or prismatic"
             at.error(f"a {self.kind} joint has several coordinates and cannot follow another", fix, node.line)
             return None
-        if node.kind is not NodeKind.MAPPING:
-            name = self.read_joint_name(at, "mimic")
-            return Mimic(name) if name else None
-        inside = at.enter(node, f"{at.place}, mimic", ("joint", "multiplier", "offset", "offset_deg"))
-        fields = inside.fields
-        name = self.read_joint_name(inside, "joint") if "joint" in fields else ""
-        if "joint" not in fields:
+        inside, key = at, "mimic"
+        if node.kind is NodeKind.MAPPING:
+            inside = at.enter(node, f"{at.place}, mimic", ("joint", "multiplier", "offset", "offset_deg"))
+            key = "joint"
+        fields, name = inside.fields, inside.read_text(key)
+        if key not in fields:
             at.error("mimic does not name the joint that it follows", "write mimic: {joint: NAME}", node.line)
-        read = {key: self.read_number(fields[key], key, f"write {key}: number") for key in fields if key != "joint"}
+        elif fields[key].kind is NodeKind.SCALAR and not name:
+            at.error(f"{key} names no joint", f"write {key}: NAME, of another constraint", key)
+        numbers = [each for each in ("multiplier", "offset", "offset_deg") if each in fields]
+        read = {each: self.read_number(fields[each], each, f"write {each}: number") for each in numbers}
         multiplier, offset = read.get("multiplier", 1.0), read.get("offset", 0.0)
         if "offset_deg" in fields:
             line, degrees = fields["offset_deg"].line, read["offset_deg"]
