@@ -70,7 +70,7 @@ TERMS = {
     "position reset": f"{FILTER}/gnss_step.py",
     "covariance inflation": f"{FILTER}/warm_start.py",
     "warm start": f"{FILTER}/warm_start.py",
-    "sensor timeout": "modelserver/core/health.py",
+    "sensor timeout": "modelserver/core/__init__.py",
     "wheel slip": "modelserver/simulation/sensors.py",
     # tf2
     "time travel": "modelserver/query/view.py",
