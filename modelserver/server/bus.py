@@ -2,7 +2,7 @@
 
 A bus has an inbox for samples, one for requests, `publish` and `wait`. Handlers run only while an inbox is drained.
 
-- Samples and requests have a receiver each (`wire.receiver`), so that a flood of requests cannot delay samples in a
+- Samples and requests have a receiver each (`wire.provider`), so that a flood of requests cannot delay samples in a
   shared queue.
 - Multicast membership survives a network interface that goes down and up again. LCM joins the group once; the kernel
   drops the membership with the interface. It delivers a group's packets to every socket bound to their port as long as
@@ -25,8 +25,16 @@ from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
 from modelserver.server.clock import FakeClock
-from modelserver.wire.provider import open_lcm, parse_udp_address, resolve_url
-from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, Sender, open_receiver
+from modelserver.wire.provider import (
+    MESSAGE_OVERHEAD_BYTES,
+    Message,
+    Receiver,
+    Sender,
+    open_lcm,
+    open_receiver,
+    parse_udp_address,
+    resolve_url,
+)
 
 log = logging.getLogger(__name__)
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from modelserver.server.bus import Inbox
     from modelserver.server.clock import Clock
-    from modelserver.wire.receiver import Sender
+    from modelserver.wire.provider import Sender
 
 log = logging.getLogger(__name__)
 

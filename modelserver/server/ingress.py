@@ -55,7 +55,7 @@ from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode, encode, read_request_header
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 _HEADER: Final = struct.Struct(">8sq24xqi")
 """Start of every sensor message: fingerprint, header.utime, header.seq, length of header.source, which follows.

@@ -14,7 +14,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import CONFLICT_TIMEOUT_NS, SensorChannel
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 
 class Rig:
