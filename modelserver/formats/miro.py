@@ -256,15 +256,14 @@ def _list_unsupported(model: Model) -> Iterator[str]:
         yield f"the model's name, {model.name}"
     if model.description:
         yield "the model's description"
-    frames = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body if frame.sigma is not None]
-    if frames:
-        yield f"the sigmas of {len(frames)} frames: {format_names(frames)}"
-    constraints = [each.name for each in model.constraints if each.sigma is not None]
-    if constraints:
-        yield f"the sigmas of {len(constraints)} constraints: {format_names(constraints)}"
+    frames = [frame for body in model.bodies for frame in body]
+    if surveyed := [frame.full_name for frame in frames if frame.sigma is not None]:
+        yield f"the sigmas of {len(surveyed)} frames: {format_names(surveyed)}"
+    if surveyed := [each.name for each in model.constraints if each.sigma is not None]:
+        yield f"the sigmas of {len(surveyed)} constraints: {format_names(surveyed)}"
     yield from list_physical_features(model)
     described = [(body.name, body.description) for body in model.bodies]
-    described += [(f"{body.name}:{frame.name}", frame.description) for body in model.bodies for frame in body]
+    described += [(frame.full_name, frame.description) for frame in frames]
     described += [(each.name, each.description) for each in model.constraints]
     if changed := [name for name, text in described if _fold_description(text) != text]:
         yield f"line breaks and control characters in {len(changed)} descriptions: {format_names(changed)}"

@@ -61,11 +61,9 @@ class StampAxis:
     @property
     def common(self) -> float:
         """What all sources are off by; 0 if they are not, or not by one amount."""
-        values = list(self.by_channel.values())
-        if not values or max(values) - min(values) > SPREAD_S:
-            return 0.0
+        values = list(self.by_channel.values()) or [0.0]
         middle = statistics.median(values)
-        return middle if abs(middle) > LARGEST_DELAY_S else 0.0
+        return middle if max(values) - min(values) <= SPREAD_S and abs(middle) > LARGEST_DELAY_S else 0.0
 
     def describe(self) -> list[str]:
         """Describe what is off, a sentence for each; empty if nothing is."""

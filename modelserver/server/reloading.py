@@ -70,10 +70,7 @@ class GeometryReader:
         thread = threading.Thread(target=lambda: found.append(self._prepare(state.model)), name="reload", daemon=True)
         thread.start()
 
-        def poll(state: CoreState) -> ModelLoaded | None:
-            return self._finish(command, found[0], state) if found else None
-
-        return poll
+        return lambda state: self._finish(command, found[0], state) if found else None
 
     def encode_snapshot(self, model: Model) -> bytes:
         """Return the snapshot of a geometry, which is encoded already if it was read again."""
@@ -134,13 +131,11 @@ class GeometryReader:
 
 def compare_geometry(vehicle: Vehicle, before: Model) -> NewGeometry:
     """Return a vehicle with its new geometry, unless that lost bodies that the one before has."""
-    lost = find_disconnected(vehicle.model) - find_disconnected(before)
-    if lost:
-        why = (
-            f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
+    if lost := find_disconnected(vehicle.model) - find_disconnected(before):
+        return NewGeometry(
+            why=f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
             "write a temporary file and rename it; to use the geometry as it is, restart the server"
         )
-        return NewGeometry(why=why)
     return NewGeometry(vehicle, "", describe_changes(before, vehicle.model), vehicle.encode_snapshot(vehicle.model))
 
 

@@ -76,10 +76,8 @@ class JournalQueue:
     def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
         """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
         self._last = now
-        if received is None:
-            self._put(RecordKind.EVENT, now, "", b"", event)
-        else:
-            self._put(RecordKind.REQUEST, now, received[0], received[1], event)
+        kind = RecordKind.EVENT if received is None else RecordKind.REQUEST
+        self._put(kind, now, *(received or ("", b"")), event)
 
     def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
         """Record a received message that the core does not process, and what is done with it instead."""
