@@ -15,21 +15,13 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict
 
+from modelserver import files
 from modelserver.config import reader
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import MagnetometerCalibration
-from modelserver.files import (
-    INSTALLED_FOLDER,
-    PROCESS_FIX,
-    STATE_FOLDER,
-    FileKind,
-    NotRegularFileError,
-    detect_file_kind,
-    read_start,
-)
 from modelserver.geometry import names
 from modelserver.messages import Mode
 
@@ -492,15 +484,15 @@ NOT_A_VEHICLE_FILE = "not a vehicle file"
 _START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
 _MODEL_HINT = "modelserver query takes it with --model"
 _GEOMETRY_HINT = f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}"
-_FIXES: dict[FileKind, str] = {
-    FileKind.EMPTY: _START_HINT,
-    FileKind.COMMENTS: _START_HINT,
-    FileKind.GEOMETRY: _GEOMETRY_HINT,
-    FileKind.URDF: _GEOMETRY_HINT,
-    FileKind.MIRO_PROCESS: PROCESS_FIX,
-    FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
-    FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
-    FileKind.BINARY: "give the vehicle file, which is YAML",
+_FIXES: dict[files.FileKind, str] = {
+    files.FileKind.EMPTY: _START_HINT,
+    files.FileKind.COMMENTS: _START_HINT,
+    files.FileKind.GEOMETRY: _GEOMETRY_HINT,
+    files.FileKind.URDF: _GEOMETRY_HINT,
+    files.FileKind.MIRO_PROCESS: files.PROCESS_FIX,
+    files.FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
+    files.FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
+    files.FileKind.BINARY: "give the vehicle file, which is YAML",
 }
 
 
@@ -508,12 +500,12 @@ def _read_bytes(path: Path) -> bytes:
     """Read a vehicle file. Raises ConfigError for a file of another type, OSError."""
     try:
         # the beginning of a larger file shows its type; the reader rejects it
-        raw = read_start(path, reader.MAX_BYTES + 1)
-    except NotRegularFileError as error:
+        raw = files.read_start(path, reader.MAX_BYTES + 1)
+    except files.NotRegularFileError as error:
         there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
         fix = f"give {path / there}" if error.is_directory and there else "give the vehicle file itself"
         raise reader.make_error(str(path), 0, f"this is {error.kind}, {NOT_A_VEHICLE_FILE}", fix) from None
-    kind = detect_file_kind(raw)
+    kind = files.detect_file_kind(raw)
     if kind in _FIXES:
         what = kind.value if kind.is_empty else f"{kind.value}, {NOT_A_VEHICLE_FILE}"
         raise reader.make_error(str(path), 0, what, _FIXES[kind].format(name=path.name))
@@ -526,8 +518,8 @@ def _resolve_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
 
     def resolve_state(given: str) -> str:
         # the units and the container have /etc read-only, and state where the file hierarchy standard has it
-        is_relative = str(path.parent.resolve()) == INSTALLED_FOLDER and not given.startswith(("/", "~"))
-        return resolve(os.path.join(STATE_FOLDER, given) if given and is_relative else given)
+        is_relative = str(path.parent.resolve()) == files.INSTALLED_FOLDER and not given.startswith(("/", "~"))
+        return resolve(os.path.join(files.STATE_FOLDER, given) if given and is_relative else given)
 
     return dataclasses.replace(
         config,

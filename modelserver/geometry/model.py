@@ -12,17 +12,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any, TypeVar
 
-from modelserver.errors import (
-    Location,
-    MalformedRequestError,
-    NotConnectedError,
-    Problem,
-    Severity,
-    UnknownBodyError,
-    UnknownFrameError,
-    find_nearest_names,
-    quote,
-)
+from modelserver import errors
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates, Joint, Mimic
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
@@ -66,7 +56,7 @@ class Model:
         constraints: tuple[Constraint, ...],
         name: str = "",
         description: str = "",
-        problems: tuple[Problem, ...] = (),
+        problems: tuple[errors.Problem, ...] = (),
     ):
         self.bodies = bodies
         self.constraints = constraints
@@ -104,7 +94,9 @@ class Model:
         """Return the body of that name. Raises UnknownBodyError with the nearest names."""
         found = self._bodies.get(name)
         if found is None:
-            raise UnknownBodyError(f"the model has no body {quote(name)}", find_nearest_names(name, self._bodies))
+            raise errors.UnknownBodyError(
+                f"the model has no body {errors.quote(name)}", errors.find_nearest_names(name, self._bodies)
+            )
         return found
 
     def frame(self, name: str) -> BodyFrame:
@@ -138,12 +130,12 @@ class Model:
         name, known = full_name(frame), [each.name for each in self.constraints_of(frame)]
         if constraint:
             there = f"it has {format_names(known)}" if known else "it has none"
-            near = find_nearest_names(constraint, known)
-            raise NotConnectedError(f"frame {name} has no constraint {quote(constraint)}; {there}", near)
+            near = errors.find_nearest_names(constraint, known)
+            raise errors.NotConnectedError(f"frame {name} has no constraint {errors.quote(constraint)}; {there}", near)
         if not found:
-            raise NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
+            raise errors.NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
         several = f"{len(found)} constraints, {format_names(known)}"
-        raise MalformedRequestError(f"frame {name} has {several}; name the one to cross")
+        raise errors.MalformedRequestError(f"frame {name} has {several}; name the one to cross")
 
     def spanning_tree(self, body: str) -> tuple[Crossing, ...]:
         """Return the constraints that lead from a body to all that is joined to it, breadth-first.
@@ -159,7 +151,7 @@ class Model:
         """
         return load_object("modelserver.dynamics", "Dynamics")(self, base, root, **options)
 
-    def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
+    def verify(self, frame: str | BodyFrame) -> tuple[errors.Problem, ...]:
         """Return the problems of a frame, none where it is valid (the report's verifyConstraint).
 
         A frame value that differs from the model's is an error, an orphaned body a warning, several constraints a note:
@@ -167,20 +159,20 @@ class Model:
         """
         known = [each.name for each in self.constraints_of(frame)]
         name = full_name(frame)
-        body, root, source = name.partition(":")[0], self.root.name, Location(element=f"frame {name}")
+        body, root, source = name.partition(":")[0], self.root.name, errors.Location(element=f"frame {name}")
         problems = []
         if not isinstance(frame, str) and self.frame(name) != frame:
             message = "the model's frame of this name differs from this one"
             fix = "take the frame from this model, or build a model with this frame in it"
-            problems.append(Problem(Severity.ERROR, message, source, fix))
+            problems.append(errors.Problem(errors.Severity.ERROR, message, source, fix))
         if body not in self.assemblies[0]:
             message = f"body {body} is an orphan: no constraints lead to the root body {root}"
             fix = f"add a constraint that joins it to {root} or to what is mounted there"
-            problems.append(Problem(Severity.WARNING, message, source, fix))
+            problems.append(errors.Problem(errors.Severity.WARNING, message, source, fix))
         if len(known) > 1:
             message = f"the frame has {len(known)} constraints, {format_names(known)}; a strict model allows one"
             fix = "give each constraint a frame of its own, if the file has to load with strict"
-            problems.append(Problem(Severity.NOTE, message, source, fix))
+            problems.append(errors.Problem(errors.Severity.NOTE, message, source, fix))
         return tuple(problems)
 
     def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
@@ -298,17 +290,17 @@ class Model:
         try:
             body_name, frame_name = names.split(names.complete(name))
         except ValueError as error:
-            raise UnknownFrameError(str(error), find_nearest_names(name, everything)) from None
+            raise errors.UnknownFrameError(str(error), errors.find_nearest_names(name, everything)) from None
         found = self._bodies.get(body_name)
         if found is None:
             near = [
                 names.join(body, frame_name) if self._bodies[body].has_frame(frame_name) else body
-                for body in find_nearest_names(body_name, self._bodies)
+                for body in errors.find_nearest_names(body_name, self._bodies)
             ]
             if frame_name == names.ORIGIN:  # perhaps what is given is a frame without its body
                 of_bodies = [names.join(body.name, body_name) for body in self.bodies if body.has_frame(body_name)]
-                near += of_bodies[: names.MAX_LISTED] or find_nearest_names(body_name, everything)
-            raise UnknownBodyError(f"the model has no body {quote(body_name)}", dict.fromkeys(near))
+                near += of_bodies[: names.MAX_LISTED] or errors.find_nearest_names(body_name, everything)
+            raise errors.UnknownBodyError(f"the model has no body {errors.quote(body_name)}", dict.fromkeys(near))
         return found, found.frame(frame_name)
 
     def _get_end_nodes(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:
@@ -358,12 +350,12 @@ class Model:
         self._transformations[frame_of_interest, frame_of_reference] = answer
         return answer
 
-    def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
+    def _not_connected(self, body_I: str, body_R: str) -> errors.NotConnectedError:
         def assembly(body: str) -> str:
             mates = next(each for each in self._topology.assemblies if body in each)
             return ", ".join(mates[:6]) + (", ..." if len(mates) > 6 else "")
 
-        return NotConnectedError(
+        return errors.NotConnectedError(
             f"no constraints lead from {body_R} to {body_I}: {body_R} is joined with [{assembly(body_R)}], "
             f"{body_I} with [{assembly(body_I)}]"
         )
@@ -398,7 +390,7 @@ def _check_unique(what: str, given: list[str]) -> None:
     """Raise ValueError for a name that is given twice (report 4.2, 4.4)."""
     if len(set(given)) < len(given):
         twice = next(name for name in given if given.count(name) > 1)
-        raise ValueError(f"the {what} name {quote(twice)} is given twice; names are unique in a model")
+        raise ValueError(f"the {what} name {errors.quote(twice)} is given twice; names are unique in a model")
 
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:

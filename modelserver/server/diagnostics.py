@@ -26,16 +26,9 @@ from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import BusError, WireError, quote
 from modelserver.messages import Gauges, Health
+from modelserver.wire import provider
 from modelserver.wire.channels import PROBE_CHANNEL, to_subscription_pattern
 from modelserver.wire.codec import decode
-from modelserver.wire.provider import (
-    RECEIVE_BUFFER_BYTES,
-    UdpAddress,
-    handle_message,
-    make_route_command,
-    open_lcm,
-    parse_udp_address,
-)
 
 if TYPE_CHECKING:
     import lcm
@@ -135,7 +128,7 @@ class BusFacts:
     """
 
     url: str
-    address: UdpAddress | None
+    address: provider.UdpAddress | None
     interface: NetworkInterface | None = None
     interfaces: tuple[NetworkInterface, ...] = ()
     delivered: bool | None = None
@@ -156,14 +149,14 @@ def evaluate_bus(facts: BusFacts) -> tuple[Diagnosis, ...]:
     )
 
 
-def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
+def _check_route(facts: BusFacts, address: provider.UdpAddress) -> Diagnosis:
     subject = "multicast route"
     group, interface = address.group, facts.interface
     lo = next((each.name for each in facts.interfaces if each.loopback), "lo")
     outward = next((each.name for each in facts.interfaces if each.up and each.multicast and not each.loopback), "")
-    by_lo = f"sudo ip link set {lo} up multicast on && sudo {make_route_command(group, lo)}"
+    by_lo = f"sudo ip link set {lo} up multicast on && sudo {provider.make_route_command(group, lo)}"
     if interface is None:
-        command = by_lo if address.ttl == 0 or not outward else f"sudo {make_route_command(group, outward)}"
+        command = by_lo if address.ttl == 0 or not outward else f"sudo {provider.make_route_command(group, outward)}"
         why = "LCM cannot be joined, so nothing is received or published"
         return Diagnosis(ERROR, subject, f"there is none to {group}", why, command)
     if not interface.name:
@@ -175,12 +168,12 @@ def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
     if address.ttl > 0 and interface.loopback:
         why = f"the URL has ttl={address.ttl}, but no other machine receives anything"
         flush = f"sudo ip route flush match {group} dev {lo}"
-        command = f"sudo {make_route_command(group, outward)}" if outward else flush
+        command = f"sudo {provider.make_route_command(group, outward)}" if outward else flush
         return Diagnosis(WARNING, subject, observed, why, command)
     return Diagnosis(OK, subject, observed)
 
 
-def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+def _check_delivery(facts: BusFacts, address: provider.UdpAddress) -> Iterator[Diagnosis]:
     subject = "own message"
     if facts.delivered is None:
         return
@@ -190,17 +183,19 @@ def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]
         yield Diagnosis(ERROR, subject, "it does not come back", why, command)
     elif facts.delivered_large is False:
         why = "long replies (histories, lists) are split into packets, and some of them are lost"
-        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+        command = _sysctl_command("net.core.rmem_max", provider.RECEIVE_BUFFER_BYTES)
         yield Diagnosis(WARNING, subject, "a short one comes back, one of 100 kB does not", why, command)
     else:
         yield Diagnosis(OK, subject, "it comes back")
 
 
-def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+def _check_buffers(facts: BusFacts, address: provider.UdpAddress) -> Iterator[Diagnosis]:
     subject = "receive buffer"
-    if facts.buffer is not None and facts.buffer < RECEIVE_BUFFER_BYTES:
-        observed = f"{_format_mib(facts.buffer)} of {_format_mib(RECEIVE_BUFFER_BYTES)} requested (net.core.rmem_max)"
-        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+    if facts.buffer is not None and facts.buffer < provider.RECEIVE_BUFFER_BYTES:
+        observed = (
+            f"{_format_mib(facts.buffer)} of {_format_mib(provider.RECEIVE_BUFFER_BYTES)} requested (net.core.rmem_max)"
+        )
+        command = _sysctl_command("net.core.rmem_max", provider.RECEIVE_BUFFER_BYTES)
         yield Diagnosis(WARNING, subject, observed, "messages are lost in bursts", command)
     elif facts.buffer is not None:
         yield Diagnosis(OK, subject, f"{_format_mib(facts.buffer)}, as requested")
@@ -258,7 +253,7 @@ def read_bus_facts(
 
     `probe_delivery` sends own messages and returns whether a short and a long one come back.
     """
-    address = parse_udp_address(url)
+    address = provider.parse_udp_address(url)
     if address is None:
         return BusFacts(url, None)
     interfaces = tuple(list_interfaces())
@@ -296,7 +291,7 @@ def list_interfaces() -> Iterator[NetworkInterface]:
             )
 
 
-def find_interface(address: UdpAddress, proc: Path = PROC) -> str | None:
+def find_interface(address: provider.UdpAddress, proc: Path = PROC) -> str | None:
     """Return the interface of the route to a group; empty if unknown, None without a route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -372,7 +367,7 @@ LARGE_BYTES: Final = 100_000
 
 def probe_delivery(url: str, seconds: float = ECHO_TIMEOUT_S) -> tuple[bool, bool]:
     """Return whether a short and a long own message come back. Raises BusError."""
-    sender, receiver = open_lcm(url), open_lcm(url)
+    sender, receiver = provider.open_lcm(url), provider.open_lcm(url)
     is_short_echoed = _is_echoed(sender, receiver, 8, seconds)
     return is_short_echoed, is_short_echoed and _is_echoed(sender, receiver, LARGE_BYTES, seconds)
 
@@ -389,7 +384,7 @@ def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, size: int, seconds: float) ->
             if now >= send_at:
                 sender.publish(PROBE_CHANNEL, payload)
                 send_at = now + RESEND_S
-            handle_message(receiver, int((min(send_at, deadline) - now) * 1e3) + 1)
+            provider.handle_message(receiver, int((min(send_at, deadline) - now) * 1e3) + 1)
     finally:
         receiver.unsubscribe(subscription)
     return any(matches)

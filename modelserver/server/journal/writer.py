@@ -40,18 +40,10 @@ from modelserver.core import Instant
 from modelserver.errors import RecordingError
 from modelserver.files import open_regular, read_start
 from modelserver.messages import CHANNEL_OF
+from modelserver.server import persistence
 from modelserver.server.clock import Clock
 from modelserver.server.journal import JournalEntry, JournalQueue, SegmentStart, encoding
 from modelserver.server.log import escape_text, start_in_background
-from modelserver.server.persistence import (
-    FileLock,
-    create_directory,
-    describe_error,
-    get_state_directory,
-    sync_directory,
-    to_file_name,
-    write_atomically,
-)
 from modelserver.signing import Key
 from modelserver.version import __version__
 from modelserver.wire import journal
@@ -177,10 +169,10 @@ class Ring:
         self.directory = directory
         self.max_bytes = max_bytes
         self.segment_bytes = segment_bytes
-        self._lock = FileLock(directory / LOCK_NAME)
+        self._lock = persistence.FileLock(directory / LOCK_NAME)
 
     def acquire(self) -> None:
-        create_directory(self.directory)
+        persistence.create_directory(self.directory)
         self._lock.acquire()
 
     def create_segment(self, min_number: int = 0) -> Segment:
@@ -200,7 +192,7 @@ class Ring:
         newest = get_number(held[-1]) if held else None
         number = max(0 if newest is None else newest + 1, min_number)
         segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
-        sync_directory(self.directory)
+        persistence.sync_directory(self.directory)
         return segment
 
     def make_room(self) -> bool:
@@ -496,7 +488,7 @@ class JournalWriter:
 
     def _write_newest(self, number: int) -> None:
         newest = NewestMarker(self._run_number, number, self._previous)
-        write_atomically(self._ring.directory / NEWEST_NAME, newest.encode(self._key))
+        persistence.write_atomically(self._ring.directory / NEWEST_NAME, newest.encode(self._key))
 
     def _fail(self, error: OSError) -> None:
         """Stop writing until the next attempt; meanwhile records are dropped and counted."""
@@ -516,7 +508,7 @@ class JournalWriter:
 
     def _describe_error(self, error: OSError) -> str:
         directory = self._ring.directory
-        why = describe_error(error, directory, "journal.directory")
+        why = persistence.describe_error(error, directory, "journal.directory")
         place = escape_text(str(directory))
         return f"nothing is recorded: the journal cannot be written in {place}: {why}. It retries every {RETRY_S:g} s"
 
@@ -545,10 +537,10 @@ def get_journal_directory(config: VehicleConfig, systemd_directory: str | None =
     systemd_directory = os.environ.get("STATE_DIRECTORY", "") if systemd_directory is None else systemd_directory
     if settings.megabytes is None and not systemd_directory:
         return None
-    base = get_state_directory(config.state_directory or systemd_directory.split(":")[0])
+    base = persistence.get_state_directory(config.state_directory or systemd_directory.split(":")[0])
     if base is None:
         return None
-    return base / f"journal-{to_file_name(config.vehicle)}"
+    return base / f"journal-{persistence.to_file_name(config.vehicle)}"
 
 
 def get_max_bytes(config: VehicleConfig) -> int:
