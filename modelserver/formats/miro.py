@@ -41,18 +41,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from modelserver.errors import Location, Severity, Suggestion, find_suggestion, quote, suggest_name
-from modelserver.formats.common import (
-    MAX_SUGGESTIONS,
-    ElementReader,
-    SavedModel,
-    find_cycles,
-    format_element,
-    format_names,
-    label,
-    list_physical_features,
-    parse_number,
-    suggest_known_key,
-)
+from modelserver.formats import common
 from modelserver.formats.xml_document import get_line, get_name, get_tag, iterate_children
 from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
@@ -65,7 +54,7 @@ if TYPE_CHECKING:
     from lxml.etree import _Element as Element
 
 
-class NamedParameters(ElementReader):
+class NamedParameters(common.ElementReader):
     """The children `<parameter name=... value=...>` of an element, by name; unknown and duplicate ones are reported."""
 
     def __init__(self, element: Element, known: tuple[str, ...], builder: ModelBuilder, file: str, place: str):
@@ -75,8 +64,8 @@ class NamedParameters(ElementReader):
             if (tag := get_tag(child)) == "parameter":
                 parameters.append((get_name(child), child, get_line(child)))
             else:
-                fix, near = "write <parameter name=... value=.../>", suggest_known_key(tag, ("parameter",))
-                self.warning(f"unexpected element <{label(tag)}>; ignored", fix, get_line(child), tuple(near))
+                fix, near = "write <parameter name=... value=.../>", common.suggest_known_key(tag, ("parameter",))
+                self.warning(f"unexpected element <{common.label(tag)}>; ignored", fix, get_line(child), tuple(near))
         self.elements: dict[str, Element] = self.select(parameters, known, "parameter")
 
     def locate(self, at: int | str = 0) -> Location:
@@ -113,7 +102,7 @@ def has_bodies(root: Element) -> bool:
     return any(get_name(each) in ("BodyName", "ConstraintName") for each in root.iter("{*}parameter"))
 
 
-class _MiroReader(ElementReader):
+class _MiroReader(common.ElementReader):
     def scan(self, element: Element) -> None:
         """Find bodies and constraints; libxml2 bounds the depth, and so this recursion."""
         for child in iterate_children(element):
@@ -123,28 +112,28 @@ class _MiroReader(ElementReader):
             elif "ConstraintName" in inside:
                 self.read_constraint(child)
             elif tag not in _CONTAINERS:
-                near, fix = suggest_known_key(tag, _CONTAINERS), f"elements here are {', '.join(_CONTAINERS)}"
-                self.warning(f"unexpected element <{label(tag)}>; ignored", fix, get_line(child), tuple(near))
+                near, fix = common.suggest_known_key(tag, _CONTAINERS), f"elements here are {', '.join(_CONTAINERS)}"
+                self.warning(f"unexpected element <{common.label(tag)}>; ignored", fix, get_line(child), tuple(near))
             elif tag != "parameter" or not self.report_misspelled(child, inside):
                 self.scan(child)
 
     def report_misspelled(self, element: Element, inside: set[str]) -> bool:
         """Report an element with the parts of a body or constraint but no name; return whether it is one."""
         values = [get_name(child) for child in iterate_children(element) if child.get("value") is not None]
-        meant = ((name, suggest_known_key(name, ("BodyName", "ConstraintName"))) for name in values)
+        meant = ((name, common.suggest_known_key(name, ("BodyName", "ConstraintName"))) for name in values)
         wrong, near = next((each for each in meant if each[1]), ("", Suggestion()))
         if not near and not inside & _PART_NAMES:
             return False
         message = "this is neither a body nor a constraint: it has no BodyName and no ConstraintName"
         fix = f"write {near[0]}" if near else "add BodyName to a body, ConstraintName to a constraint"
-        self.error(message + (f", but {label(wrong)}" if near else ""), fix, get_line(element), near)
+        self.error(message + (f", but {common.label(wrong)}" if near else ""), fix, get_line(element), near)
         return True
 
     def enter(self, element: Element, known: tuple[str, ...], place: str) -> NamedParameters:
         return NamedParameters(element, known, self.builder, self.file, place)
 
     def read_body(self, element: Element) -> None:
-        place = f"body {label(_get_value(element, 'BodyName'))}"
+        place = f"body {common.label(_get_value(element, 'BodyName'))}"
         parts = self.enter(element, (*_BODY_KEYS, *self.find_misnamed_lists(element, place)), place)
         body = self.builder.add_body(
             parts.read_text("BodyName") or "", _read_description(parts), _read_transform(parts), source=parts.locate()
@@ -161,7 +150,7 @@ class _MiroReader(ElementReader):
             inside = (get_name(part) for each in iterate_children(child) for part in iterate_children(each))
             if name not in _BODY_KEYS and "FrameName" in inside:
                 found.append(name)
-                at = ElementReader(self.builder, self.file, get_line(child), place)
+                at = common.ElementReader(self.builder, self.file, get_line(child), place)
                 message = f"unknown parameter {quote(name)} holds frames; read as Frames"
                 at.warning(message, "write Frames", nearest=Suggestion.of(name, "Frames"))
         return found
@@ -169,7 +158,7 @@ class _MiroReader(ElementReader):
     def read_frames(self, element: Element, body: BodyBuilder, body_place: str) -> None:
         for child in iterate_children(element):
             name = _get_value(child, "FrameName")
-            parts = self.enter(child, _FRAME_KEYS, f"{body_place}, frame {label(name)}")
+            parts = self.enter(child, _FRAME_KEYS, f"{body_place}, frame {common.label(name)}")
             if "FrameName" not in parts.elements:
                 parts.error("a frame without a name", 'add <parameter name="FrameName" value="..."/>')
                 continue
@@ -180,7 +169,7 @@ class _MiroReader(ElementReader):
 
     def read_constraint(self, element: Element) -> None:
         """Read a constraint; one with a missing end is reported and left out."""
-        place = f"constraint {label(_get_value(element, 'ConstraintName'))}"
+        place = f"constraint {common.label(_get_value(element, 'ConstraintName'))}"
         parts = self.enter(element, _CONSTRAINT_KEYS, place)
         pose = _read_transform(parts)
         from_, to = _read_end(parts, "From"), _read_end(parts, "To")
@@ -240,7 +229,7 @@ def _get_value(element: Element, key: str) -> str:
     return next(found, "").strip()
 
 
-def save(model: Model) -> SavedModel:
+def save(model: Model) -> common.SavedModel:
     """Return the text of `model`, and its features that this format does not support."""
     bodies = [line for body in model.bodies for line in _format_body(body)]
     constraints = [line for each in model.constraints for line in _format_constraint(each)]
@@ -248,7 +237,7 @@ def save(model: Model) -> SavedModel:
     for name, inside in (("BodyList", bodies), ("ConstraintList", constraints)):
         lines += [f'  <parameter name="{name}">', *(f"    {line}" for line in inside), "  </parameter>"]
     lines += [" </section>", "</config>"]
-    return SavedModel("\n".join(lines) + "\n", tuple(_list_unsupported(model)))
+    return common.SavedModel("\n".join(lines) + "\n", tuple(_list_unsupported(model)))
 
 
 def _list_unsupported(model: Model) -> Iterator[str]:
@@ -258,15 +247,15 @@ def _list_unsupported(model: Model) -> Iterator[str]:
         yield "the model's description"
     frames = [frame for body in model.bodies for frame in body]
     if surveyed := [frame.full_name for frame in frames if frame.sigma is not None]:
-        yield f"the sigmas of {len(surveyed)} frames: {format_names(surveyed)}"
+        yield f"the sigmas of {len(surveyed)} frames: {common.format_names(surveyed)}"
     if surveyed := [each.name for each in model.constraints if each.sigma is not None]:
-        yield f"the sigmas of {len(surveyed)} constraints: {format_names(surveyed)}"
-    yield from list_physical_features(model)
+        yield f"the sigmas of {len(surveyed)} constraints: {common.format_names(surveyed)}"
+    yield from common.list_physical_features(model)
     described = [(body.name, body.description) for body in model.bodies]
     described += [(frame.full_name, frame.description) for frame in frames]
     described += [(each.name, each.description) for each in model.constraints]
     if changed := [name for name, text in described if _fold_description(text) != text]:
-        yield f"line breaks and control characters in {len(changed)} descriptions: {format_names(changed)}"
+        yield f"line breaks and control characters in {len(changed)} descriptions: {common.format_names(changed)}"
 
 
 def _fold_description(text: str) -> str:
@@ -281,29 +270,29 @@ def _format_body(body: Body) -> Iterator[str]:
     lines.append('<parameter name="Frames">')
     for frame in body:
         inside = [*_format_head("FrameName", frame.name, frame.description), *_format_transform(frame.pose)]
-        lines += [f"  {line}" for line in format_element("parameter", inside, "BodyFrame")]
+        lines += [f"  {line}" for line in common.format_element("parameter", inside, "BodyFrame")]
     lines.append("</parameter>")
-    return format_element("parameter", lines, "Body")
+    return common.format_element("parameter", lines, "Body")
 
 
 def _format_constraint(each: Constraint) -> Iterator[str]:
     lines = _format_head("ConstraintName", each.name, each.description)
     for key, end in (("From", each.from_), ("To", each.to)):
-        lines += format_element("parameter", name=key, value=end)
-    return format_element("parameter", [*lines, *_format_transform(each.default_pose)], "Constraint")
+        lines += common.format_element("parameter", name=key, value=end)
+    return common.format_element("parameter", [*lines, *_format_transform(each.default_pose)], "Constraint")
 
 
 def _format_head(key: str, name: str, description: str) -> list[str]:
-    lines = [*format_element("parameter", name=key, value=name)]
+    lines = [*common.format_element("parameter", name=key, value=name)]
     if description:
-        lines += format_element("parameter", name="Description", value=_fold_description(description))
+        lines += common.format_element("parameter", name="Description", value=_fold_description(description))
     return lines
 
 
 def _format_transform(pose: Pose) -> Iterator[str]:
     rows = enumerate(pose.matrix_rows()[:3], 1)
-    inside = [line for n, row in rows for line in format_element("parameter", name=f"Row{n}", value=row)]
-    return format_element("parameter", inside, name="HTransform")
+    inside = [line for n, row in rows for line in common.format_element("parameter", name=f"Row{n}", value=row)]
+    return common.format_element("parameter", inside, name="HTransform")
 
 
 # --- frame trees ------------------------------------------------------------------------------------------------------
@@ -399,7 +388,7 @@ class _FrameInstance:
     path: FramePath
 
 
-class _FrameTreeReader(ElementReader):
+class _FrameTreeReader(common.ElementReader):
     def __init__(self, builder: ModelBuilder, file: str, variables: Mapping[str, str]):
         super().__init__(builder, file)
         self.variables = variables
@@ -416,13 +405,14 @@ class _FrameTreeReader(ElementReader):
     def read_frame(self, element: Element) -> None:
         """Read one instance; a second one of the same name and parent is ignored with a warning."""
         own = get_name(element)
-        parts = NamedParameters(element, _PARAMETERS, self.builder, self.file, f"frame {label(own)}")
+        parts = NamedParameters(element, _PARAMETERS, self.builder, self.file, f"frame {common.label(own)}")
         name = self.expand(own, parts.locate())
         stated = self.expand(parts.read_text("Name") or "", parts.locate("Name"))
         if not name:
             name = stated
         elif stated and stated != name:
-            message = f"the instance is named {label(name)}, its parameter Name {label(stated)}; {label(name)} is used"
+            used, unused = common.label(name), common.label(stated)
+            message = f"the instance is named {used}, its parameter Name {unused}; {used} is used"
             parts.warning(message, "make the two alike, or remove the parameter Name", "Name")
         parent = self.expand(parts.read_text("Parent") or "", parts.locate("Parent"))
         pose = self.read_pose(parts)
@@ -443,7 +433,7 @@ class _FrameTreeReader(ElementReader):
         moved, turned = first.pose.distance(second.pose)
         lines = f"on line {first.source.line} and on line {second.source.line}"
         message = (
-            f"frame {label(first.name)} is defined twice: {lines}; "
+            f"frame {common.label(first.name)} is defined twice: {lines}; "
             f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first is used"
         )
         self.builder.add_warning(message, second.source, "rename one of the two, or remove the wrong one")
@@ -465,7 +455,7 @@ class _FrameTreeReader(ElementReader):
                 parts.error(message, f"give it: {fix}", key, tuple(near))
                 continue
             try:
-                values.append(parse_number(filled.strip()))
+                values.append(common.parse_number(filled.strip()))
             except ValueError as error:
                 unit = "meters" if key in _POSITION else "degrees"
                 parts.error(f"{key}: {error}", f"write one number, in {unit}", key)
@@ -512,7 +502,7 @@ class _FrameTreeReader(ElementReader):
                 passed[kind].append(get_line(element))
         for kind, lines in passed.items():
             # a type with "frame" in its name is probably meant as one
-            message = f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {label(kind)} ignored"
+            message = f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {common.label(kind)} ignored"
             if "frame" in kind.casefold():
                 self.warning(message, "frames have type rapid::FrameRpyParameters", lines[0])
             else:
@@ -583,7 +573,7 @@ class _FrameTreeReader(ElementReader):
             is_outside = bool(_EXTERNAL_FRAME.fullmatch(path.name))
             if not is_outside:
                 if path.is_absolute and path.name not in meant:
-                    meant[path.name] = find_suggestion(path.name, known) if len(meant) < MAX_SUGGESTIONS else ""
+                    meant[path.name] = find_suggestion(path.name, known) if len(meant) < common.MAX_SUGGESTIONS else ""
                 if not path.is_absolute or meant[path.name]:
                     continue
             if path.name in names.RESERVED_BODIES:
@@ -593,7 +583,7 @@ class _FrameTreeReader(ElementReader):
                 source = frame.parent_source
                 self.frames[path.name] = _FrameInstance(path.name, "", Pose.identity(), source, source, ROOT)
                 self.builder.add_problem(
-                    Severity.NOTE, f"Parent {label(frame.parent)} is not in the file; it becomes a root", source
+                    Severity.NOTE, f"Parent {common.label(frame.parent)} is not in the file; it becomes a root", source
                 )
 
     def resolve_shared_names(self, several: list[str]) -> None:
@@ -621,8 +611,8 @@ class _FrameTreeReader(ElementReader):
         paths = ["/".join(self.list_names(each) or ()) for each in fitting]
         chosen = "/".join(self.list_names(self.parents[key]) or ())
         self.builder.add_warning(
-            f"Parent {label(frame.parent)} names {len(fitting)} frames: {', '.join(map(label, paths[:4]))}; "
-            f"{label(chosen)} is used",
+            f"Parent {common.label(frame.parent)} names {len(fitting)} frames: "
+            f"{', '.join(map(common.label, paths[:4]))}; {common.label(chosen)} is used",
             frame.parent_source,
             "write the path of the one that is meant",
         )
@@ -645,11 +635,13 @@ class _FrameTreeReader(ElementReader):
             frame = self.frames[key]
             path = frame.path
             if path not in meant:
-                meant[path] = self.suggest_parent(frame) if len(meant) < MAX_SUGGESTIONS else ""
+                meant[path] = self.suggest_parent(frame) if len(meant) < common.MAX_SUGGESTIONS else ""
             near = meant[path]
             why = ""
             if self.parents.get(key):
-                why = f": {label(path.name)} is {label('/'.join(self.list_names(self.parents[key]) or ()))}"
+                why = (
+                    f": {common.label(path.name)} is {common.label('/'.join(self.list_names(self.parents[key]) or ()))}"
+                )
             self.builder.add_error(
                 f"Parent names {quote(frame.parent)}, which does not exist{why}",
                 frame.parent_source,
@@ -679,10 +671,10 @@ class _FrameTreeReader(ElementReader):
 
     def has_no_cycles(self) -> bool:
         is_tree = True
-        for cycle in find_cycles(self.frames, lambda key: self.parents.get(key) or None):
+        for cycle in common.find_cycles(self.frames, lambda key: self.parents.get(key) or None):
             is_tree = False
             self.builder.add_error(
-                f"parents form a cycle: {' in '.join(map(label, cycle))}",
+                f"parents form a cycle: {' in '.join(map(common.label, cycle))}",
                 self.frames[cycle[-1]].parent_source,
                 "one of them must have a Parent outside the cycle, or an empty one",
             )
@@ -710,7 +702,7 @@ class _FrameTreeReader(ElementReader):
                     bodies[key].pose = frame.pose
                 continue
             if frame.name == ORIGIN:
-                where = label(bodies[parent].name)
+                where = common.label(bodies[parent].name)
                 message = f"a frame in {where} is named {ORIGIN}, which is the name of the frame of {where} itself"
                 self.builder.add_error(message, frame.source, "rename it")
                 continue

@@ -12,15 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from modelserver.errors import has_error, quote, suggest_name
-from modelserver.formats.common import (
-    LARGEST_SIGMA,
-    LARGEST_SURVEY_SIGMA,
-    MAX_POSITION,
-    ElementReader,
-    looks_like_degrees,
-    looks_like_radians,
-    parse_number,
-)
+from modelserver.formats import common
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.parts import RigidInertia, Rows, Sigma
@@ -30,7 +22,7 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 from modelserver.yaml_tree import NodeKind, YamlNode
 
 
-class YamlMapping(ElementReader):
+class YamlMapping(common.ElementReader):
     """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
 
     Null values are left out of the fields; unknown and duplicate keys are errors.
@@ -97,7 +89,7 @@ class YamlMapping(ElementReader):
         try:
             if not node.is_plain:
                 raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
-            return parse_number(node.text)
+            return common.parse_number(node.text)
         except ValueError as error:
             self.error(f"{key}: {error}", fix, node.line)
             return None
@@ -183,7 +175,7 @@ def _read_rotation(at: YamlMapping, key: str) -> Quaternion | None:
 def check_unit(at: YamlMapping, angles: Iterable[float], key: str, line: int) -> None:
     """Warn of angles that look like those of the other unit."""
     is_degrees = key.endswith("_deg")
-    is_other = looks_like_radians if is_degrees else looks_like_degrees
+    is_other = common.looks_like_radians if is_degrees else common.looks_like_degrees
     found = next((each for each in angles if math.isfinite(each) and is_other(each)), None)
     if found is None:
         return
@@ -250,7 +242,7 @@ def read_sigma(owner: YamlMapping) -> SigmaDefaults | None:
     found = {key: _read_deviations(at, node, key, units[key]) for key, node in at.fields.items()}
     if degrees := found.get("rpy_deg"):
         found["rpy"] = so3.to_vector3(map(math.radians, degrees))
-    elif (turn := max(found.get("rpy") or (0.0,))) >= LARGEST_SURVEY_SIGMA:
+    elif (turn := max(found.get("rpy") or (0.0,))) >= common.LARGEST_SURVEY_SIGMA:
         at.warning(
             f"rpy: a sigma of {turn:g} rad ({math.degrees(turn):.0f} deg)",
             "write rpy_deg where degrees are meant",
@@ -411,7 +403,7 @@ class _YamlJointReader:
             if is_degrees:
                 check_unit(at, value, name, node.line)
                 value = tuple(map(math.radians, value))
-            if key == "sigma" and is_angle and value[0] >= LARGEST_SIGMA:
+            if key == "sigma" and is_angle and value[0] >= common.LARGEST_SIGMA:
                 size = f"{value[0]:g} rad ({math.degrees(value[0]):.0f} deg)"
                 at.warning(f"a sigma of {size} of a joint", "write sigma_deg where degrees are meant", node.line)
             return {"": value}
@@ -476,8 +468,8 @@ class _YamlJointReader:
 
     def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
         value = self.at.read_number(node, key, fix)
-        if value is not None and abs(value) > MAX_POSITION:
-            self.at.error(f"{key}: {value:g} is out of reach; the limit is {MAX_POSITION:g}", fix, node.line)
+        if value is not None and abs(value) > common.MAX_POSITION:
+            self.at.error(f"{key}: {value:g} is out of reach; the limit is {common.MAX_POSITION:g}", fix, node.line)
             return None
         return value
 

@@ -44,22 +44,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from modelserver import earth
+from modelserver import earth, messages
 from modelserver.earth.geodesy import Geodesy, LocalFrame, rotation_about_up
-from modelserver.messages import (
-    NAN,
-    Direction,
-    FixType,
-    GpsSample,
-    ImuSample,
-    OrientationReference,
-    SensorHeader,
-    VehicleMode,
-    VehicleStatusSample,
-    WheelSample,
-    WheelsSample,
-    YawSource,
-)
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -183,7 +169,7 @@ class Run:
 
     def generate_headers(
         self, timing: Timing, name: str, device_epoch: int | None = None
-    ) -> Iterator[tuple[SensorHeader, float]]:
+    ) -> Iterator[tuple[messages.SensorHeader, float]]:
         """Yield the header of each sample of `kind/source` without end, and its instant in seconds since the start.
 
         `device_epoch` is the utime at which the device's own clock shows 0; None for a second before the start.
@@ -196,7 +182,9 @@ class Run:
             utime = self.start_utime + round(seq * 1e6 / timing.rate_hz)
             delay = timing.latency + (abs(noise.normal(timing.jitter)) if timing.jitter else 0.0)
             arrived = max(arrived, utime + round(delay * 1e6))
-            header = SensorHeader(utime, source, seq, host_utime=arrived, device_utime=utime - epoch, utime_sigma=0.0)
+            header = messages.SensorHeader(
+                utime, source, seq, host_utime=arrived, device_utime=utime - epoch, utime_sigma=0.0
+            )
             yield header, (utime - self.start_utime) * 1e-6
             seq += 1
 
@@ -250,10 +238,10 @@ def apply_rows(M: Rows, v: Vector3) -> Vector3:
 
 
 _HALF = math.sqrt(0.5)
-_REFERENCE: dict[OrientationReference, Quaternion] = {
-    OrientationReference.ENU: so3.IDENTITY,
+_REFERENCE: dict[messages.OrientationReference, Quaternion] = {
+    messages.OrientationReference.ENU: so3.IDENTITY,
     # rotates east, north, up to north, east, down: half a turn about the axis between east and north
-    OrientationReference.NED: (0.0, _HALF, _HALF, 0.0),
+    messages.OrientationReference.NED: (0.0, _HALF, _HALF, 0.0),
 }
 
 
@@ -292,22 +280,22 @@ class ImuModel:
     tilt_sigma: float = 0.004
     tilt_noise: float = 0.001
     yaw_offset: float | None = None
-    reference: OrientationReference = OrientationReference.NED
+    reference: messages.OrientationReference = messages.OrientationReference.NED
     earth_rotation: bool = True
     gyro: TriadErrors | None = None
     accelerometer: TriadErrors | None = None
     magnetometer: MagnetometerModel | None = None
-    yaw_source: YawSource = YawSource.NONE
+    yaw_source: messages.YawSource = messages.YawSource.NONE
     yaw_sigma: float = 0.0
     yaw_noise: float = 0.0
     frozen_from: float | None = None
     outages: Intervals = ()
 
 
-def simulate_imu(model: ImuModel, run: Run, X_VS: Pose) -> Iterator[ImuSample]:
+def simulate_imu(model: ImuModel, run: Run, X_VS: Pose) -> Iterator[messages.ImuSample]:
     """Yield samples without end. `X_VS` is the pose of the sensor axes in the vehicle's moving frame."""
     unit = _SimulatedImu(model, run, X_VS)
-    last: ImuSample | None = None
+    last: messages.ImuSample | None = None
     for header, t in run.generate_headers(model.timing, "imu/imu"):
         if last is None or model.frozen_from is None or t < model.frozen_from:
             last = unit.sample(header, t)
@@ -339,7 +327,7 @@ class _SimulatedImu:
         # standard deviation of a uniform angle
         yaw_sigma = math.pi / math.sqrt(3.0)
         self.yaw_noise = run.noise("imu/imu/yaw")
-        if model.yaw_source is not YawSource.NONE:
+        if model.yaw_source is not messages.YawSource.NONE:
             self.yaw_error = (model.yaw_offset or 0.0) + self.yaw_noise.normal(model.yaw_sigma)
             yaw_sigma = max(math.hypot(model.yaw_sigma, model.yaw_noise), 1e-4)
         tilt_sigma = max(math.hypot(model.tilt_sigma, model.tilt_noise), 1e-4)
@@ -352,7 +340,7 @@ class _SimulatedImu:
         )
         self.magnetometer_noise = run.noise("imu/imu/magnetometer").prefetch()
 
-    def sample(self, header: SensorHeader, t: float) -> ImuSample:
+    def sample(self, header: messages.SensorHeader, t: float) -> messages.ImuSample:
         model, noise, lever, turning = self.model, self.noise, self.X_VS.xyz, self.earth_rate
         magnetometer = model.magnetometer
         motion = self.drive.at(t)
@@ -370,12 +358,12 @@ class _SimulatedImu:
         rate = so3.add(rate, self.gyro_bias, noise.vector(self.gyro_sigma))
         force = so3.add(force, self.accelerometer_bias, noise.vector(self.accelerometer_sigma))
         orientation = None
-        if model.reference is not OrientationReference.NONE:
+        if model.reference is not messages.OrientationReference.NONE:
             orientation = self._orientation(t, q_ES)
-            if model.yaw_source is YawSource.NONE:
+            if model.yaw_source is messages.YawSource.NONE:
                 # yaw integrates the gyros, and so their error
                 self.yaw_error += (so3.rotate(q_ES, rate)[2] - turn[2]) / model.timing.rate_hz
-        return ImuSample(
+        return messages.ImuSample(
             header,
             angular_velocity=rate,
             specific_force=force,
@@ -393,9 +381,9 @@ class _SimulatedImu:
         x, y, _ = so3.add(self.tilt, self.noise.vector(model.tilt_noise))
         tilted = so3.exponential((x, y, 0.0))
         error = self.yaw_error
-        if model.yaw_source is not YawSource.NONE:
+        if model.yaw_source is not messages.YawSource.NONE:
             error += self.yaw_noise.normal(model.yaw_noise)
-            if model.yaw_source is YawSource.MAGNETIC and model.magnetometer is not None:
+            if model.yaw_source is messages.YawSource.MAGNETIC and model.magnetometer is not None:
                 east, north, _ = model.magnetometer.ambient_field(t)
                 # declination is clockwise from true north; yaw relative to magnetic north is larger by it
                 error += math.atan2(east, north)
@@ -455,11 +443,11 @@ class GpsModel:
     vertical: float = 1.5
     velocity_sigma: float = 0.03
     velocity_latency: float = 0.0
-    fix_type: FixType = FixType.DIFFERENTIAL
+    fix_type: messages.FixType = messages.FixType.DIFFERENTIAL
     satellites: int = 9
     hdop: float = 0.9
     outages: Intervals = ()
-    undulation: float = NAN
+    undulation: float = messages.NAN
     unstated_latency: float = 0.0
     jumps: tuple[tuple[float, float, float, float], ...] = ()
     sigma_factor: float = 1.0
@@ -467,7 +455,9 @@ class GpsModel:
     baseline_sigma: float = 0.003
 
 
-def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector3 | None = None) -> Iterator[GpsSample]:
+def simulate_fixes(
+    model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector3 | None = None
+) -> Iterator[messages.GpsSample]:
     """Yield fixes without end. `X_VA` is the antenna's pose in the vehicle's moving frame.
 
     Position is on the ellipsoid; velocity is along true east, north and up at the antenna's position. `second_antenna`
@@ -493,7 +483,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
         velocity_error = noise.vector(model.velocity_sigma)
         baseline_error = baseline_noise.normal(model.baseline_sigma) if baseline else 0.0
         if is_within(model.outages, t):
-            yield GpsSample(header, FixType.NONE, NAN, NAN, satellites=0)
+            yield messages.GpsSample(header, messages.FixType.NONE, messages.NAN, messages.NAN, satellites=0)
             continue
         for begin, end, east, north in model.jumps:
             if begin <= t < end:
@@ -502,7 +492,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
         motion = drive.at(t - model.unstated_latency)
         x, y, z = motion.pose_of(X_VA).xyz
         latitude, longitude, height = geodesy.geodetic_from_enu((x + error[0], y + error[1], z + error[2]))
-        sample = GpsSample(
+        sample = messages.GpsSample(
             header,
             model.fix_type,
             latitude,
@@ -563,7 +553,7 @@ class Encoder:
         self._scale = 1.0 + noise.normal(model.scale_sigma)
         self._rotated = 0.0
 
-    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> messages.WheelSample:
         """Return the encoder's sample at `t` seconds.
 
         `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
@@ -571,7 +561,7 @@ class Encoder:
         model, seen = self._model, self._scale * excess
         error = self._noise.normal(model.speed_sigma) if abs(speed) > model.stationary_speed else 0.0
         self._rotated += rolled * seen
-        return WheelSample(
+        return messages.WheelSample(
             self._name,
             travel=quantize(self._rotated, model.travel_step),
             travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4),
@@ -609,13 +599,13 @@ class WheelsModel:
     encoder: Callable[[WheelsModel, str, NoiseSource, Run], Encoder] = Encoder
 
 
-def _direction(speed: float, stationary_speed: float) -> Direction:
+def _direction(speed: float, stationary_speed: float) -> messages.Direction:
     if abs(speed) <= stationary_speed:
-        return Direction.STOPPED
-    return Direction.FORWARD if speed > 0 else Direction.BACKWARD
+        return messages.Direction.STOPPED
+    return messages.Direction.FORWARD if speed > 0 else messages.Direction.BACKWARD
 
 
-def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3]) -> Iterator[WheelsSample]:
+def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3]) -> Iterator[messages.WheelsSample]:
     """Yield samples without end. `contacts` has each wheel's contact point in the vehicle's moving frame, meters."""
     noise = run.noise("wheels/wheels")
     encoders = {name: model.encoder(model, name, noise, run) for name in contacts}
@@ -634,7 +624,7 @@ def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3
                 forward, turn, pitch = _rates(motion)
                 speed, steering = forward - contact[1] * turn + contact[2] * pitch, 0.0
             wheels.append(encoders[name].sample(t, distances[name], speed, 1.0 + slip, steering))
-        yield WheelsSample(header, tuple(wheels))
+        yield messages.WheelsSample(header, tuple(wheels))
 
 
 class _WheelOdometry:
@@ -688,13 +678,13 @@ class StatusModel:
     angle_error: float = 0.0
 
 
-def simulate_status(model: StatusModel, run: Run) -> Iterator[VehicleStatusSample]:
+def simulate_status(model: StatusModel, run: Run) -> Iterator[messages.VehicleStatusSample]:
     """Yield the controller's samples without end: forward speed and steering angle of the equivalent front wheel."""
     noise = run.noise("status/vehicle")
     for header, t in run.generate_headers(model.timing, "status/vehicle"):
         motion = run.drive.at(t)
         angle = math.atan(motion.curvature * model.wheelbase) + model.angle_error + noise.normal(model.angle_sigma)
-        yield VehicleStatusSample(header, VehicleMode.AUTONOMOUS, motion.speed, angle)
+        yield messages.VehicleStatusSample(header, messages.VehicleMode.AUTONOMOUS, motion.speed, angle)
 
 
 def _rates(motion: TrajectoryMotion) -> Vector3:
