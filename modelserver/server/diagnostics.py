@@ -328,7 +328,7 @@ def get_granted_buffer(size: int) -> int:
 def count_dropped(port: int, proc: Path = PROC) -> int | None:
     """Count the packets that the sockets on a port have lost, at most; None if unknown.
 
-    The kernel counts packets that a socket filter drops (`wire.socket_filter`) as drops of the socket, too. Its count
+    The kernel counts packets that a socket filter drops (`wire.provider`) as drops of the socket, too. Its count
     of full buffers has only lost ones, but those of all ports.
     """
     try:
