@@ -29,7 +29,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import yaml
@@ -595,14 +595,8 @@ class ModelSnapshot:
     """Microseconds by which the stamps on `joints_channel` are later than the measurement."""
 
 
-_SETTINGS: Final[dict[str, Callable[[Any], Any]]] = {
-    "vehicle": str,
-    "base_frame": str,
-    "rolling_frame": str,
-    "history_s": float,
-    "joints_channel": str,
-    "joints_latency_us": int,
-}
+_KINDS: Final[dict[Any, Callable[[Any], Any]]] = {"str": str, "float": float, "int": int}
+_SETTINGS: Final = {each.name: _KINDS[each.type] for each in fields(ModelSnapshot) if each.name != "model"}
 
 
 def encode_snapshot(snapshot: ModelSnapshot) -> bytes:

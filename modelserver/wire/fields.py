@@ -437,14 +437,6 @@ def unpack_pose_vector(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     return _make_answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, rest)
 
 
-def skip_pose_transform(data: bytes, at: int) -> int:
-    return _find_pose_end(data, at, _MATRIX.size)
-
-
-def skip_pose_vector(data: bytes, at: int) -> int:
-    return _find_pose_end(data, at, _STATE_VECTOR.size)
-
-
 def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
     transformation, origin, quality, *bounds = answer[:-2]
     covariance = transformation.covariance_numbers
@@ -481,6 +473,10 @@ def _find_pose_end(data: bytes, at: int, size: int) -> int:
     at = _read_pose_head(data, at)[3] + size + _NUMBERS.size
     _REST.unpack_from(data, at)
     return read_text(data, at + _REST.size)[1]
+
+
+skip_pose_transform = partial(_find_pose_end, size=_MATRIX.size)
+skip_pose_vector = partial(_find_pose_end, size=_STATE_VECTOR.size)
 
 
 def _make_answer(

@@ -137,8 +137,6 @@ def handle_message(bus: lcm.LCM, milliseconds: int = 0) -> bool:
 SCHEMES: Final = ("udpm", "mpudpm", "tcpq", "file", "memq")
 """Providers that liblcm has."""
 
-EXAMPLE: Final = "udpm://239.255.76.67:7667?ttl=0"
-
 _MULTICAST: Final = ("udpm", "mpudpm")
 
 _NUMBER: Final = re.compile(r"\s*[+-]?(0[xX][0-9a-fA-F]+|\d+)")
@@ -149,15 +147,15 @@ def find_url_problem(url: str) -> str:
     scheme, found, rest = url.partition("://")
     place, _, options = rest.partition("?")
     if not found or scheme not in SCHEMES:
-        return f"{quote(url, 40)} is no URL of LCM's, which has {', '.join(SCHEMES)}; write it like {EXAMPLE}"
+        return f"{quote(url, 40)} is no URL of LCM's, which has {', '.join(SCHEMES)}; write it like {DEFAULT_URL}"
     if scheme == "memq":
-        return f"memq:// does not leave the process, so no other program receives it; write {EXAMPLE}"
+        return f"memq:// does not leave the process, so no other program receives it; write {DEFAULT_URL}"
     if scheme == "file" and not place:
         return "it names no log; write file:///path/of/log"
     if scheme in _MULTICAST and not (_is_multicast(place, scheme) and all(map(_is_valid_ttl, options.split("&")))):
         return (
             f"{quote(rest, 60)} is no multicast address: a group between 224.0.0.0 and 239.255.255.255, a port from 1 "
-            f"to 65535, and a ttl from 0 (this machine) to 255; write it like {EXAMPLE}"
+            f"to 65535, and a ttl from 0 (this machine) to 255; write it like {DEFAULT_URL}"
         )
     return ""
 
