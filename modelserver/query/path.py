@@ -344,22 +344,14 @@ def explain(
         share = shares[link.source]
         large_angle = shares.get((*link.source, chain.LARGE_ANGLE), _EXACT)
         traces.append((float(np.sum(share[:3] ** 2) + np.sum(large_angle**2)), float(np.sum(share[3:] ** 2))))
-    position, rotation = (sum(each[side] for each in traces) for side in (0, 1))
+    of_edges = np.array(traces).reshape(-1, 2)
+    whole = of_edges.sum(axis=0)
+    of_edges /= np.where(whole > 0.0, whole, 1.0)
+    of_edges[[step.factor is None for step in path.steps]] = messages.NAN
+    edges = zip(path.steps, of_edges.tolist(), strict=True)
     return messages.Explanation(
-        answer,
-        tuple(
-            _build_edge_report(
-                view, step, (_share(trace[0], position, step), _share(trace[1], rotation, step)), time, now
-            )
-            for step, trace in zip(path.steps, traces, strict=True)
-        ),
+        answer, tuple(_build_edge_report(view, step, share, time, now) for step, share in edges)
     )
-
-
-def _share(own: float, whole: float, step: PathStep) -> float:
-    if step.factor is None:
-        return messages.NAN
-    return own / whole if whole > 0.0 else 0.0
 
 
 def _describe_warning(view: PlatformView, step: PathStep, time: messages.TimeQuery, now: int) -> str:
@@ -393,7 +385,7 @@ def _describe_source(view: PlatformView, leader: str, step: PathStep) -> str:
 
 
 def _build_edge_report(
-    view: PlatformView, step: PathStep, shares: tuple[float, float], time: messages.TimeQuery, now: int
+    view: PlatformView, step: PathStep, shares: list[float], time: messages.TimeQuery, now: int
 ) -> messages.EdgeReport:
     edge = step.edge
     X = step.X_FT if edge.forward else step.X_FT.inverse()
@@ -405,18 +397,16 @@ def _build_edge_report(
     elif step.readings:
         source = _describe_source(view, view.model.drives[edge.name].leader, step)
         warning = _describe_warning(view, step, time, now)
-    constraint = None
-    if edge.kind in (EdgeKind.CONSTRAINT, EdgeKind.JOINT):
-        constraint = next(each for each in view.model.constraints if each.name == edge.name)
+    ends = (edge.name.partition(":")[0], edge.name)
+    if edge.kind is EdgeKind.VEHICLE:
+        ends = (edge.name, view.rolling_frame)
+    elif edge.kind is not EdgeKind.FRAME:
+        ends = next((each.from_, each.to) for each in view.model.constraints if each.name == edge.name)
     return messages.EdgeReport(
         kind=edge.kind.value,
         name=edge.name,
         forward=edge.forward,
-        ends=(constraint.from_, constraint.to)
-        if constraint is not None
-        else (edge.name, view.rolling_frame)
-        if edge.kind is EdgeKind.VEHICLE
-        else (edge.name.partition(":")[0], edge.name),
+        ends=ends,
         pose=X,
         provenance=provenance,
         stamp=stamp,
