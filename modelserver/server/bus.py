@@ -25,16 +25,7 @@ from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
 from modelserver.server.clock import FakeClock
-from modelserver.wire.provider import (
-    MESSAGE_OVERHEAD_BYTES,
-    Message,
-    Receiver,
-    Sender,
-    open_lcm,
-    open_receiver,
-    parse_udp_address,
-    resolve_url,
-)
+from modelserver.wire import provider
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +38,7 @@ class MulticastMembership:
 
     def __init__(self, url: str):
         self._request = b""
-        address = parse_udp_address(url)
+        address = provider.parse_udp_address(url)
         if address is not None and address.group in url:
             # the interface is that of the group's route, as for LCM
             with contextlib.suppress(OSError):  # no address: LCM reports it
@@ -97,7 +88,7 @@ MAX_SAMPLE_BYTES: Final = 1 << 20
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Longest messages that are received: a message of 15 MB would cost several ticks before it is rejected."""
 
-Handler: TypeAlias = Callable[[str, bytes, Sender], None]
+Handler: TypeAlias = Callable[[str, bytes, provider.Sender], None]
 """Channel, data, and who has sent it."""
 
 Inboxes: TypeAlias = Literal["samples", "requests", "both"]
@@ -117,11 +108,11 @@ class ReceiverInbox:
     short, and all channels share it. Beyond these bytes they are dropped. 0: they wait in the receive buffer.
     """
 
-    def __init__(self, receiver: Receiver, queue_bytes: int = 0):
+    def __init__(self, receiver: provider.Receiver, queue_bytes: int = 0):
         self._receiver = receiver
         self._queue_bytes = queue_bytes
         self._handlers: dict[bytes, tuple[str, list[Handler]]] = {}
-        self._queue: deque[Message] = deque()
+        self._queue: deque[provider.Message] = deque()
         self._queued_bytes: dict[bytes, int] = {}
         self.fileno = receiver.fileno
         self.expected: int | None = None
@@ -177,7 +168,7 @@ class ReceiverInbox:
         self._read_ahead()
         return limit
 
-    def _handle(self, message: Message | None) -> int:
+    def _handle(self, message: provider.Message | None) -> int:
         if message is None:
             return 0
         known = self._handlers.get(message[0])
@@ -187,9 +178,9 @@ class ReceiverInbox:
                 handler(channel, message[1], message[2])
         return 1
 
-    def _pop(self) -> Message:
+    def _pop(self) -> provider.Message:
         message = self._queue.popleft()
-        self._queued_bytes[message[0]] -= len(message[1]) + MESSAGE_OVERHEAD_BYTES
+        self._queued_bytes[message[0]] -= len(message[1]) + provider.MESSAGE_OVERHEAD_BYTES
         return message
 
     def _read_ahead(self) -> None:
@@ -198,7 +189,7 @@ class ReceiverInbox:
             message = self._receiver.receive()
             if message is None:
                 return
-            size = self._queued_bytes.get(message[0], 0) + len(message[1]) + MESSAGE_OVERHEAD_BYTES
+            size = self._queued_bytes.get(message[0], 0) + len(message[1]) + provider.MESSAGE_OVERHEAD_BYTES
             if size <= self._queue_bytes:
                 self._queued_bytes[message[0]] = size
                 self._queue.append(message)
@@ -208,10 +199,10 @@ class LcmBus:
     """Bus on LCM. Make it after forking, never before: liblcm may have a thread of its own."""
 
     def __init__(self, url: str = ""):
-        self.url = resolve_url(url)
-        self.publish = open_lcm(self.url).publish
-        self.sensors = ReceiverInbox(open_receiver(self.url, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
-        self.requests = ReceiverInbox(open_receiver(self.url, MAX_REQUEST_BYTES))
+        self.url = provider.resolve_url(url)
+        self.publish = provider.open_lcm(self.url).publish
+        self.sensors = ReceiverInbox(provider.open_receiver(self.url, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
+        self.requests = ReceiverInbox(provider.open_receiver(self.url, MAX_REQUEST_BYTES))
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)
@@ -255,12 +246,12 @@ class FakeInbox:
     def __init__(self, clock: FakeClock) -> None:
         self._clock = clock
         self._handlers: dict[str, list[Handler]] = {}
-        self._queue: deque[tuple[str, bytes, Sender]] = deque()
+        self._queue: deque[tuple[str, bytes, provider.Sender]] = deque()
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         self._handlers.setdefault(channel, []).append(handler)
 
-    def put(self, channel: str, data: bytes, sender: Sender = None) -> None:
+    def put(self, channel: str, data: bytes, sender: provider.Sender = None) -> None:
         if channel in self._handlers:
             self._queue.append((channel, data, sender))
 

@@ -37,7 +37,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import BusError, quote
@@ -253,23 +253,6 @@ MAX_PARTIAL: Final = 256
 dropped."""
 
 
-class Receiver(Protocol):
-    """Queue of received messages. `fileno` is readable if one may have arrived."""
-
-    fileno: int
-    refused: Counter[bytes]
-    """Messages that are too long, by channel."""
-
-    def subscribe(self, channel: str) -> None:
-        """Receive the messages of a channel too."""
-
-    def receive(self) -> Message | None:
-        """Return the next message that has arrived, None without one. It does not wait."""
-
-    def close(self) -> None:
-        """Leave the bus."""
-
-
 def open_receiver(url: str, max_bytes: int = MAX_PARTIAL_BYTES) -> Receiver:
     """Join the bus to receive; longer messages than `max_bytes` are refused. Raises BusError with hints."""
     address = parse_udp_address(url)
@@ -383,7 +366,10 @@ def _join(partial: _PartialMessage, sender: Sender) -> Message | None:
 
 
 class UdpReceiver:
-    """Receiver on a multicast group, whose queue is the socket's receive buffer. Raises OSError."""
+    """Receiver on a multicast group, whose queue is the socket's receive buffer. Raises OSError.
+
+    `fileno` is readable if a message may have arrived; `refused` counts those that are too long, by channel.
+    """
 
     def __init__(self, address: UdpAddress, max_bytes: int = MAX_PARTIAL_BYTES):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -411,7 +397,7 @@ class UdpReceiver:
         set_channel_filter(self._socket, self._assembler.channels)
 
     def receive(self) -> Message | None:
-        """See `Receiver`."""
+        """Return the next message that has arrived, None without one. It does not wait."""
         for _ in range(MAX_IGNORED):
             try:
                 packet, sender = self._receive(MAX_PACKET)
@@ -441,7 +427,7 @@ MESSAGE_OVERHEAD_BYTES: Final = 128
 
 
 class LcmReceiver:
-    """Receiver by liblcm, for other providers. It queues `MAX_QUEUED` messages of a channel, and drops further ones."""
+    """As `UdpReceiver`, by liblcm: for other providers. It queues `MAX_QUEUED` messages of a channel, and no more."""
 
     def __init__(self, url: str, max_bytes: int = MAX_PARTIAL_BYTES):
         self._bus = open_lcm(url)
@@ -452,7 +438,6 @@ class LcmReceiver:
         self._received: deque[Message] = deque()
 
     def subscribe(self, channel: str) -> None:
-        """See `Receiver`."""
         # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
         received, name, refused, max_bytes = self._received, channel.encode(), self.refused, self._max_bytes
 
@@ -476,6 +461,9 @@ class LcmReceiver:
         for each in self._subscriptions:
             self._bus.unsubscribe(each)
         self._subscriptions.clear()
+
+
+Receiver: TypeAlias = UdpReceiver | LcmReceiver
 
 
 # --- the socket filter ------------------------------------------------------------------------------------------------
