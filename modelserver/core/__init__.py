@@ -31,7 +31,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, get_args
+from typing import Any, Final, TypeAlias, get_args
 
 import numpy as np
 
@@ -579,7 +579,8 @@ class ModelLoaded:
     changes: tuple[str, ...] = ()
 
 
-COMMANDS: Final = (messages.ReloadModel, messages.SetStateVector, messages.SetHTransform)
+Command: TypeAlias = messages.ReloadModel | messages.SetStateVector | messages.SetHTransform
+COMMANDS: Final = get_args(Command)
 """Requests that must be signed."""
 
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())
@@ -594,9 +595,7 @@ UNSIGNED_MESSAGE: Final = (
 )
 
 
-def deny_unsigned(
-    state: CoreState, command: messages.ReloadModel | messages.SetStateVector | messages.SetHTransform, now: Instant
-) -> StepResult:
+def deny_unsigned(state: CoreState, command: Command, now: Instant) -> StepResult:
     """Deny a command without signature."""
     forbidden = _forbid(state, command, now)
     if forbidden is not None:
@@ -620,9 +619,7 @@ def execute_command(state: CoreState, signed: messages.SignedCommand, now: Insta
     )
 
 
-def _forbid(
-    state: CoreState, command: messages.ReloadModel | messages.SetStateVector | messages.SetHTransform, now: Instant
-) -> StepResult | None:
+def _forbid(state: CoreState, command: Command, now: Instant) -> StepResult | None:
     """Reject a command whose reply channel, or which itself, is not permitted; None if it is."""
     channel, settings = messages.CHANNEL_OF[type(command)], state.settings
     if not is_answerable(command.header, settings.reply_prefix):

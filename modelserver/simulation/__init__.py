@@ -15,6 +15,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from modelserver import messages
 from modelserver.earth.geodesy import Geodesy
@@ -27,15 +28,7 @@ from modelserver.transforms.so3 import Vector3, conjugate, rotate
 START_UTIME = 1_750_000_000_000_000
 """Default start of a simulation: a whole second in June 2025."""
 
-Event = (
-    messages.GpsSample
-    | messages.ImuSample
-    | messages.WheelsSample
-    | messages.VehicleStatusSample
-    | messages.AbsolutePoseSample
-    | messages.RelativePoseSample
-    | messages.RangeSample
-)
+Event: TypeAlias = messages.Sample
 
 
 @dataclass(frozen=True, slots=True)
