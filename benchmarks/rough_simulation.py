@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from modelserver.geometry.model import Model
@@ -38,12 +39,25 @@ from modelserver.simulation.sensors import (
     apply_rows,
     is_within,
 )
-from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
+from modelserver.simulation.trajectory import Attitude, Coefficients, MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 
 # --- ground and side slip -----------------------------------------------------------------------------------
+
+
+def compute_higher_rates(trajectory: Trajectory, t: float) -> Vector3:
+    """Return first and second rate of curvature (1/m/s, 1/m/s2) and jerk (m/s3, second rate of speed)."""
+    piece, u = trajectory._locate(t)
+    curvature, speed = piece.curvature_rate, piece.speed_rate
+    rates = (curvature, _derive(curvature, piece.duration), _derive(speed, piece.duration))
+    return so3.to_vector3(sum(c * u**n for n, c in enumerate(rate)) for rate in rates)
+
+
+@lru_cache(maxsize=4096)
+def _derive(coefficients: Coefficients, duration: float) -> Coefficients:
+    return tuple(n * each / duration for n, each in enumerate(coefficients))[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +102,7 @@ class SlipAngle:
     def at(self, t: float, motion: TrajectoryMotion, higher: Vector3) -> Vector3:
         """Return the slip angle at `t` seconds and its first and second rate, rad, rad/s, rad/s2.
 
-        `motion` is the trajectory's at `t`, and `higher` the result of `Trajectory.higher_rates`.
+        `motion` is the trajectory's at `t`, and `higher` the result of `compute_higher_rates`.
         """
         v, v1, v2 = motion.speed, motion.forward_acceleration, higher[2]
         size, sign = abs(v), math.copysign(1.0, v)
@@ -225,7 +239,7 @@ class GroundMotion:
         yaw, yaw_rate, yaw_acceleration = plan.yaw, plan.yaw_rate, plan.yaw_acceleration
         along, across = plan.speed, 0.0
         if self._slip is not None:
-            b, b1, b2 = self._slip.at(t, plan, self._trajectory.higher_rates(t))
+            b, b1, b2 = self._slip.at(t, plan, compute_higher_rates(self._trajectory, t))
             yaw, yaw_rate, yaw_acceleration = yaw - b, yaw_rate - b1, yaw_acceleration - b2
             along, across = plan.speed * math.cos(b), plan.speed * math.sin(b)
         cos, sin = math.cos(yaw), math.sin(yaw)

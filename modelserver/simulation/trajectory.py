@@ -172,15 +172,6 @@ class Trajectory:
         piece, u = self._locate(t)
         return piece.at(u)
 
-    def higher_rates(self, t: float) -> Vector3:
-        """Return first and second rate of curvature (1/m/s, 1/m/s2) and jerk (m/s3, second rate of speed)."""
-        piece, u = self._locate(t)
-        return (
-            _evaluate(piece.curvature_rate, u),
-            _evaluate(piece.curvature_rate_rate, u),
-            _evaluate(piece.jerk, u),
-        )
-
     def _locate(self, t: float) -> tuple[_Piece, float]:
         """Return the phase at an instant, and the share of its duration that is over."""
         t = min(max(t, 0.0), self.duration)
@@ -213,7 +204,6 @@ class _Piece:
         self.speed, self.curvature = _ramp(before[0], phase.speed), _ramp(before[1], phase.curvature)
         self.yaw_rate = _trim(polynomial.polymul(self.speed, self.curvature))
         self.speed_rate, self.curvature_rate = derive(self.speed), derive(self.curvature)
-        self.jerk, self.curvature_rate_rate = derive(self.speed_rate), derive(self.curvature_rate)
         self.yaw_acceleration = derive(self.yaw_rate)
         self.yaw, self.distance = integrate(self.yaw_rate, yaw), integrate(self.speed, distance)
         steps = max(1, math.ceil(duration / _KNOT_SECONDS))
