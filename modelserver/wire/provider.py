@@ -317,8 +317,12 @@ class FragmentAssembler:
         start = _FRAGMENT_HEADER.size
         if number == 0:
             end = packet.find(0, start)
-            if partial is None and end > start:
-                partial = self._begin(sender, packet[start:end], sequence, size, count)
+            channel = packet[start:end]
+            if partial is None and end > start and channel in self.channels:
+                if size <= self._max_bytes:
+                    partial = self._partial[sender] = _PartialMessage(sequence, size, count, channel)
+                else:
+                    self.refused[channel] += 1
             start = end + 1
         if partial is None:
             return None
@@ -339,30 +343,19 @@ class FragmentAssembler:
             self._drop(next(iter(self._partial)))
         return None
 
-    def _begin(self, sender: Sender, channel: bytes, sequence: int, size: int, count: int) -> _PartialMessage | None:
-        if channel not in self.channels:
-            return None
-        if size > self._max_bytes:
-            self.refused[channel] += 1
-            return None
-        partial = self._partial[sender] = _PartialMessage(sequence, size, count, channel)
-        return partial
-
     def _drop(self, sender: Sender) -> None:
         self.partial_bytes -= self._partial.pop(sender).received
 
 
 def _join(partial: _PartialMessage, sender: Sender) -> Message | None:
     """Return a message of which all fragments are there; None if they leave a gap, or overlap."""
+    fragments = [partial.parts[number] for number in range(partial.count)]
     at = 0
-    for number in range(partial.count):
-        offset, data = partial.parts[number]
+    for offset, data in fragments:
         if offset != at:
             return None
         at += len(data)
-    if at != partial.size:
-        return None
-    return partial.channel, b"".join(partial.parts[number][1] for number in range(partial.count)), sender
+    return (partial.channel, b"".join(data for _, data in fragments), sender) if at == partial.size else None
 
 
 class UdpReceiver:
