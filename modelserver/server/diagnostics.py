@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import BusError, WireError, quote
 from modelserver.messages import Gauges, Health
+from modelserver.server.log import RateLimiter
 from modelserver.wire import provider
 from modelserver.wire.channels import PROBE_CHANNEL, to_subscription_pattern
 from modelserver.wire.codec import decode
@@ -410,8 +411,7 @@ class DuplicateServerMonitor:
         self._set_warning = set_warning
         self._clock = clock
         self._received_ns = 0
-        self._window_ns = 0
-        self._reports = 0
+        self._limiter = RateLimiter(MAX_REPORTS_PER_S)
         self._warning = ""
 
     def subscribe(self, inbox: Inbox, prefix: str) -> None:
@@ -419,10 +419,7 @@ class DuplicateServerMonitor:
 
     def on_health(self, channel: str, data: bytes, sender: Sender = None) -> None:
         now = self._clock.monotonic_ns()
-        if now - self._window_ns >= 1_000_000_000:
-            self._window_ns, self._reports = now, 0
-        self._reports += 1
-        if self._reports > MAX_REPORTS_PER_S:
+        if not self._limiter.try_acquire(channel, now):
             return
         try:
             health: Health = decode("health_t", data)

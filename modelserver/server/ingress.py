@@ -38,7 +38,7 @@ one. A stranger with the source of the sensor, that is first and as fast as one,
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Container, Hashable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -49,7 +49,7 @@ from modelserver.core import Instant
 from modelserver.errors import WireError, quote
 from modelserver.named_tuples import new_tuple
 from modelserver.server.journal import JournalQueue
-from modelserver.server.log import RateLimitedLog
+from modelserver.server.log import SECOND_NS, RateLimitedLog, RateLimiter
 from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode, encode, read_request_header
@@ -107,26 +107,6 @@ MAX_PER_SECOND: Final = 8
 MAX_RECORDED_BYTES: Final = 512
 """Bytes that the journal records of a message that is not used."""
 
-SECOND_NS: Final = 1_000_000_000
-
-
-class RateLimiter:
-    """Limits events by name: `per_second` in each window of a second, which starts with the first event."""
-
-    def __init__(self, per_second: int = MAX_PER_SECOND):
-        self._per_second = per_second
-        self._windows: dict[Hashable, tuple[int, int]] = {}
-
-    def try_acquire(self, name: Hashable, now_ns: int) -> bool:
-        """Count an event at an instant (monotonic, ns); return whether it is within the limit."""
-        begin, used = self._windows.get(name, (now_ns, 0))
-        if now_ns - begin >= SECOND_NS:
-            begin, used = now_ns, 0
-        if used >= self._per_second:
-            return False
-        self._windows[name] = (begin, used + 1)
-        return True
-
 
 class RejectionCounter:
     """Counts rejected messages and records some of them, within rate limits. `step` passes an event to the core.
@@ -137,7 +117,7 @@ class RejectionCounter:
     def __init__(self, step: Callable[[messages.Rejected, Instant], None], journal: JournalQueue):
         self._step = step
         self._journal = journal
-        self._records, self._events = RateLimiter(), RateLimiter()
+        self._records, self._events = RateLimiter(MAX_PER_SECOND), RateLimiter(MAX_PER_SECOND)
         self._waiting: dict[tuple[str, str], int] = {}
         self._flushed_ns = 0
 
