@@ -315,24 +315,16 @@ def figure_eight(
     hold = _LOOP_ANGLE / (speed * curvature) - ramp
     if hold <= 0:
         raise ValueError(f"a loop of {radius:g} m at {speed:g} m/s is shorter than {ramp:g} s of steering")
-    # length of the straights for which the tangents at both ends of a loop meet in the crossing
-    probe = Trajectory(
-        (
-            DrivePhase(ramp, speed),
-            DrivePhase(ramp, curvature=curvature),
-            DrivePhase(hold),
-            DrivePhase(ramp, curvature=0.0),
-            DrivePhase(1.0, 0.0),
-        )
-    )
-    (x0, _, _), (x1, _, _) = probe.at(ramp).position, probe.at(3 * ramp + hold).position
-    half = (x0 - x1) / (1.0 + math.cos(_LOOP_ANGLE)) / speed
-    if half <= 0:
-        raise ValueError(f"ramp {ramp:g} s is too long for a loop of {radius:g} m at {speed:g} m/s")
 
     def loop(side: float) -> tuple[DrivePhase, ...]:
         return (DrivePhase(ramp, curvature=side * curvature), DrivePhase(hold), DrivePhase(ramp, curvature=0.0))
 
+    # length of the straights for which the tangents at both ends of a loop meet in the crossing
+    probe = Trajectory((DrivePhase(ramp, speed), *loop(1.0), DrivePhase(1.0, 0.0)))
+    (x0, _, _), (x1, _, _) = probe.at(ramp).position, probe.at(3 * ramp + hold).position
+    half = (x0 - x1) / (1.0 + math.cos(_LOOP_ANGLE)) / speed
+    if half <= 0:
+        raise ValueError(f"ramp {ramp:g} s is too long for a loop of {radius:g} m at {speed:g} m/s")
     lap = [DrivePhase(half), *loop(1.0), DrivePhase(2.0 * half), *loop(-1.0), DrivePhase(half)]
     halt = [DrivePhase(ramp, 0.0), DrivePhase(max(stop, 1.0))]
     if stop > 0 or reverse > 0:
