@@ -448,11 +448,8 @@ class _FrameTreeReader(common.ElementReader):
             filled, missing = self.substitute(text)
             if missing:
                 message = f"{key} takes its number from ${missing[0]}, which is not defined"
-                near, fix = (
-                    suggest_name(missing[0], self.variables),
-                    f"--set {missing[0]}=NUMBER, or export {missing[0]}",
-                )
-                parts.error(message, f"give it: {fix}", key, tuple(near))
+                fix = f"give it: --set {missing[0]}=NUMBER, or export {missing[0]}"
+                parts.error(message, fix, key, suggest_name(missing[0], self.variables))
                 continue
             try:
                 values.append(common.parse_number(filled.strip()))
