@@ -156,6 +156,11 @@ class Dynamics:
             )
         self.model = model
         self.tree = tree
+        self.coordinates = tree.coordinates
+        """The names of the generalized coordinates, in the order of all arrays."""
+        self.cut = tree.cut
+        """The constraints that are left out because they close loops."""
+        self.massless = tree.massless
         self.uncertainty = uncertainty
         self.gravitational_acceleration = gravity
         self.mass = math.fsum(link.inertia.mass for link in self.tree.links.values() if link.inertia is not None)
@@ -186,20 +191,6 @@ class Dynamics:
         # their rows and columns in the upper triangle
         self._blocks = [((rows, slice(rows.start, nv)), (slice(rows.stop), rows)) for rows, _ in self._vectors]
         self._zeros = np.zeros(nv)
-
-    @property
-    def coordinates(self) -> tuple[str, ...]:
-        """The names of the generalized coordinates, in the order of all arrays."""
-        return self.tree.coordinates
-
-    @property
-    def cut(self) -> tuple[str, ...]:
-        """The constraints that are left out because they close loops."""
-        return self.tree.cut
-
-    @property
-    def massless(self) -> tuple[str, ...]:
-        return self.tree.massless
 
     @property
     def default_position(self) -> Array:

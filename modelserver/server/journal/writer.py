@@ -189,8 +189,7 @@ class Ring:
                 break
             path.unlink()
             excess -= size
-        newest = get_number(held[-1]) if held else None
-        number = max(0 if newest is None else newest + 1, min_number)
+        number = max([min_number, *((get_number(path) or 0) + 1 for path in held)])
         segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
         persistence.sync_directory(self.directory)
         return segment
