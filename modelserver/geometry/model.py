@@ -68,6 +68,8 @@ class Model:
         _check_unique("constraint", [each.name for each in constraints])
         self._bodies = {body.name: body for body in bodies}
         self._topology = Topology(bodies, constraints)
+        self.assemblies = self._topology.assemblies
+        """Groups of bodies joined by constraints; the root's comes first, the others are orphans."""
         # An OrderedDict drops its oldest in constant time; a dict passes over all entries dropped before.
         self._transformations: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
         self._paths: OrderedDict[tuple[str, str], KinematicPath] = OrderedDict()
@@ -84,11 +86,6 @@ class Model:
     @property
     def root(self) -> Body:
         return self.bodies[0]
-
-    @property
-    def assemblies(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of bodies joined by constraints; the root's comes first, the others are orphans."""
-        return self._topology.assemblies
 
     def body(self, name: str) -> Body:
         """Return the body of that name. Raises UnknownBodyError with the nearest names."""

@@ -83,16 +83,14 @@ class Notifier:
         self._send, self._watchdog_ns, self._monotonic_ns = send, watchdog, monotonic_ns
         self._ping_due_ns = 0
         self._status, self._status_due_ns = "", 0
+        self.is_active = send is not None
+        """Whether there is a service manager."""
         self.is_ready = False
         """Whether READY was sent."""
 
     @classmethod
     def from_environment(cls) -> Notifier:
         return cls(open_manager_socket(), get_watchdog_ns())
-
-    @property
-    def is_active(self) -> bool:
-        return self._send is not None
 
     def send(self, *lines: str) -> None:
         if self._send is not None:

@@ -141,16 +141,15 @@ class LogFile:
             self._data.close()
         self._data = b""
 
-    def __iter__(self) -> Iterator[LogEvent]:
-        return self.read_from(0)
-
-    def read_from(self, offset: int) -> Iterator[LogEvent]:
+    def read_from(self, offset: int = 0) -> Iterator[LogEvent]:
         self.damage.clear()
         for each in scan(self._data, offset):
             if isinstance(each, LogEvent):
                 yield each
             else:
                 self.damage.append(each)
+
+    __iter__ = read_from
 
     @property
     def is_corrupt(self) -> bool:
