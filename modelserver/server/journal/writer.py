@@ -75,10 +75,9 @@ def collect_facts() -> Mapping[str, str]:
 
 
 def _read_version(name: str) -> str:
-    try:
+    with contextlib.suppress(PackageNotFoundError):
         return version(name)
-    except PackageNotFoundError:
-        return ""
+    return ""
 
 
 def _hash_source() -> str:
@@ -92,14 +91,11 @@ def _hash_source() -> str:
 
 
 def _read_processor() -> str:
-    try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                key, _, value = line.partition(":")
-                if key.strip() in ("model name", "Model", "CPU part"):
-                    return value.strip()
-    except OSError:
-        pass
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() in ("model name", "Model", "CPU part"):
+                return value.strip()
     return platform.processor()
 
 
@@ -537,9 +533,7 @@ def get_journal_directory(config: VehicleConfig, systemd_directory: str | None =
     if settings.megabytes is None and not systemd_directory:
         return None
     base = persistence.get_state_directory(config.state_directory or systemd_directory.split(":")[0])
-    if base is None:
-        return None
-    return base / f"journal-{persistence.to_file_name(config.vehicle)}"
+    return None if base is None else base / f"journal-{persistence.to_file_name(config.vehicle)}"
 
 
 def get_max_bytes(config: VehicleConfig) -> int:
