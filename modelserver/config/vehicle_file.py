@@ -364,6 +364,8 @@ class CommandsConfig:
 
     reload: bool = False
     """Whether the geometry file may be reloaded."""
+    frames: bool = False
+    """Whether programs may add frames to the bodies while the service runs."""
     set_pose: bool = False
     """Whether the pose of the vehicle may be set."""
     drive: Literal["auto", "signed", "unsigned"] = "auto"
@@ -374,7 +376,7 @@ class CommandsConfig:
     """Greatest age of a signed message, seconds, by the vehicle's clock."""
 
     def __post_init__(self) -> None:
-        enabled = [name for name in ("reload", "set_pose") if getattr(self, name) and not self.key_file]
+        enabled = [name for name in ("reload", "frames", "set_pose") if getattr(self, name) and not self.key_file]
         enabled += ["drive: signed"] if self.drive == "signed" and not self.key_file else []
         _check(self, *(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled), window_s=(0.1, 300.0))
 

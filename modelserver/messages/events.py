@@ -40,6 +40,7 @@ from modelserver.messages.generated import (
     ReloadReply,
     ReplyHeader,
     RequestHeader,
+    SetFrame,
     SetHTransform,
     SetStateVector,
     StateVectorReply,
@@ -80,6 +81,7 @@ Request: TypeAlias = (
     | GetExplanation
     | GetDynamics
     | ReloadModel
+    | SetFrame
     | SetStateVector
     | SetHTransform
 )
@@ -96,6 +98,7 @@ CHANNEL_OF: Final[Mapping[type, str]] = {
     GetExplanation: "PLATFORM_GET_EXPLANATION",
     GetDynamics: "PLATFORM_GET_DYNAMICS",
     ReloadModel: "PLATFORM_RELOAD_MODEL",
+    SetFrame: "PLATFORM_SET_FRAME",
     SetStateVector: "POSE_SET_STATE_VECTOR",
     SetHTransform: "POSE_SET_H_TRANSFORM",
 }
@@ -216,7 +219,7 @@ class HealthWarning:
 class SignedCommand:
     """A command whose signature was verified with the vehicle's key."""
 
-    command: ReloadModel | SetStateVector | SetHTransform | SwitchMode
+    command: ReloadModel | SetFrame | SetStateVector | SetHTransform | SwitchMode
     sender: str = ""
 
 
@@ -277,9 +280,9 @@ class PublishNavigation:
 
 @dataclass(frozen=True, slots=True)
 class LoadModel:
-    """Reload the geometry file; `request` is None for a reload by signal."""
+    """Reload the geometry file, or change an added frame; `request` is None for a reload by signal."""
 
-    request: ReloadModel | None = None
+    request: ReloadModel | SetFrame | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,6 +66,7 @@ from modelserver.messages import (
     ReplyHeader,
     Request,
     RequestHeader,
+    SetFrame,
     SetHTransform,
     SetStateVector,
     StateVectorReply,
@@ -267,6 +268,7 @@ _REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
     GetExplanation: ExplanationReply,
     GetDynamics: DynamicsReply,
     ReloadModel: ReloadReply,
+    SetFrame: ReloadReply,
     SetStateVector: Acknowledgement,
     SetHTransform: Acknowledgement,
 }

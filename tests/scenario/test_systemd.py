@@ -219,7 +219,7 @@ def test_given_another_geometry_and_a_reload_then_it_is_used_and_one_that_is_wro
     site.wait_until(lambda: "reload failed, the old model stays" in site.status(), "the status does not report it")
     assert f"model {fresh}" in site.status()
     errors = site.machine.journal(SERVICE, "--priority=err")
-    assert f"could not be reloaded, revision {fresh} stays in use" in errors
+    assert f"could not be changed, revision {fresh} stays in use" in errors
     assert site.measure_answer() > 0
 
     site.machine.run("mv", f"{GEOMETRY}.good", GEOMETRY)

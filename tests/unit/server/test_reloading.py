@@ -297,7 +297,7 @@ def test_given_the_signal_then_the_next_pass_reads_the_file_and_sends_it_out(
     new = rig.loop.state.model.revision
     assert new != old
     assert [part.model_revision for part in rig.parts] == [old, new]
-    assert caplog.messages[-1] == f"the geometry was reloaded: revision {new}, before {old}"
+    assert caplog.messages[-1] == f"the geometry was changed: revision {new}, before {old}"
     content = SnapshotAssembler().add(rig.parts[-1])
     assert content is not None
     snapshot = decode_snapshot(content)
