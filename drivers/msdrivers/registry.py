@@ -98,7 +98,7 @@ class NtripSettings:
     """A caster and its mountpoint. Raises ValueError for an invalid value."""
 
     caster: str
-    """`HOST:PORT` of the caster; the port is customarily 2101."""
+    """`HOST:PORT` of the caster; the port is customarily 2101, with TLS 2102 or 443."""
     mountpoint: str
     """Name of the stream."""
     user: str = ""
@@ -108,6 +108,8 @@ class NtripSettings:
     gga_period: float | None = None
     """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; None: 10 for a
     stream that sends nothing and needs them by the source table; 0: none."""
+    tls: bool = False
+    """Whether the caster's port is one with TLS; without it the password is sent readable."""
 
     def __post_init__(self) -> None:
         try:
