@@ -193,17 +193,6 @@ class RegisterTable(Enum):
     """Only read (function 4)."""
 
 
-class FailureKind(Enum):
-    """Why there is no reply."""
-
-    EXCEPTION = "exception"
-    """The device rejected the request; see `code`."""
-    TIMEOUT = "silence"
-    """No reply in time."""
-    LINE = "line"
-    """The line failed, or the data was not Modbus."""
-
-
 @dataclass(frozen=True, slots=True)
 class ReadRegisters:
     """Read `count` registers from `address` on."""
@@ -243,9 +232,8 @@ class RegistersWritten:
 
 @dataclass(frozen=True, slots=True)
 class ModbusFailure:
-    """A request without reply; `code` is the device's for an EXCEPTION."""
+    """An exception by which the device rejects a request; with code 0 the line failed, or the data was not Modbus."""
 
-    kind: FailureKind
     text: str = ""
     code: int = 0
     transaction: int = 0

@@ -29,7 +29,6 @@ from msdrivers.endpoint import (
     MAX_READ,
     EndpointPhase,
     EndpointStatus,
-    FailureKind,
     HostTime,
     MeasuredSample,
     ModbusFailure,
@@ -448,15 +447,13 @@ class AxisDriver:
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
+        if isinstance(unit, ModbusFailure) and not unit.code:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
         if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
             self.counts["rejected.stale"] += 1
             return []
         if isinstance(unit, ModbusFailure):
-            if unit.kind is FailureKind.TIMEOUT:
-                return self._on_timeout(now)
             return self._on_exception(pending, unit, now)
         self._pending = None
         self._received_ns = now.monotonic_ns

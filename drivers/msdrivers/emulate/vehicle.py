@@ -35,7 +35,6 @@ from msdrivers.endpoint import (
     CanFrame,
     EndpointPhase,
     EndpointStatus,
-    FailureKind,
     HostTime,
     ModbusFailure,
     ModbusUnit,
@@ -420,7 +419,7 @@ class AxisEmulator:
         return RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
     def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
-        return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, unit.transaction)
+        return ModbusFailure(explain_exception(code), code, unit.transaction)
 
 
 PERIOD_US: Final = 20_000

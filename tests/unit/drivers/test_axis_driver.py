@@ -18,7 +18,6 @@ from msdrivers.emulate import FaultInjector, InjectedFault
 from msdrivers.emulate.vehicle import AxisEmulator, AxisUnit
 from msdrivers.endpoint import (
     EndpointPhase,
-    FailureKind,
     HostTime,
     MeasuredSample,
     ModbusFailure,
@@ -264,7 +263,7 @@ def test_given_an_axis_that_rejects_to_be_read_then_the_rejection_is_reported_wh
     def refuses(unit: ModbusUnit) -> None:
         send(unit)
         at_s = time.monotonic_ns * 1e-9 + 0.001
-        link.incoming.append((at_s, ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=unit.transaction)))
+        link.incoming.append((at_s, ModbusFailure(code=2, transaction=unit.transaction)))
 
     link.send = refuses  # type: ignore[method-assign]
     reports: list[DriverHealth] = []
@@ -312,20 +311,12 @@ def test_given_replies_that_do_not_belong_to_the_request_then_they_are_not_used(
 def test_given_a_line_that_breaks_then_it_is_reopened_once() -> None:
     driver = AxisDriver(axis_settings())
     driver.on_open(at(0.0))
-    broken = ModbusFailure(FailureKind.LINE, "connection reset by the device")
+    broken = ModbusFailure("connection reset by the device")
     (status, reopen) = driver.on_receive(broken, at(0.1))
     assert isinstance(reopen, Reopen)
     assert "connection reset by the device" in status.text  # type: ignore[union-attr]
     assert driver.on_receive(broken, at(0.2)) == []
     assert driver.get_deadline() is None
-
-
-def test_given_a_transport_that_reports_silence_itself_then_it_is_as_a_reply_that_did_not_come() -> None:
-    driver = AxisDriver(axis_settings(nod=None))
-    driver.on_open(at(0.0))
-    outputs = driver.on_receive(ModbusFailure(FailureKind.TIMEOUT, transaction=1), at(0.05))
-    assert outputs == [Send(ReadRegisters(0, 4, RegisterTable.HOLDING, 2))]
-    assert driver.counts["unanswered"] == 1
 
 
 @pytest.mark.parametrize(
@@ -409,9 +400,7 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
     def reply(transaction: int) -> ModbusUnit:
         kind = rng.randrange(6)
         if kind == 0:
-            return ModbusFailure(
-                rng.choice(list(FailureKind)[:2]), "x" * rng.randrange(99), rng.randrange(256), transaction
-            )
+            return ModbusFailure("x" * rng.randrange(99), rng.randrange(1, 256), transaction)
         if kind == 1:
             return RegistersWritten(rng.choice((16, 18, 20)), rng.randrange(4), transaction)
         if kind == 2:
@@ -474,7 +463,7 @@ def test_given_a_request_that_the_axis_does_not_take_then_it_answers_with_the_ex
     (reply,) = emulator.on_receive(request_, at(0.1))
     assert isinstance(reply, Send)
     assert isinstance(reply.unit, ModbusFailure)
-    assert (reply.unit.kind, reply.unit.code, reply.unit.transaction) == (FailureKind.EXCEPTION, code, 4)
+    assert (reply.unit.code, reply.unit.transaction) == (code, 4)
 
 
 @pytest.mark.parametrize(
