@@ -569,3 +569,11 @@ _FIELDS: Final[Mapping[str, Callable[[GpsSample], dict[str, Any]]]] = {
     "NAV-EOE": lambda sample: {"iTOW": _get_itow(sample)},
 }
 """Fields of each message of a sample, as pyubx2 names and scales them."""
+
+EMULATORS: Final[Mapping[str, Callable[[Any, Iterable[GpsSample]], SampleEmulator[GpsSample, bytes]]]] = {
+    "ublox": lambda settings, samples: UbloxEmulator(samples),
+    "novatel": make_gps_emulator,
+    "nmea": make_gps_emulator,
+    "gpsd": lambda settings, samples: GpsdEmulator(samples),
+}
+"""By kind of device."""

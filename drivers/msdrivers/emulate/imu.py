@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from modelserver.messages import ImuSample, OrientationReference
 from modelserver.transforms import so3
@@ -337,3 +338,12 @@ class Gx1Emulator(SampleEmulator[ImuSample, bytes]):
         word = words.get(CommandByte(command))
         has_ticks = gx1.LAYOUTS[command].has_ticks
         return b"" if word is None else Gx1Packet(command, (word,), ticks if has_ticks else None).to_bytes()
+
+
+EMULATORS: Mapping[str, Callable[[Any, Iterable[ImuSample]], SampleEmulator[ImuSample, bytes]]] = {
+    "gx1": lambda settings, samples: Gx1Emulator(samples),
+    "vectornav": lambda settings, samples: VectornavEmulator(samples),
+    "xsens": lambda settings, samples: XsensEmulator(samples, field_strength=settings.field_strength or 5e-5),
+    "text_imu": lambda settings, samples: TextImuEmulator(samples, settings),
+}
+"""By kind of device."""

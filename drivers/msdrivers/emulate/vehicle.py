@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Final
+from typing import Any, Final
 
 from modelserver.messages import (
     Direction,
@@ -33,6 +33,7 @@ from msdrivers.endpoint import (
     MAX_READ,
     MAX_WRITE,
     CanFrame,
+    Endpoint,
     EndpointPhase,
     EndpointStatus,
     HostTime,
@@ -456,3 +457,14 @@ class TextJointsEmulator(SampleEmulator[JointsSample, bytes]):
             period = SWEEP_S * (2.0 / 3.0) ** number
             values[name] = 1.0 + seconds if name == "time" else AMPLITUDE * math.sin(math.tau * seconds / period)
         return values
+
+
+EMULATORS: Final[Mapping[str, Callable[..., Endpoint[Any]]]] = {
+    "wheels": lambda settings, samples, database: WheelsEmulator(settings.wheels, database, samples),
+    "vehicle": lambda settings, samples, database: VehicleEmulator(
+        database, settings.status, settings.command, samples=samples
+    ),
+    "text_joints": lambda settings, samples: TextJointsEmulator(settings),
+    "axis": lambda settings, samples: AxisEmulator(settings.registers),
+}
+"""By kind of device."""
