@@ -206,33 +206,24 @@ def _count_xbus(data: bytes) -> int:
 
 
 _SENTENCE: Final = re.compile(rb"\$([A-Z]{2,6}[^*\r\n]{0,200})\*([0-9A-Fa-f]{2})")
-_VECTORNAV: Final = re.compile(rb"\$VN[A-Z]{3},[^*\r\n]{0,200}\*[0-9A-Fa-f]{2}")
-_NOVATEL_ASCII: Final = re.compile(rb"#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
+_NOVATEL: Final = re.compile(rb"\xaa\x44\x12\x1c|#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
 
 
-def _count_nmea(data: bytes) -> int:
+def _count_sentences(data: bytes, is_vectornav: bool) -> int:
     return sum(
         reduce(xor, body, 0) == int(checksum, 16)
         for body, checksum in _SENTENCE.findall(data)
-        if not body.startswith(b"VN")
+        if body.startswith(b"VN") is is_vectornav
     )
-
-
-def _count_vectornav(data: bytes) -> int:
-    # of a unit as it comes from its maker: binary output is switched on by a driver
-    return len(_VECTORNAV.findall(data))
-
-
-def _count_novatel(data: bytes) -> int:
-    return data.count(b"\xaa\x44\x12\x1c") + len(_NOVATEL_ASCII.findall(data))
 
 
 PROTOCOLS: Final = (
     KnownProtocol("UBX messages of a u-blox receiver", "ublox", _count_ubx),
-    KnownProtocol("NovAtel logs", "novatel", _count_novatel),
+    KnownProtocol("NovAtel logs", "novatel", lambda data: len(_NOVATEL.findall(data))),
     KnownProtocol("Xbus messages of an Xsens unit", "xsens", _count_xbus),
-    KnownProtocol("messages of a VectorNav unit", "vectornav", _count_vectornav),
-    KnownProtocol("NMEA sentences", "nmea", _count_nmea),
+    # as it comes from its maker: binary output is switched on by a driver
+    KnownProtocol("messages of a VectorNav unit", "vectornav", partial(_count_sentences, is_vectornav=True)),
+    KnownProtocol("NMEA sentences", "nmea", partial(_count_sentences, is_vectornav=False)),
 )
 
 
@@ -298,16 +289,9 @@ class ScriptRunner:
         self._deadline_ns = self._attempt = 0
         self._reply: Any = None
 
-    def _prepare(self, step: RequestStep | PauseStep) -> None:
-        """Get ready for a step that waits: it begins, or its request is sent again."""
-
     @property
     def is_running(self) -> bool:
         return self._script is not None
-
-    @property
-    def is_requesting(self) -> bool:
-        return isinstance(self.step, RequestStep)
 
     @property
     def deadline_ns(self) -> int | None:
@@ -380,12 +364,10 @@ class ScriptRunner:
     def _wait(self, step: PauseStep, now: HostTime, reply: Any = None) -> None:
         self.step, self._reply = step, reply
         self._deadline_ns = now.monotonic_ns + round(step.seconds * 1e9)
-        self._prepare(step)
 
     def _send_request(self, step: RequestStep, now: HostTime) -> Send[bytes]:
         self._attempt += 1
         self._deadline_ns = now.monotonic_ns + round(step.timeout * 1e9)
-        self._prepare(step)
         return Send(step.frame)
 
 
@@ -542,7 +524,7 @@ class StreamDriver(ABC, Generic[M]):
     @property
     def _step(self) -> SetupStep | None:
         """The step whose acknowledgement is awaited."""
-        return self._setup_step if self._setup.is_requesting else None
+        return self._setup_step if isinstance(self._setup.step, RequestStep) else None
 
     def _on_acknowledgement(self, now: HostTime, error: str = "") -> list[Output[bytes]]:
         """Go on to the next step; `error`: why the device rejected this one."""
@@ -587,10 +569,11 @@ class StreamDriver(ABC, Generic[M]):
 
     def _run_setup(self) -> Script:
         """Find the device and configure it; then samples must come."""
+        limits = self.answer_timeout, self.attempts
         while True:
             self._setup_step, self._first_bytes, seq = None, b"", self._seq
             try:
-                self._product, steps = yield self._make_request(self._make_identification())
+                self._product, steps = yield RequestStep(self._make_identification(), *limits)
                 break
             except NoReplyError:
                 if self._seq > seq:
@@ -605,7 +588,7 @@ class StreamDriver(ABC, Generic[M]):
         for step in steps:
             self._setup_step = step
             try:
-                error = yield self._make_request(step.frame)
+                error = yield RequestStep(step.frame, *limits)
             except NoReplyError:
                 self._counts["unanswered"] += 1
                 error = "" if step.is_optional else "no answer"
@@ -618,9 +601,6 @@ class StreamDriver(ABC, Generic[M]):
             text = f"{self._product} is set up, waiting for {self.awaited}"
             yield from self._set_status(EndpointPhase.CONFIGURING, text)
         self._restart_silence_timer()
-
-    def _make_request(self, frame: bytes) -> RequestStep:
-        return RequestStep(frame, self.answer_timeout, self.attempts)
 
     def _restart_silence_timer(self) -> None:
         self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)
