@@ -77,9 +77,9 @@ class ReplyLayout(NamedTuple):
         return sum(count for _, count in self.fields)
 
     @property
-    def length(self) -> int:
-        """Length of the reply in bytes."""
-        return 1 + 2 * self.words + 2 * self.has_ticks + 2
+    def format(self) -> struct.Struct:
+        """Command, words as signed numbers, ticks, checksum."""
+        return struct.Struct(f">B{self.words}h{'H' * self.has_ticks}H")
 
 
 _VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
@@ -99,19 +99,12 @@ LAYOUTS: dict[int, ReplyLayout] = {
     CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
 }
 
-LENGTHS: dict[int, int] = {command: layout.length for command, layout in LAYOUTS.items()}
+_STRUCTS = {command: layout.format for command, layout in LAYOUTS.items()}
+LENGTHS: dict[int, int] = {command: each.size for command, each in _STRUCTS.items()}
+"""Bytes of the replies."""
 
-MEASUREMENTS = frozenset(
-    {
-        CommandByte.STABILIZED_VECTORS,
-        CommandByte.INSTANTANEOUS_VECTORS,
-        CommandByte.QUATERNION_VECTORS,
-        CommandByte.INSTANTANEOUS_EULER,
-        CommandByte.STABILIZED_EULER,
-        CommandByte.EULER_VECTORS,
-    }
-)
-"""Measurements: what may be streamed."""
+MEASUREMENTS = frozenset(command for command, layout in LAYOUTS.items() if layout.words >= 3)
+"""Replies with vectors or angles: what may be streamed."""
 
 _SLICES = {
     command: {
@@ -120,8 +113,6 @@ _SLICES = {
     }
     for command, layout in LAYOUTS.items()
 }
-_STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in LAYOUTS.items()}
-_UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
 
 
 class Gx1Packet(NamedTuple):
@@ -156,11 +147,12 @@ def decode_packet(data: bytes | bytearray, at: int, command: int) -> Gx1Packet |
 
     The whole reply must be there: `LENGTHS[command]` bytes.
     """
-    unsigned = _UNSIGNED[command].unpack_from(data, at)
-    if (sum(unsigned) - 2 * unsigned[-1]) & 0xFFFF:
+    _, *words, checksum = _STRUCTS[command].unpack_from(data, at)
+    # modulo 65536 signed and unsigned words are the same
+    if (command + sum(words) - checksum) & 0xFFFF:
         return None
-    words = _STRUCTS[command].unpack_from(data, at + 1)
-    return Gx1Packet(command, words, unsigned[-2] if LAYOUTS[command].has_ticks else None)
+    ticks = words.pop() if LAYOUTS[command].has_ticks else None
+    return Gx1Packet(command, tuple(words), ticks)
 
 
 class EepromAddress:
@@ -181,35 +173,28 @@ class Gains(NamedTuple):
     magnetometer: int
 
 
-class Gx1Format:
-    """A `FrameFormat` of replies; those to other `commands` are noise."""
+class Gx1Stream(FrameScanner[Gx1Packet]):
+    """Parses bytes to the replies to some commands, at first all; others are noise. At most 30 bytes are buffered."""
 
     start_bytes = bytes(LAYOUTS)
 
     def __init__(self) -> None:
-        self.commands: frozenset[int] = frozenset(LAYOUTS)
+        super().__init__((self,))
+        self._commands = frozenset(LAYOUTS)
+
+    def set_commands(self, *commands: int) -> None:
+        """Set the commands whose replies are read."""
+        self._commands = frozenset(commands)
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[Gx1Packet] | RejectedFrame | None:
         command = buffer[at]
-        if command not in self.commands:
+        if command not in self._commands:
             return NO_FRAME
         if at + LENGTHS[command] > len(buffer):
             return None
         packet = decode_packet(buffer, at, command)
         kind = f"message.{CommandByte(command).name.lower()}"
         return ParsedFrame(at + LENGTHS[command], kind, packet) if packet else RejectedFrame("checksum")
-
-
-class Gx1Stream(FrameScanner[Gx1Packet]):
-    """Parses bytes to the replies to some commands, at first all. At most 30 bytes are buffered."""
-
-    def __init__(self) -> None:
-        self._format = Gx1Format()
-        super().__init__((self._format,))
-
-    def set_commands(self, *commands: int) -> None:
-        """Set the commands whose replies are read."""
-        self._format.commands = frozenset(commands)
 
 
 COUNTER_RANGE = 65536
@@ -252,11 +237,6 @@ class TickUnwrapper:
         self._count += ahead
         self._last, self._at_ns = ticks, at_ns
         return self._count
-
-
-def make_poll(command: int) -> bytes:
-    """Return the request for one reply of a command that takes no data."""
-    return bytes((command,))
 
 
 def make_stream(command: int) -> bytes:
@@ -317,12 +297,8 @@ def orientation_from_euler(words: Iterable[int]) -> Quaternion:
 
 def euler_to_words(orientation: Quaternion) -> tuple[int, int, int]:
     """Return roll, pitch, yaw as words, each turn within -32768..32767."""
-    roll, pitch, yaw = (round(angle / _ANGLE_SCALE) for angle in so3.to_rpy(orientation))
-    return (_wrap(roll), pitch, _wrap(yaw))
-
-
-def _wrap(word: int) -> int:
-    return (word + 32768) % 65536 - 32768
+    roll, pitch, yaw = ((round(angle / _ANGLE_SCALE) + 32768) % 65536 - 32768 for angle in so3.to_rpy(orientation))
+    return (roll, pitch, yaw)
 
 
 def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
@@ -337,11 +313,6 @@ def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
 def quaternion_to_words(orientation: Quaternion) -> tuple[int, int, int, int]:
     w, x, y, z = (round(element / _QUATERNION_SCALE) for element in orientation)
     return (w, x, y, z)
-
-
-def is_unit(words: Iterable[int]) -> bool:
-    """Return whether four words are a unit quaternion within 1 %."""
-    return abs(math.hypot(*words) * _QUATERNION_SCALE - 1.0) < 0.01
 
 
 def temperature_from_word(word: int) -> float:
@@ -471,7 +442,6 @@ def read_gains() -> ScriptPart[Gains]:
 
 
 def _read_tick() -> ScriptPart[float]:
-    """Return the seconds of a tick. Raises UnusableDeviceError for timer words that cannot be."""
     words = yield from read_words(EepromAddress.TIMER)
     tick_s = tick_from_timer_words(words)
     if not 1e-3 <= tick_s <= 0.1:
@@ -600,7 +570,7 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         self._poll_ns = now.monotonic_ns + TEMPERATURE_PERIOD_NS
-        return [Send(make_poll(CommandByte.TEMPERATURE))]
+        return [Send(bytes((CommandByte.TEMPERATURE,)))]
 
     def on_close(self, now: HostTime) -> list[Output[bytes]]:
         """Stop the stream of a device that was found."""
@@ -648,8 +618,8 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
             yield Send(STOP)
             yield PauseStep(FLUSH_S)
         yield CommandStep(STOP, value=0)
-        serial = yield CommandStep(make_poll(CommandByte.SERIAL))
-        firmware = yield CommandStep(make_poll(CommandByte.FIRMWARE))
+        serial = yield CommandStep(bytes((CommandByte.SERIAL,)))
+        firmware = yield CommandStep(bytes((CommandByte.FIRMWARE,)))
         return f"3DM-GX1 serial {serial.unsigned}, firmware {format_version(firmware.unsigned)}"
 
     def _on_message(self, message: Gx1Packet, now: HostTime) -> list[Output[bytes]]:
@@ -712,7 +682,9 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
 
 
 def _is_plausible(packet: Gx1Packet) -> bool:
-    """Return whether the content is possible: pitch within 90 degrees, a unit quaternion."""
+    """Return whether the content is possible: pitch within 90 degrees, a unit quaternion within 1 %."""
     if packet.has("euler"):
         return abs(packet.field("euler")[1]) <= QUARTER_TURN
-    return is_unit(packet.field("quaternion")) if packet.has("quaternion") else True
+    if packet.has("quaternion"):
+        return abs(math.hypot(*packet.field("quaternion")) * _QUATERNION_SCALE - 1.0) < 0.01
+    return True
