@@ -6,6 +6,7 @@ Protocols are parsers and encoders without clock, socket, file, thread or log.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import ClassVar
 
 from modelserver.transforms.so3 import Quaternion
@@ -19,14 +20,18 @@ def check_ranges(settings: object, **ranges: tuple[float, float]) -> None:
             raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
 
 
-STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
+def check_choice(settings: object, **choices: Iterable[object]) -> None:
+    """Raise ValueError for the first attribute that is none of its choices."""
+    for key, known in choices.items():
+        if (value := getattr(settings, key)) not in known:
+            raise ValueError(f"{key} is one of {', '.join(map(str, filter(None, known)))}, got {value!r}")
 
 
 class Strict:
     """Base of settings that pydantic reads without conversions and without further keys."""
 
     __slots__ = ()
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 
 def to_rotation(w: float, x: float, y: float, z: float) -> Quaternion | None:

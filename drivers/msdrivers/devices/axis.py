@@ -20,9 +20,8 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from modelserver.errors import quote
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices import Strict, check_ranges
+from msdrivers.devices import Strict, check_choice, check_factor, check_ranges
 from msdrivers.devices.stream import BoundedCounter
 from msdrivers.endpoint import (
     LAST_ADDRESS,
@@ -87,28 +86,20 @@ class RegisterMap(Strict):
     `high_word_first: false`. Of 16 bits, BADC and DCBA swap the bytes."""
 
     def __post_init__(self) -> None:
-        if self.registers not in (1, 2):
-            raise ValueError(f"registers is 1 (16 bits) or 2 (32 bits), got {self.registers}")
+        check_choice(self, registers=(1, 2), type=(None, *_TYPES), order=(None, *_ORDERS))
         if self.type is not None:
-            if self.type not in _TYPES:
-                raise ValueError(f"type is {', '.join(_TYPES)}, got {quote(self.type)}")
             count, is_signed = _TYPES[self.type]
             # a default that is written cannot be distinguished from nothing written, and contradicts nothing
             if self.registers not in (1, count):
                 raise ValueError(f"registers is left out with type: {self.type} has {count}, got {self.registers}")
             if not self.is_signed and is_signed:
                 raise ValueError(f"is_signed is left out with type: {self.type} is signed, got false")
-        if self.order is not None:
-            if self.order not in _ORDERS:
-                raise ValueError(f"order is {', '.join(_ORDERS)}, got {quote(self.order)}")
-            if not self.high_word_first and self.order not in ("CDAB", "DCBA"):
-                raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
+        if self.order in ("ABCD", "BADC") and not self.high_word_first:
+            raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
         if not 0 <= self.address <= LAST_ADDRESS + 1 - self.word_count:
-            raise ValueError(
-                f"address is 0 to {LAST_ADDRESS + 1 - self.word_count}, got {self.address}; a manual's 40001 is 0"
-            )
-        if not math.isfinite(self.scale_deg) or self.scale_deg == 0.0:
-            raise ValueError(f"scale_deg is a number and not 0, got {self.scale_deg:g}")
+            last = LAST_ADDRESS + 1 - self.word_count
+            raise ValueError(f"address is 0 to {last}, got {self.address}; a manual's 40001 is 0")
+        check_factor(self.scale_deg, "scale_deg")
         if not math.isfinite(self.offset_deg):
             raise ValueError(f"offset_deg is a number, got {self.offset_deg:g}")
 
@@ -199,8 +190,7 @@ class AxisRegisters(Strict):
     """Rate of the nodding motion, written; 0: stationary."""
 
     def __post_init__(self) -> None:
-        if self.table not in ("holding", "input"):
-            raise ValueError(f"table is holding or input, got {self.table!r}")
+        check_choice(self, table=("holding", "input"))
         if len(self.commanded) not in (0, 3):
             raise ValueError(
                 "lower_limit, upper_limit and nod_rate are given together or not at all: nodding needs all"

@@ -40,8 +40,18 @@ from modelserver.errors import (
     quote,
     suggest_name,
 )
+from modelserver.messages import Sample, SensorHeader
 from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey, HostTime, Output, Reopen
+from msdrivers.endpoint import (
+    CanFrame,
+    EndpointPhase,
+    EndpointStatus,
+    FrameKey,
+    HostTime,
+    MeasuredSample,
+    Output,
+    Reopen,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
@@ -290,10 +300,16 @@ class SignalBinder:
         self._place = place
         self.problems: list[Problem] = []
 
-    def bind_signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
+    def bind_mapped(self, settings: object, prefix: str = "", /, **bits: int) -> dict[str, BoundSignal]:
+        """Return the signals of those attributes that are mapped, by name; `bits`: of each, see `bind_signal`."""
+        paths = {name: getattr(mapped, "signal", mapped) for name in bits if (mapped := getattr(settings, name))}
+        found = {name: self.bind_signal(path, f"{prefix}{name}", bits[name]) for name, path in paths.items()}
+        return {name: signal for name, signal in found.items() if signal is not None}
+
+    def bind_signal(self, path: str, key: str, bits: int = 0) -> BoundSignal | None:
         """Return the signal `Message.Signal` of the setting `key`; add a problem and return None if it is unknown.
 
-        The message may be named by its PGN. `whole`: it must be an integer of at most `bits` bits.
+        The message may be named by its PGN. bits: it must be an integer of at most so many; 0: any number.
         """
         message_name, _, name = path.partition(".")
         pgn = parse_pgn(message_name)
@@ -320,7 +336,7 @@ class SignalBinder:
             form = "{}" if key.endswith(f".{name}") else f"{message_name}.{{}}"
             self._add_missing(key, f"message {message_name} has no signal", name, known, form)
             return None
-        if whole and (signal.is_float or signal.length > bits):
+        if bits and (signal.is_float or signal.length > bits):
             kind = "a floating-point number" if signal.is_float else f"{signal.length} bits long"
             self.add_problem(
                 key, f"{path} is {kind}; a whole number of at most {bits} bits is needed", "map another signal"
@@ -334,7 +350,7 @@ class SignalBinder:
         return bound
 
     def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
+        """Add a problem that is fixed at the setting `key`, not in the DBC file."""
         source = Location(element=f"{self._place}.{key}")
         self.problems.append(Problem(Severity.ERROR, f"{self._database.name}: {message}", source, fix, nearest))
 
@@ -448,8 +464,7 @@ _PLACE = re.compile(r"at line (\d+)")
 _HEAD: Final = 'VERSION ""\nNS_ :\nBS_:\nBU_:\n'
 
 
-@dataclass(frozen=True, slots=True)
-class _Statement:
+class _Statement(NamedTuple):
     """A statement of the file and the number of its first line."""
 
     line: int
@@ -601,6 +616,8 @@ class CanDriver(ABC):
     def __init__(self, database: CanDatabase, signals: Iterable[BoundSignal], settings: BusSettings):
         """The frames of `signals` are needed; the others see `WheelsSettings`. Raises ConfigError."""
         signals = list(signals)
+        self.settings = settings
+        self.max_silence = settings.silence if signals else inf
         self.phase = EndpointPhase.WAITING
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
@@ -659,7 +676,9 @@ class CanDriver(ABC):
         try:
             values = self._database.decode(unit)
         except FrameError as error:
-            return self._on_malformed_frame(unit, error)
+            self.counts[f"rejected.{error.reason}"] += 1
+            self._note_useless(f"{self._needed[unit.key]} ({unit.key}) {error.summary}")
+            return self._warn_once(unit.key, f"{error}; such frames are counted and not used")
         self.counts["frames"] += 1
         arrival = get_arrival_time(unit, now)
         return outputs + self._publish(self._assembler.add(key, values, arrival.monotonic_ns, arrival.utime), now)
@@ -676,21 +695,18 @@ class CanDriver(ABC):
             return next((key for key in stated if self._stated[key] == source), None), []
         (key,) = keys
         used, last_ns = self._sources.get(key, (source, now.monotonic_ns))
+        is_own = source == key.arbitration_id & 0xFF
+        outputs: list[Output[CanFrame]] = []
         if source != used and now.monotonic_ns - last_ns < self._silence_s * 1e9:
-            outputs: list[Output[CanFrame]] = []
-            if ("sources", key) not in self._reported:
-                self._reported.add(("sources", key))
-                name, first = self._needed[key], min(source, used)
-                chosen = source if source == key.arbitration_id & 0xFF else used
-                what = f"source addresses 0x{first:02X} and 0x{max(source, used):02X} send PGN {pgn} ({name})"
-                fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
-                outputs.append(EndpointStatus(self.phase, f"{what}; {fix}", is_warning=True))
-            if source != key.arbitration_id & 0xFF:
+            name, chosen = self._needed[key], source if is_own else used
+            first, second = sorted((source, used))
+            what = f"source addresses 0x{first:02X} and 0x{second:02X} send PGN {pgn} ({name})"
+            fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
+            outputs = self._warn_once(("sources", key), f"{what}; {fix}")
+            if not is_own:
                 return None, outputs
-            self._sources[key] = (source, now.monotonic_ns)
-            return key, outputs
         self._sources[key] = (source, now.monotonic_ns)
-        return key, []
+        return key, outputs
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
         """Publish instants whose window has passed; report silence after its timeout."""
@@ -709,25 +725,34 @@ class CanDriver(ABC):
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
         return []
 
-    @abstractmethod
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
-        """Make the samples of complete and expired instants."""
+        self.counts["incomplete"] += sum(not each.is_complete for each in instants)
+        return [output for each in instants for output in self._publish_instant(each, now)]
 
-    def _on_usable(self, now: HostTime, text: str) -> list[Output[CanFrame]]:
+    @abstractmethod
+    def _publish_instant(self, instant: CanFrameSet, now: HostTime) -> list[Output[CanFrame]]:
+        """Make the sample of a complete or expired instant."""
+
+    def _make_header(self, instant: CanFrameSet) -> SensorHeader:
+        self._seq += 1
+        return SensorHeader(instant.utime, self.settings.source, self._seq - 1, instant.utime)
+
+    def _publish_sample(self, sample: Sample, text: str, now: HostTime) -> list[Output[CanFrame]]:
+        """Publish a sample; `text`: the status of a driver that was not streaming."""
+        self.counts["samples"] += 1
         self._restart_silence_timer(now)
+        measured = MeasuredSample(sample, self.settings.delay, self.settings.delay_sigma)
         if self.phase is EndpointPhase.STREAMING:
-            return []
+            return [measured]
         self.phase = EndpointPhase.STREAMING
-        return [EndpointStatus(EndpointPhase.STREAMING, text)]
+        return [EndpointStatus(EndpointPhase.STREAMING, text), measured]
 
-    def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
-        """Count a malformed frame; reported once per kind."""
-        self.counts[f"rejected.{error.reason}"] += 1
-        self._note_useless(f"{self._needed[frame.key]} ({frame.key}) {error.summary}")
-        if frame.key in self._reported:
+    def _warn_once(self, what: object, text: str) -> list[Output[CanFrame]]:
+        """Return a warning, once for what it is about since the line was opened."""
+        if what in self._reported:
             return []
-        self._reported.add(frame.key)
-        return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
+        self._reported.add(what)
+        return [EndpointStatus(self.phase, text, is_warning=True)]
 
     def _note_useless(self, what: str) -> None:
         """Note what is wrong with a frame, or with the frames of an instant."""
@@ -761,9 +786,7 @@ class CanDriver(ABC):
                 )
             else:
                 continue
-            if (signal.path, name) not in self._reported:
-                self._reported.add((signal.path, name))
-                outputs.append(EndpointStatus(self.phase, text, is_warning=True))
+            outputs += self._warn_once((signal.path, name), text)
         return outputs
 
     def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:

@@ -32,7 +32,7 @@ from typing import NamedTuple
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_choice, check_ranges
 from msdrivers.devices.stream import (
     NO_FRAME,
     SECOND_NS,
@@ -356,15 +356,9 @@ class Gx1Settings(ByteSettings):
 
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
-        if self.message not in MEASUREMENTS:
-            known = ", ".join(str(int(command)) for command in sorted(MEASUREMENTS))
-            raise ValueError(f"message is one of {known}, got {self.message}")
-        if self.heading not in _YAW_SOURCES:
-            raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
+        check_choice(self, message=sorted(MEASUREMENTS), heading=_YAW_SOURCES, specific_force_sign=(1, -1))
         if self.message == CommandByte.INSTANTANEOUS_EULER and self.heading == "vertical_gyro":
             raise ValueError("heading is magnetic with message 13, whose yaw is from the magnetometers")
-        if self.specific_force_sign not in (1, -1):
-            raise ValueError(f"specific_force_sign is 1 or -1, got {self.specific_force_sign}")
         check_ranges(self, tick=(0.0, 1.0))
 
 

@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 from modelserver.errors import quote, suggest_name
 from modelserver.messages import NAN, ImuSample, JointSample, JointsSample, Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices import Strict, check_factor, check_ranges
+from msdrivers.devices import Strict, check_choice, check_factor, check_ranges
 from msdrivers.devices.stream import (
     NEVER_NS,
     ByteSettings,
@@ -81,8 +81,7 @@ class TextSettings(Strict, ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, columns=(1, 256))
-        if self.checksum not in ("none", "xor"):
-            raise ValueError(f"checksum is none or xor, got {quote(self.checksum)}")
+        check_choice(self, checksum=("none", "xor"))
         for name, column in self.mapped.items():
             if column.column >= self.columns:
                 raise ValueError(f"fields: {name} is in column {column.column}, but a line has {self.columns}, from 0")

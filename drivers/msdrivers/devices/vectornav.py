@@ -19,7 +19,7 @@ from operator import xor
 from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_ranges, to_rotation
+from msdrivers.devices import check_choice, check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -224,8 +224,7 @@ class VectornavSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
-        if self.heading not in ("magnetic", "none"):
-            raise ValueError(f"heading is magnetic or none, got '{self.heading}'")
+        check_choice(self, heading=("magnetic", "none"))
 
 
 class VectornavDriver(StreamDriver[VnMessage]):

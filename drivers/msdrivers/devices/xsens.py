@@ -16,7 +16,7 @@ from enum import IntEnum
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_ranges, to_rotation
+from msdrivers.devices import check_choice, check_ranges, to_rotation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -216,8 +216,7 @@ class XsensSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1, 400), field_strength=(0.0, 1e-3))
-        if self.heading not in _YAW_SOURCES:
-            raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
+        check_choice(self, heading=_YAW_SOURCES)
 
 
 _YAW_SOURCES: Final = {"magnetic": YawSource.MAGNETIC, "none": YawSource.NONE, "true": YawSource.TRUE}

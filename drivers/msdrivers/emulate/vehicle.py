@@ -15,7 +15,6 @@ from itertools import count
 from typing import Any, Final
 
 from modelserver.messages import (
-    Direction,
     JointsSample,
     SensorHeader,
     VehicleMode,
@@ -66,7 +65,7 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
         for wheel in self._wheels:
-            for signal in wheel.signals:
+            for signal in wheel.signals.values():
                 self._raw.setdefault(signal.message, dict.fromkeys(database.bind_signals(signal.message), 0))
         self._offset = dict.fromkeys((wheel.name for wheel in self._wheels), first_count)
         self._counted = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
@@ -89,31 +88,24 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
         return [self._database.encode(message, raw) for message, raw in self._raw.items()]
 
     def _set_wheel(self, wheel: BoundWheel, sample: WheelSample) -> None:
-        mapped = wheel.map
-        if wheel.count is not None and mapped.count is not None and math.isfinite(sample.travel):
+        mapped, get = wheel.map, wheel.signals.get
+        if (signal := get("count")) is not None and mapped.count is not None and math.isfinite(sample.travel):
             rolled = round(sample.travel / mapped.count.meters_per_count)
             step = rolled - self._rolled[wheel.name]
             self._counted[wheel.name] += abs(step) if mapped.count.counts_up_only else step
             self._rolled[wheel.name] = rolled
-            count = (self._counted[wheel.name] + self._offset[wheel.name]) % (
-                mapped.count.wrap or 1 << wheel.count.length
-            )
-            signed = wheel.count.is_signed and count >= 1 << (wheel.count.length - 1)
-            self._set_raw(wheel.count, count - (1 << wheel.count.length) if signed else count)
-        if wheel.speed is not None and mapped.speed is not None and math.isfinite(sample.speed):
+            whole = 1 << signal.length
+            count = (self._counted[wheel.name] + self._offset[wheel.name]) % (mapped.count.wrap or whole)
+            self._set_raw(signal, count - whole if signal.is_signed and count >= whole // 2 else count)
+        if (signal := get("speed")) is not None and mapped.speed is not None and math.isfinite(sample.speed):
             speed = sample.speed / mapped.speed.scale
-            self._set_raw(wheel.speed, wheel.speed.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
-        if wheel.direction is not None and mapped.direction is not None:
-            numbers = {
-                Direction.STOPPED: mapped.direction.stopped,
-                Direction.FORWARD: mapped.direction.forward,
-                Direction.BACKWARD: mapped.direction.backward,
-            }
-            known = set(numbers.values())
-            unknown = next((each for each in range(1 << wheel.direction.length) if each not in known), 0)
-            self._set_raw(wheel.direction, numbers.get(sample.direction, unknown))
-        if wheel.steering is not None and mapped.steering is not None and math.isfinite(sample.steering):
-            self._set_raw(wheel.steering, wheel.steering.to_bits(mapped.steering.from_si(sample.steering)))
+            self._set_raw(signal, signal.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
+        if (signal := get("direction")) is not None and mapped.direction is not None:
+            numbers = mapped.direction.numbers
+            unknown = next((each for each in range(1 << signal.length) if each not in numbers.values()), 0)
+            self._set_raw(signal, numbers.get(sample.direction, unknown))
+        if (signal := get("steering")) is not None and mapped.steering is not None and math.isfinite(sample.steering):
+            self._set_raw(signal, signal.to_bits(mapped.steering.from_si(sample.steering)))
 
     def _set_raw(self, signal: BoundSignal, raw: float) -> None:
         self._raw[signal.message][signal.name] = raw
@@ -177,7 +169,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
     def on_receive(self, unit: CanFrame, now: HostTime) -> Sequence[Output[CanFrame]]:
         outputs = self.on_timer(now)
         command = self._command
-        if command is not None and not unit.is_error and unit.key == command.forward_speed.key:
+        if command is not None and not unit.is_error and unit.key == command.key:
             try:
                 self._on_command(command, self._database.decode(unit), now.monotonic_ns)
             except FrameError as error:
@@ -204,19 +196,16 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
-        if command.alive is not None:
-            if raw[command.alive.name] == self._alive:
+        if (alive := command.signals.get("alive")) is not None:
+            if raw[alive.name] == self._alive:
                 self.counts["rejected.repeated"] += 1
                 return
-            self._alive = raw[command.alive.name]
+            self._alive = raw[alive.name]
         enabled = all(raw[name] == bits for name, bits in command.drive_bits.items())
         requested = []
-        for signal, mapped in (
-            (command.forward_speed, command.map.forward_speed),
-            (command.steering_angle, command.map.steering_angle),
-        ):
+        for signal, mapped in command.motion:
             physical = signal.to_physical(raw[signal.name])
-            requested.append(math.nan if physical is None else physical * mapped.scale + mapped.offset)
+            requested.append(math.nan if physical is None else mapped.to_si(physical))
         fits = abs(requested[0]) <= self.unit.max_speed and abs(requested[1]) <= self.unit.max_steering
         if not fits or (enabled and self.mode is not VehicleMode.AUTONOMOUS):
             self.rejected += 1
@@ -247,22 +236,19 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         if status is None:
             return []
         unit = self.unit
-        values = dict(
-            zip(NUMERIC_FIELDS, (self.speed, self.steering, unit.supply_voltage, unit.engine_speed), strict=True)
-        )
+        numbers = (self.speed, self.steering, unit.supply_voltage, unit.engine_speed)
+        values = dict(zip(NUMERIC_FIELDS, numbers, strict=True))
         raw: dict[str, dict[str, float]] = {}
         for name, signal in status.signals.items():
             message = raw.setdefault(signal.message, dict.fromkeys(self._database.bind_signals(signal.message), 0))
             if name in values:
-                mapped = getattr(status.map, name)
-                message[signal.name] = signal.to_bits(mapped.from_si(values[name]))
+                bits = signal.to_bits(getattr(status.map, name).from_si(values[name]))
             elif name == "mode":
-                message[signal.name] = status.map.modes.get(self.mode.name.lower(), 0)
+                bits = status.map.modes.get(self.mode.name.lower(), 0)
             else:
-                message[signal.name] = (
-                    unit.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
-                )
-        return [self._database.encode(message, bits) for message, bits in raw.items()]
+                bits = unit.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
+            message[signal.name] = bits
+        return [self._database.encode(name, values) for name, values in raw.items()]
 
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3

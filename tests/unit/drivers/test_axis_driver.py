@@ -486,13 +486,13 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: RegisterMap(0, 3), "registers is 1"),
+        (lambda: RegisterMap(0, 3), "registers is one of 1, 2"),
         (lambda: RegisterMap(-1), "address is 0 to 65535"),
         (lambda: RegisterMap(65535, 2), "address is 0 to 65534"),
         (lambda: RegisterMap(40001, scale_deg=0.0), "scale_deg is a number and not 0"),
         (lambda: RegisterMap(0, offset_deg=math.nan), "offset_deg is a number"),
-        (lambda: RegisterMap(0, type="float64"), "type is int16, uint16, int32, uint32, float32, got 'float64'"),  # type: ignore[arg-type]
-        (lambda: RegisterMap(0, order="ACBD"), "order is ABCD, CDAB, BADC, DCBA, got 'ACBD'"),  # type: ignore[arg-type]
+        (lambda: RegisterMap(0, type="float64"), "type is one of int16, uint16, int32, uint32, float32, got 'float64'"),  # type: ignore[arg-type]
+        (lambda: RegisterMap(0, order="ACBD"), "order is one of ABCD, CDAB, BADC, DCBA, got 'ACBD'"),  # type: ignore[arg-type]
         (lambda: RegisterMap(65535, type="float32"), "address is 0 to 65534"),
         (lambda: RegisterMap(0, 2, type="int16"), "registers is left out with type: int16 has 1, got 2"),
         (lambda: RegisterMap(0, is_signed=False, type="int32"), "is_signed is left out with type: int32 is signed"),
@@ -500,7 +500,7 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
         (lambda: NodSettings(1.0, 1.0), "lower_deg is below upper_deg"),
         (lambda: AxisRegisters(RegisterMap(0), RegisterMap(125)), "lie 126 registers apart; at most 125"),
         (lambda: AxisRegisters(RegisterMap(0), nod_rate=RegisterMap(1)), "given together"),
-        (lambda: AxisRegisters(RegisterMap(0), table="coils"), "table is holding or input"),  # type: ignore[arg-type]
+        (lambda: AxisRegisters(RegisterMap(0), table="coils"), "table is one of holding, input"),  # type: ignore[arg-type]
     ],
 )
 def test_given_registers_that_cannot_be_then_the_key_is_named(make: object, expected: str) -> None:

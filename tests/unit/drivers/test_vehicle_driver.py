@@ -383,7 +383,7 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
 def test_given_limits_that_cannot_be_then_the_key_is_named() -> None:
     with pytest.raises(ValueError, match="steering_angle is between"):
         CommandLimits(steering_angle=2.0)
-    with pytest.raises(ValueError, match="over_limit is clamp or reject"):
+    with pytest.raises(ValueError, match="over_limit is one of clamp, reject"):
         CommandLimits(over_limit="perhaps")  # type: ignore[arg-type]
 
 

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices import check_ranges
+from msdrivers.devices import check_choice, check_ranges
 from msdrivers.devices.gps import (
     DAY,
     WEEK,
@@ -56,8 +56,6 @@ from msdrivers.devices.stream import (
 )
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
-PROTOCOLS = ("novatel", "nmea")
-HEADING_LOGS = ("", "HEADING", "HEADING2")
 POSITION_LOG = "BESTPOS"
 
 HOLD_NS = SECOND_NS // 10
@@ -90,9 +88,7 @@ class GpsSettings(ByteSettings):
 
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
-        for name, known in (("protocol", PROTOCOLS), ("heading_log", HEADING_LOGS)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} is one of {', '.join(filter(None, known))}, got '{getattr(self, name)}'")
+        check_choice(self, protocol=("novatel", "nmea"), heading_log=("", "HEADING", "HEADING2"))
         check_ranges(self, rate_hz=(0.1, 20.0))
         for command in self.commands:
             if not command.strip() or not command.isprintable() or not command.isascii():
