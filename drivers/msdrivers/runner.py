@@ -87,7 +87,8 @@ class HealthReporter:
         """Deadline of the next report, monotonic nanoseconds."""
         self._source, self._silence, self._period_ns = source, silence, round(period * 1e9)
         self._send = send
-        self._sample_ns: int | None = None
+        self.sample_ns: int | None = None
+        """When the last sample was published, monotonic nanoseconds."""
         self._counted_ns, self._counted = now.monotonic_ns, 0
         self._phase, self._text, self._is_warning = DriverPhase.CLOSED, "not opened yet", False
         self._last_warning = ""
@@ -105,14 +106,6 @@ class HealthReporter:
         if phase is DriverPhase.SILENT and self._last_warning not in text:
             text += f"; before that: {self._last_warning}"
         return phase, text
-
-    def sample_age(self, now: HostTime) -> float:
-        """Return the seconds since the last sample; nan before the first."""
-        return NAN if self._sample_ns is None else (now.monotonic_ns - self._sample_ns) * 1e-9
-
-    def count_sample(self, now: HostTime) -> None:
-        self.samples += 1
-        self._sample_ns = now.monotonic_ns
 
     def set_status(self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False) -> None:
         """Set phase and text and report a change.
@@ -136,7 +129,7 @@ class HealthReporter:
         if self._changes > MAX_CHANGES_PER_PERIOD and not self.is_ending:
             return
         # at a start the device may appear after its driver: what is wrong then is logged once it lasts (`on_timer`)
-        is_starting = self._sample_ns is None and now.monotonic_ns - self._started_ns < STABLE_NS
+        is_starting = self.sample_ns is None and now.monotonic_ns - self._started_ns < STABLE_NS
         is_new = now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS
         if self.is_ending or (is_new and not (is_starting and self._is_bad)):
             self._log(now)
@@ -197,23 +190,19 @@ class ReconnectBackoff:
         self._wait, self._failures = self._min_wait, 0
         return True
 
-    def on_lost(self, at_ns: int, *, is_orderly: bool = False) -> float:
-        """Return how long to wait before the next attempt; 0 only for an orderly close of a stable line.
+    def on_lost(self, at_ns: int, *, is_orderly: bool, changes_baud: bool) -> float:
+        """Return how long to wait before the next attempt; 0 for an orderly close of a stable line.
 
-        A lost line always waits: a program that competes for it must not cause a busy loop.
+        A lost line always waits: a program that competes for it must not cause a busy loop. A change of the baud rate
+        is neither failure nor success.
         """
         was_stable = self.is_stable(at_ns)
-        if self._opened_ns is not None and not was_stable:
-            self._failures += 1
+        self._failures += self._opened_ns is not None and not was_stable and not changes_baud
         self._opened_ns = None
-        if is_orderly and was_stable:
+        if changes_baud or (is_orderly and was_stable):
             return 0.0
         wait, self._wait = self._wait, min(self._wait * 2.0, self._max_wait)
         return wait * self._rng.uniform(0.8, 1.2)
-
-    def on_rate_change(self) -> None:
-        """Record that the line was closed to change the baud rate: neither failure nor success."""
-        self._opened_ns = None
 
     @property
     def is_failing(self) -> bool:
@@ -330,7 +319,7 @@ class Runner(Generic[U]):
         if not self._is_open:
             self.counts["units_dropped"] += 1
             return
-        self._execute_guarded("send", lambda: [Send(unit)])
+        self._call_guarded("send", lambda: [Send(unit)])
 
     def _dispatch_command(self, call: Callable[[CommandableEndpoint[U], HostTime], Sequence[Output[U]]]) -> None:
         endpoint = self._endpoint
@@ -338,7 +327,7 @@ class Runner(Generic[U]):
             self.counts["commands_dropped"] += 1
             return
         now = self._time_source.now()
-        self._execute_guarded("on_command", lambda: call(endpoint, now))
+        self._call_guarded("on_command", lambda: call(endpoint, now))
 
     def run_once(self) -> None:
         """Make one pass: open the line or process its input, fire the endpoint's timer, report health."""
@@ -375,11 +364,12 @@ class Runner(Generic[U]):
         self._received_ns = now.monotonic_ns
         self._backoff.on_open(now.monotonic_ns)
         self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
-        self._execute_guarded("on_open", lambda: self._endpoint.on_open(now))
+        self._call_guarded("on_open", lambda: self._endpoint.on_open(now))
 
-    def _execute_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+    def _call_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+        """Call the endpoint; an error of the link closes the line."""
         try:
-            self._execute(self._call_endpoint(what, call))
+            self._call(what, call)
         except LinkError as error:
             self._close(str(error))
 
@@ -392,9 +382,7 @@ class Runner(Generic[U]):
         """Close the line and schedule its reopening: at once to change the baud rate, else when the backoff allows."""
         self._close_line()
         at_ns = self._time_source.now().monotonic_ns
-        if changes_baud:
-            self._backoff.on_rate_change()
-        wait = 0.0 if changes_baud else self._backoff.on_lost(at_ns, is_orderly=is_orderly)
+        wait = self._backoff.on_lost(at_ns, is_orderly=is_orderly, changes_baud=changes_baud)
         self._open_ns = at_ns + round(wait * 1e9)
         if self._backoff.is_failing:
             reason += "; it is opened and closed again and again: does another program use it?"
@@ -415,21 +403,21 @@ class Runner(Generic[U]):
         if units:
             self._received_ns, self._reporter.is_silent = now.monotonic_ns, False
         for unit in units:
-            self._execute(self._call_endpoint("on_receive", lambda unit=unit: self._endpoint.on_receive(unit, now)))  # type: ignore[misc]
+            self._call("on_receive", lambda unit=unit: self._endpoint.on_receive(unit, now))  # type: ignore[misc]
             if not self._is_open:
                 return
         due = self._endpoint.get_deadline()
         if due is not None and now.monotonic_ns >= due:
-            self._execute(self._call_endpoint("on_timer", lambda: self._endpoint.on_timer(now)))
+            self._call("on_timer", lambda: self._endpoint.on_timer(now))
         self._check_silence(now)
 
-    def _call_endpoint(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> Sequence[Output[U]]:
-        """Call the endpoint; an exception is counted and logged, and the driver continues."""
+    @contextlib.contextmanager
+    def _continue_on_error(self, what: str) -> Iterator[None]:
+        """Count and log an exception; the driver continues."""
         try:
-            return call()
+            yield
         except Exception:
             self._count_error(what)
-            return ()
 
     @contextlib.contextmanager
     def _guard_link(self, what: str) -> Iterator[None]:
@@ -451,7 +439,11 @@ class Runner(Generic[U]):
         if str(count).strip("0") == "1":
             log.exception("%s: internal error number %d in %s", self._settings.source, count, what)
 
-    def _execute(self, outputs: Sequence[Output[U]]) -> None:
+    def _call(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+        """Call the endpoint and execute its outputs. Raises LinkError."""
+        outputs: Sequence[Output[U]] = ()
+        with self._continue_on_error(what):
+            outputs = call()
         for output in outputs:
             if isinstance(output, Send):
                 with self._guard_link("send"):
@@ -466,12 +458,10 @@ class Runner(Generic[U]):
 
     def _publish_sample(self, measured: MeasuredSample) -> None:
         now = self._time_source.now()
-        try:
+        with self._continue_on_error("publish"):
             self._publish(self._stamper.stamp(measured, now))
-        except Exception:
-            self._count_error("publish")
-            return
-        self._reporter.count_sample(now)
+            self._reporter.samples += 1
+            self._reporter.sample_ns = now.monotonic_ns
 
     def _check_silence(self, now: HostTime) -> None:
         self._backoff.is_stable(now.monotonic_ns)
@@ -486,10 +476,8 @@ class Runner(Generic[U]):
         self._reporter.set_status(phase, text, self._time_source.now(), is_warning=is_warning)
 
     def _send_report(self, now: HostTime) -> None:
-        try:
+        with self._continue_on_error("report"):
             self._publish_health(self.make_health(now))
-        except Exception:
-            self._count_error("report")
 
     def make_health(self, now: HostTime) -> DriverHealth:
         phase, text = self._reporter.state
@@ -505,7 +493,7 @@ class Runner(Generic[U]):
             reconnects=self.reconnects,
             samples=self.samples,
             rate_hz=self._reporter.rate_hz,
-            age=self._reporter.sample_age(now),
+            age=NAN if self._reporter.sample_ns is None else (now.monotonic_ns - self._reporter.sample_ns) * 1e-9,
             clock_offset=self._stamper.offset,
             clock_drift=clock.drift,
             clock_sigma=self._stamper.sigma,
@@ -517,7 +505,7 @@ class Runner(Generic[U]):
         if self._is_open:
             now = self._time_source.now()
             try:
-                self._execute(self._call_endpoint("on_close", lambda: self._endpoint.on_close(now)))
+                self._call("on_close", lambda: self._endpoint.on_close(now))
             except LinkError as error:
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._close_line()

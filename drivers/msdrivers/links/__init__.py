@@ -159,16 +159,15 @@ class TcpLink(DescriptorLink):
         """Connect; the baud rate is that of the server. Raises LinkError."""
         try:
             self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
-        except socket.gaierror as error:
-            raise LinkError(self.description, f"no such host ({error.strerror})", "look at address") from None
-        except UnicodeError as error:
-            # a name with an empty part, or one that is too long
-            raise LinkError(self.description, f"no such address ({error})", "look at address") from None
-        except TimeoutError:
-            raise LinkError(self.description, "no answer", "is it switched on and on this network?") from None
-        except OSError as error:
-            why = error.strerror or str(error)
-            fix = "nothing listens there: is the device's server on?" if error.errno == errno.ECONNREFUSED else ""
+        except (OSError, UnicodeError) as error:
+            why, fix = getattr(error, "strerror", None) or str(error), ""
+            # UnicodeError: a name with an empty part, or one that is too long
+            if isinstance(error, socket.gaierror | UnicodeError):
+                why, fix = f"no such host ({why})", "look at address"
+            elif isinstance(error, TimeoutError):
+                why, fix = "no answer", "is it switched on and on this network?"
+            elif isinstance(error, ConnectionRefusedError):
+                fix = "nothing listens there: is the device's server on?"
             raise LinkError(self.description, why, fix) from None
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
