@@ -172,10 +172,8 @@ class CanFrame:
         return self.is_error and bool(self.arbitration_id & BUS_OFF)
 
 
-def make_bus_off_frame() -> CanFrame:
-    """Make the error frame of an interface that went bus-off."""
-    return CanFrame(BUS_OFF, is_error=True)
-
+BUS_OFF_FRAME = CanFrame(BUS_OFF, is_error=True)
+"""The error frame of an interface that went bus-off."""
 
 MAX_READ = 125
 MAX_WRITE = 123

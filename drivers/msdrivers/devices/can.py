@@ -249,14 +249,11 @@ class CanDatabase:
         message = self.by_key.get(frame.key)
         if message is None:
             raise FrameError("unknown", f"{self.name} has no message {frame.key}")
-        if len(frame.data) != message.length:
-            raise FrameError(
-                "length",
-                f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
-                f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
-                f"identifier",
-                f"with {len(frame.data)} bytes instead of {message.length}",
-            )
+        what, size = f"frame {frame.key} ({message.name})", len(frame.data)
+        if size != message.length:
+            why = "the DBC is of another version of the controller, or another device uses the same identifier"
+            text = f"{what} has {size} bytes, {self.name} expects {message.length}: {why}"
+            raise FrameError("length", text, f"with {size} bytes instead of {message.length}")
         from cantools.database.errors import Error
 
         try:
@@ -264,13 +261,9 @@ class CanDatabase:
                 frame.data, decode_choices=False, scaling=False, allow_truncated=False, allow_excess=False
             )
         except Error as error:
-            raise FrameError(
-                "multiplexer", f"frame {frame.key} ({message.name}): {error}", "with an unknown multiplexer"
-            ) from None
+            raise FrameError("multiplexer", f"{what}: {error}", "with an unknown multiplexer") from None
         except (ValueError, KeyError, OverflowError) as error:
-            raise FrameError(
-                "bits", f"frame {frame.key} ({message.name}): {error}", "with bits that are no number"
-            ) from None
+            raise FrameError("bits", f"{what}: {error}", "with bits that are no number") from None
         return {name: value for name, value in values.items() if isinstance(value, int | float)}
 
     def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:

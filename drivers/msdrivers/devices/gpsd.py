@@ -126,12 +126,6 @@ class GpsdFormat:
         return ParsedFrame(end + 1, f"gpsd.{name[:16]}", report)
 
 
-class GpsdStream(FrameScanner[GpsdReport]):
-    """Parses bytes to reports. Never raises; memory is bounded."""
-
-    formats = (GpsdFormat(),)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsdSettings(ByteSettings):
     """Settings of gpsd. Raises ValueError with the key for an invalid value."""
@@ -159,7 +153,7 @@ class GpsdDriver(StreamDriver[GpsdReport]):
     attempts = 2
 
     def __init__(self, settings: GpsdSettings) -> None:
-        super().__init__(settings, GpsdStream())
+        super().__init__(settings, FrameScanner((GpsdFormat(),)))
         self._receiver = settings.receiver
         self._pending: tuple[GpsdReport, int, int] | None = None
         self._gst: GpsdReport | None = None

@@ -22,7 +22,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from operator import xor
-from typing import Any, ClassVar, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from modelserver.messages import Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
@@ -88,11 +88,8 @@ class FrameFormat(Protocol[M_co]):
 class FrameScanner(Generic[M]):
     """Finds the frames of several formats in a byte stream. `feed` never raises; memory is bounded."""
 
-    formats: ClassVar[Sequence[FrameFormat[Any]]] = ()
-    """Those of a subclass."""
-
-    def __init__(self, formats: Sequence[FrameFormat[M]] = ()) -> None:
-        self._formats = {lead: each for each in formats or self.formats for lead in each.start_bytes}
+    def __init__(self, formats: Sequence[FrameFormat[M]]) -> None:
+        self._formats = {lead: each for each in formats for lead in each.start_bytes}
         self._start_pattern = re.compile(b"[" + re.escape(bytes(self._formats)) + b"]")
         self._buffer = bytearray()
         self._offset = 0

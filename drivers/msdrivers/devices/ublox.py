@@ -12,6 +12,7 @@ at the end of the epoch (NAV-EOE), at the latest after `HOLD_NS`.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -113,12 +114,6 @@ class UbxFormat:
         return ParsedFrame(end, f"ubx.{name}", UbxMessage(name, values, start))
 
 
-class UbxStream(FrameScanner[UbxMessage]):
-    """Parses bytes to UBX messages. Never raises; memory is bounded."""
-
-    formats = (UbxFormat(),)
-
-
 # --- values of messages ---------------------------------------------------------------------------------------
 
 
@@ -163,17 +158,9 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
         for name, value in vars(version).items()
         if name.startswith(("extension", "swVersion", "hwVersion"))
     ]
-    protocol, product = 0.0, ""
-    for text in texts:
-        key, _, value = text.replace("=", " ").partition(" ")
-        if key == "PROTVER":
-            try:
-                protocol = float(value.split()[0])
-            except (ValueError, IndexError):
-                protocol = 0.0
-        elif key == "MOD":
-            product = value.strip()
-    return product or "u-blox receiver", protocol
+    stated = dict(text.replace("=", " ").partition(" ")[::2] for text in texts)
+    protocol = re.match(r"\s*(\d+(?:\.\d*)?)(?!\S)", stated.get("PROTVER", ""))
+    return stated.get("MOD", "").strip() or "u-blox receiver", float(protocol[1]) if protocol else 0.0
 
 
 # --- configuration --------------------------------------------------------------------------------------------
@@ -348,7 +335,7 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     awaited = "NAV-PVT"
 
     def __init__(self, settings: UbloxSettings) -> None:
-        super().__init__(settings, UbxStream())
+        super().__init__(settings, FrameScanner((UbxFormat(),)))
         self._rate_hz = settings.rate_hz
         self._epoch: Epoch | None = None
         self._last_itow: int | None = None

@@ -144,12 +144,6 @@ class VnTextFormat:
         return ParsedFrame(found.end(), f"text.{words[0][:3]}", VnText(words, start))
 
 
-class VnStream(FrameScanner[VnMessage]):
-    """Parses bytes to binary and ASCII messages. Never raises; memory is bounded."""
-
-    formats = (VnBinaryFormat(), VnTextFormat())
-
-
 def encode_text(text: str) -> bytes:
     """Return an ASCII message, e.g. of RRG,01."""
     body = f"VN{text}"
@@ -239,7 +233,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
     answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
-        super().__init__(settings, VnStream())
+        super().__init__(settings, FrameScanner((VnBinaryFormat(), VnTextFormat())))
         self._rate_hz, self._port = settings.rate_hz, settings.unit_port
         self._yaw_source = YawSource.MAGNETIC if settings.heading == "magnetic" else YawSource.NONE
         self._last_ns: int | None = None

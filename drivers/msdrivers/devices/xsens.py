@@ -112,12 +112,6 @@ class XbusFormat:
         )
 
 
-class XbusStream(FrameScanner[XbusMessage]):
-    """Parses bytes to Xbus messages. Never raises; memory is bounded."""
-
-    formats = (XbusFormat(),)
-
-
 def encode(identifier: int, data: bytes = b"") -> bytes:
     size = bytes((len(data),)) if len(data) < 0xFF else b"\xff" + len(data).to_bytes(2, "big")
     body = bytes((BUS_IDS[0], identifier)) + size + data
@@ -254,7 +248,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
     """Some units do not answer after power-up."""
 
     def __init__(self, settings: XsensSettings) -> None:
-        super().__init__(settings, XbusStream())
+        super().__init__(settings, FrameScanner((XbusFormat(),)))
         self._own = settings
         self._ticks = SampleTimeUnwrapper()
         self._last_counter: int | None = None

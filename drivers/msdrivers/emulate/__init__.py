@@ -14,6 +14,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
 from msdrivers.endpoint import (
+    BUS_OFF_FRAME,
     CanFrame,
     Endpoint,
     EndpointPhase,
@@ -23,7 +24,6 @@ from msdrivers.endpoint import (
     Registers,
     Send,
     U,
-    make_bus_off_frame,
 )
 
 S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample, JointsSample)
@@ -142,7 +142,7 @@ class FaultInjector(Generic[U]):
             fault = self._faults.popleft()
             outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
             if fault.kind == "bus_off":
-                outputs.append(cast(Send[U], Send(make_bus_off_frame())))
+                outputs.append(cast(Send[U], Send(BUS_OFF_FRAME)))
             if fault.kind in ("stall", "restart", "bus_off"):
                 self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
             self._pending[fault.kind] += round(fault.amount)

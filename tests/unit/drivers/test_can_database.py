@@ -12,7 +12,7 @@ from modelserver.errors import ConfigError, Severity
 from msdrivers.devices.can import CanDatabase, FrameError, SignalMap, parse_dbc
 from msdrivers.devices.vehicle import CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, bind_wheels
-from msdrivers.endpoint import CanFrame, FrameKey, make_bus_off_frame
+from msdrivers.endpoint import BUS_OFF_FRAME, CanFrame, FrameKey
 
 MIXED = """VERSION ""
 NS_ :
@@ -106,7 +106,7 @@ def test_given_a_command_then_the_frame_holds_it(database: CanDatabase) -> None:
 
 
 def test_given_error_frames_then_bus_off_is_distinguished() -> None:
-    assert make_bus_off_frame().is_bus_off
+    assert BUS_OFF_FRAME.is_bus_off
     assert not CanFrame(0x4, is_error=True).is_bus_off
     assert not CanFrame(0x40).is_bus_off
 

@@ -15,8 +15,8 @@ from support_gps import SECOND, START, Line, add_noise, drive, split_in_half, sp
 
 from modelserver.messages import FixType, GpsSample
 from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
-from msdrivers.devices.stream import compute_fletcher, recognize, recognize_line
-from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxStream
+from msdrivers.devices.stream import FrameScanner, compute_fletcher, recognize, recognize_line
+from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxFormat
 from msdrivers.emulate import FaultInjector, parse_fault
 from msdrivers.emulate.gps import ORDER, GpsEmulator, GpsUnit, UbloxEmulator, UbloxUnit, encode_ubx
 from msdrivers.endpoint import EndpointPhase
@@ -196,8 +196,8 @@ def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
     noise = noise.replace(b"\xb5\x62", b"")
     frame = encode_ubx("NAV-PVT", ALL)
     data = noise[:at] + frame + noise[at:]
-    whole = UbxStream().feed(data)
-    stream = UbxStream()
+    whole = FrameScanner((UbxFormat(),)).feed(data)
+    stream = FrameScanner((UbxFormat(),))
     pieces: list[object] = []
     position = 0
     while position < len(data):
@@ -210,7 +210,7 @@ def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
 
 
 def test_given_damaged_lengths_or_payloads_then_they_are_counted() -> None:
-    stream = UbxStream()
+    stream = FrameScanner((UbxFormat(),))
     stream.feed(b"\xb5\x62\x01\x07\xff\xff" + bytes(20))
     short = b"\x01\x07\x04\x00\x00\x00\x00\x00"
     stream.feed(b"\xb5\x62" + short + compute_fletcher(short))
