@@ -156,13 +156,6 @@ class SectionReader(SettingsReader):
         return [] if detail["type"] == "missing" and is_of_line and not self._has_line else super().explain(detail)
 
 
-SOURCE_FIELD = "source"
-"""The field of a kind's settings that takes the driver's name."""
-
-BAUDS_FIELD = "bauds"
-"""The field of a kind's settings that has the rates to try; `baud` in the section gives it one."""
-
-
 @dataclass(frozen=True, slots=True)
 class SourceMap:
     """File and lines of the keys by path."""
@@ -249,20 +242,20 @@ def read_driver(
     reader = SectionReader(name, section, source_map.locate)
     kind = reader.read_kind(kinds)
     settings = kind.load().settings
-    station_keys = [key for key in list_keys(settings) if key != SOURCE_FIELD and key not in kind.presets]
-    more = [*COMMON_KEYS, *([NTRIP_FIELD] if kind.takes_corrections else []), *station_keys]
+    station_keys = [key for key in list_keys(settings) if key != "source" and key not in kind.presets]
+    more = [*COMMON_KEYS, *(["ntrip"] if kind.takes_corrections else []), *station_keys]
     line = reader.read_line_type(kind, more)
     reader.report_unknown_keys(kind, line, more)
     line_values = reader.read_values(line)
-    given: dict[str, Any] = {SOURCE_FIELD: name, **kind.presets}
+    given: dict[str, Any] = {"source": name, **kind.presets}
     baud = getattr(line_values, "baud", 0)
     if "bauds" in section and "baud" in section:
         reader.report("baud", "both baud and bauds are given", "keep one of baud or bauds")
-    elif baud and BAUDS_FIELD in station_keys:
-        given[BAUDS_FIELD] = [baud]
-    if line is TcpSettings and BAUDS_FIELD in station_keys:
+    elif baud and "bauds" in station_keys:
+        given["bauds"] = [baud]
+    if line is TcpSettings and "bauds" in station_keys:
         # the device server owns the rate; it cannot be changed from here
-        given[BAUDS_FIELD] = []
+        given["bauds"] = []
     values = reader.read_values(settings, given)
     common = reader.read_values(_CommonKeys)
     if reader.problems:
@@ -279,11 +272,8 @@ class _CommonKeys:
     ntrip: NtripSettings | None = None
 
 
-NTRIP_FIELD = "ntrip"
-"""Key of the corrections, for receivers that take them."""
-
-COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
-"""Keys that every driver has."""
+COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != "ntrip")
+"""Keys that every driver has; `ntrip` is of receivers that take corrections."""
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:
@@ -310,7 +300,7 @@ def make_link(settings: DriverSettings) -> Link[Any]:
 
 def choose_first_baud(settings: DriverSettings) -> int:
     """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
-    bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
+    bauds = getattr(settings.device_settings, "bauds", ())
     given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
     return bauds[0] if bauds else given or settings.kind.baud
 

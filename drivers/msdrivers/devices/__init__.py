@@ -6,10 +6,10 @@ Protocols are parsers and encoders without clock, socket, file, thread or log.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import ClassVar
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar
 
-from modelserver.transforms.so3 import Quaternion
+from modelserver.messages import OrientationReference, YawSource
 
 
 def check_ranges(settings: object, **ranges: tuple[float, float]) -> None:
@@ -34,10 +34,15 @@ class Strict:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 
-def to_rotation(w: float, x: float, y: float, z: float) -> Quaternion | None:
-    """Return a unit's own orientation, normalized; None for numbers that are no rotation."""
-    norm = math.hypot(w, x, y, z)
-    return (w / norm, x / norm, y / norm, z / norm) if abs(norm - 1.0) < 0.01 else None
+def make_orientation(
+    quaternion: Sequence[float] | None, reference: OrientationReference, yaw_source: YawSource
+) -> dict[str, Any]:
+    """Return a sample's fields of a unit's own orientation, scalar first; none for numbers that are no rotation."""
+    norm = math.hypot(*(quaternion or ()))
+    if quaternion is None or not abs(norm - 1.0) < 0.01:
+        return {}
+    orientation = tuple(each / norm for each in quaternion)
+    return {"orientation": orientation, "orientation_reference": reference, "yaw_source": yaw_source}
 
 
 def check_factor(value: float, key: str) -> None:

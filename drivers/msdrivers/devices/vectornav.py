@@ -19,7 +19,7 @@ from operator import xor
 from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_choice, check_ranges, to_rotation
+from msdrivers.devices import check_choice, check_ranges, make_orientation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -272,8 +272,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             self._counts["lost"] += max(0, round(step) - 1) if step < 1000.0 else 0
         self._last_ns = time_ns
         magnetic, celsius = message.get_floats(MAGNETIC), message.get_floats(TEMPERATURE)
-        x, y, z, w = message.get_floats(QUATERNION) or (math.nan,) * 4
-        orientation = to_rotation(w, x, y, z)
+        quaternion = message.get_floats(QUATERNION)
+        scalar_first = quaternion and (quaternion[3], *quaternion[:3])
         sample = ImuSample(
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
@@ -281,10 +281,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             angular_velocity=self._read_vector(rate, MAX_RATE),
             specific_force=self._read_vector(force, MAX_ACCELERATION),
             magnetic_field=self._read_vector(magnetic, MAX_ACCELERATION, GAUSS),
-            orientation=orientation,
-            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.NED,
-            yaw_source=YawSource.NONE if orientation is None else self._yaw_source,
             temperature_celsius=celsius[0] if celsius is not None and math.isfinite(celsius[0]) else NAN,
+            **make_orientation(scalar_first, OrientationReference.NED, self._yaw_source),
         )
         return self._publish(sample, now)
 

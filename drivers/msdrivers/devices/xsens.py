@@ -8,7 +8,6 @@ Axes: as on the label, z up when it is upright.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from enum import IntEnum
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_choice, check_ranges, to_rotation
+from msdrivers.devices import check_choice, check_ranges, make_orientation
 from msdrivers.devices.stream import (
     NO_FRAME,
     ByteSettings,
@@ -297,7 +296,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)
-        orientation = to_rotation(*(data.get_numbers(ItemId.QUATERNION, 4) or (math.nan,) * 4))
+        quaternion, yaw_source = data.get_numbers(ItemId.QUATERNION, 4), _YAW_SOURCES[self._own.heading]
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
             angular_velocity=self._read_vector(rate, MAX_RATE),
@@ -305,9 +304,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
             magnetic_field=self._read_vector(field, 100.0, self._own.field_strength)
             if self._own.field_strength
             else None,
-            orientation=orientation,
-            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.ENU,
-            yaw_source=YawSource.NONE if orientation is None else _YAW_SOURCES[self._own.heading],
             temperature_celsius=self._celsius,
+            **make_orientation(quaternion, OrientationReference.ENU, yaw_source),
         )
         return self._publish(sample, now, TICK)

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseError, UBXReader, UBXTypeError
 
@@ -39,16 +39,26 @@ from msdrivers.devices.ublox import VALSET_VERSION, UbxFormat
 from msdrivers.emulate import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 
+
+class _Codes(NamedTuple):
+    """A type of fix: in NovAtel's logs, in GGA, in RMC, in gpsd's status, and in UBX (fixType, diffSoln, carrSoln)."""
+
+    position: PositionType
+    quality: str
+    mode: str
+    status: int
+    ubx: tuple[int, int, int]
+
+
 _FIXES = {
-    FixType.NONE: (PositionType.NONE, "0", "N"),
-    FixType.FIX_2D: (PositionType.FIXEDHEIGHT, "1", "A"),
-    FixType.FIX_3D: (PositionType.SINGLE, "1", "A"),
-    FixType.DIFFERENTIAL: (PositionType.PSRDIFF, "2", "D"),
-    FixType.RTK_FLOAT: (PositionType.NARROW_FLOAT, "5", "F"),
-    FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
-    FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
+    FixType.NONE: _Codes(PositionType.NONE, "0", "N", 0, (0, 0, 0)),
+    FixType.FIX_2D: _Codes(PositionType.FIXEDHEIGHT, "1", "A", 0, (2, 0, 0)),
+    FixType.FIX_3D: _Codes(PositionType.SINGLE, "1", "A", 0, (3, 0, 0)),
+    FixType.DIFFERENTIAL: _Codes(PositionType.PSRDIFF, "2", "D", 2, (3, 1, 0)),
+    FixType.RTK_FLOAT: _Codes(PositionType.NARROW_FLOAT, "5", "F", 4, (3, 1, 1)),
+    FixType.RTK_FIXED: _Codes(PositionType.NARROW_INT, "4", "R", 3, (3, 1, 2)),
+    FixType.DEAD_RECKONING: _Codes(PositionType.PROPAGATED, "6", "E", 5, (1, 0, 0)),
 }
-"""Position type, quality in GGA, mode in RMC."""
 
 
 def is_known(name: str) -> bool:
@@ -101,7 +111,7 @@ def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
         return Position(status, PositionType.NONE, *zeros, WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
-    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type][0]
+    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type].position
     heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
     place = (sample.latitude_deg, sample.longitude_deg, *heights)
     return Position(
@@ -146,13 +156,13 @@ def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
 def _format_gga(sample: GpsSample, utime: int) -> bytes:
     count = str(sample.satellites) if sample.satellites >= 0 else ""
     heights = (nmea.format_number(_get_height_msl(sample), 4), "M", nmea.format_number(sample.undulation, 4), "M")
-    quality = (_FIXES[sample.fix_type][1], count, nmea.format_number(sample.hdop, 2))
+    quality = (_FIXES[sample.fix_type].quality, count, nmea.format_number(sample.hdop, 2))
     return nmea.encode("GP", "GGA", (_format_clock(utime), *_format_position(sample), *quality, *heights, "", ""))
 
 
 def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
-    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
+    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type].mode
     motion = (nmea.format_number(speed / nmea.KNOT, 4), nmea.format_number(_track_from_course(course), 4))
     date = datetime.fromtimestamp(utime // SECOND, UTC).strftime("%d%m%y")
     fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
@@ -292,8 +302,6 @@ RECEIVER = "/dev/ttyACM0"
 LATENCY = 0.03
 """From the instant of a sample to what gpsd or the u-blox receiver sends, seconds."""
 
-_STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
-
 
 class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
     """An `Endpoint` of bytes that speaks as gpsd does. `samples` are in the order of their stamps."""
@@ -334,7 +342,7 @@ class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
             return (out + self._report(**{"class": "TPV"}, **head, mode=1),)
         east, north, up = sample.velocity or (math.nan,) * 3
         mode = 2 if sample.fix_type is FixType.FIX_2D else 3
-        status = {"status": _STATUS[sample.fix_type]} if sample.fix_type in _STATUS else {}
+        status = {"status": code} if (code := _FIXES[sample.fix_type].status) else {}
         motion = {"velN": north, "velE": east, "velD": -up, "speed": math.hypot(east, north)}
         track = {"track": math.degrees(math.atan2(east, north)) % 360.0 if east == east else math.nan}
         heights = {"altHAE": sample.height_ellipsoidal, "altMSL": sample.height_msl, "geoidSep": sample.undulation}
@@ -347,17 +355,6 @@ class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
 
 
 UBX_PORT: Final = "UART1"
-
-_UBX_FIXES: Final = {
-    FixType.NONE: (0, 0, 0),
-    FixType.DEAD_RECKONING: (1, 0, 0),
-    FixType.FIX_2D: (2, 0, 0),
-    FixType.FIX_3D: (3, 0, 0),
-    FixType.DIFFERENTIAL: (3, 1, 0),
-    FixType.RTK_FLOAT: (3, 1, 1),
-    FixType.RTK_FIXED: (3, 1, 2),
-}
-"""fixType, diffSoln, carrSoln."""
 
 _FACTORY_PERIOD_MS: Final = 1000
 
@@ -479,7 +476,7 @@ def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
     # the second is the nearest one, nano what is missing to it
     second = (sample.header.utime + 500_000) // 1_000_000
     when = datetime.fromtimestamp(second, UTC)
-    fix, is_differential, carrier = _UBX_FIXES[sample.fix_type]
+    fix, is_differential, carrier = _FIXES[sample.fix_type].ubx
     east, north, up = sample.velocity or (0.0, 0.0, 0.0)
     P, V = sample.position_covariance, sample.velocity_covariance
     height, msl = _nan_to_zero(sample.height_ellipsoidal), _nan_to_zero(_get_height_msl(sample))

@@ -8,7 +8,7 @@ steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -273,7 +273,7 @@ class AxisUnit:
     """Measurements a second; a reading between two gives the last."""
 
 
-class AxisEmulator:
+class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
     """An `Endpoint` of `ModbusUnit` that answers requests.
 
     Faults of its own: restart: it restarts with its first limits and rate. jump: its angle jumps by `amount` degrees.
@@ -281,11 +281,11 @@ class AxisEmulator:
     """
 
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
+        super().__init__(())
         self.unit = unit or AxisUnit()
         self._registers = registers
         self._started_ns: int | None = None
         self._exceptions: deque[int] = deque()
-        self.counts: Counter[str] = Counter()
         self._switch_on(0)
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
@@ -299,18 +299,9 @@ class AxisEmulator:
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
-        reply = self._make_exception(unit, code) if code else self._answer(unit)
+        reply = self._make_exception(unit, code) if code else self._reply(unit)
         self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
         return [Send(reply)]
-
-    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        return []
-
-    def get_deadline(self) -> int | None:
-        return None
-
-    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        return []
 
     def _switch_on(self, at_ns: int) -> None:
         unit = self.unit
@@ -365,7 +356,7 @@ class AxisEmulator:
             self.degrees = lower + (phase if phase < span else 2.0 * span - phase)
         return self._direction * rate
 
-    def _answer(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
+    def _reply(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
         if isinstance(unit, WriteRegisters):
             return self._write(unit)
         table = self._make_table(unit.table)

@@ -11,7 +11,7 @@ import os
 import select
 import socket
 from collections.abc import Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from modelserver.errors import ModelServerError
 
@@ -90,10 +90,19 @@ class DescriptorLink:
     """Base of the links whose bytes go through a file descriptor."""
 
     description: str
+    _file: Any = None
+    """A socket or serial port; None: closed."""
 
     def fileno(self) -> int:
         """Return the descriptor. Raises LinkError if the line is not open."""
-        raise NotImplementedError
+        if self._file is None:
+            raise LinkError(self.description, "the line is not open")
+        return int(self._file.fileno())
+
+    def close(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
     def poll(self, timeout: float) -> Sequence[bytes]:
         """Return received bytes; wait at most `timeout` seconds. Raises LinkError if the line is lost."""
@@ -153,12 +162,11 @@ class TcpLink(DescriptorLink):
     def __init__(self, host: str, port: int):
         self._address = (host, port)
         self.description = f"tcp {host}:{port}"
-        self._socket: socket.socket | None = None
 
     def open(self, baud: int | None = None) -> None:
         """Connect; the baud rate is that of the server. Raises LinkError."""
         try:
-            self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
+            connection = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
         except (OSError, UnicodeError) as error:
             why, fix = getattr(error, "strerror", None) or str(error), ""
             # UnicodeError: a name with an empty part, or one that is too long
@@ -169,19 +177,10 @@ class TcpLink(DescriptorLink):
             elif isinstance(error, ConnectionRefusedError):
                 fix = "nothing listens there: is the device's server on?"
             raise LinkError(self.description, why, fix) from None
-        self._socket.setblocking(False)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-
-    def close(self) -> None:
-        connection, self._socket = self._socket, None
-        if connection is not None:
-            connection.close()
-
-    def fileno(self) -> int:
-        if self._socket is None:
-            raise LinkError(self.description, "the line is not open")
-        return self._socket.fileno()
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._file = connection
 
 
 class TcpServerLink(DescriptorLink):

@@ -165,35 +165,26 @@ class SerialLink(DescriptorLink):
     def __init__(self, port: str, baud: int):
         self.description = port
         self.baud = baud
-        self._serial: serial.Serial | None = None
 
     def open(self, baud: int | None = None) -> None:
         """Open the port. Raises LinkError that names the process which holds it."""
         self.baud = baud or self.baud
         try:
-            self._serial = serial.Serial(self.description, self.baud, timeout=0, exclusive=True)
+            self._file = serial.Serial(self.description, self.baud, timeout=0, exclusive=True)
         # pyserial passes on termios.error, which is no OSError
         except (OSError, ValueError, termios.error) as error:
             raise self._explain_error(error) from None
 
     def close(self) -> None:
         """Drain the output, with a time limit, and close the port."""
-        port, self._serial = self._serial, None
-        if port is None:
-            return
-        # not port.flush(): that waits for ever where the other end does not take what was sent
+        # not flush(): that waits for ever where the other end does not take what was sent
         with contextlib.suppress(OSError, termios.error):
             for _ in range(DRAIN_ATTEMPTS):
-                if not port.out_waiting:
+                if self._file is None or not self._file.out_waiting:
                     break
                 time.sleep(DRAIN_INTERVAL_S)
         with contextlib.suppress(OSError, termios.error):
-            port.close()
-
-    def fileno(self) -> int:
-        if self._serial is None:
-            raise LinkError(self.description, "the port is not open")
-        return self._serial.fileno()
+            super().close()
 
     def _explain_error(self, error: Exception) -> LinkError:
         path = self.description

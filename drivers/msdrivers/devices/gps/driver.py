@@ -383,8 +383,10 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self._counts_before: Mapping[str, int] = {}
         """Those of the stream at the last fix or search."""
         self._seen_problems: set[str] = set()
-        self._last_byte_ns: int | None = None
-        self._answered_ns: int | None = None
+        self._gap_ns: int | None = None
+        """When the line has paused long enough."""
+        self._prompt_until_ns = 0
+        """Until then a prompt belongs to a response."""
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -396,11 +398,11 @@ class GpsDriver(StreamDriver[GpsMessage]):
 
     def _on_start(self) -> None:
         self._fixes.clear()
-        self._last_byte_ns = None
+        self._gap_ns = None
         self._counts_before = self._stream.counts
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        self._last_byte_ns = now.monotonic_ns
+        self._gap_ns = now.monotonic_ns + GAP_NS
         return super().on_receive(unit, now)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
@@ -414,14 +416,10 @@ class GpsDriver(StreamDriver[GpsMessage]):
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         if self._gap_ns is not None and now.monotonic_ns >= self._gap_ns:
-            self._last_byte_ns = None
+            self._gap_ns = None
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
         return out + self._publish_fixes(self._fixes.on_timer(now), now)
-
-    @property
-    def _gap_ns(self) -> int | None:
-        return None if self._last_byte_ns is None else self._last_byte_ns + GAP_NS
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
@@ -445,7 +443,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
         return out
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
-        self._answered_ns = now.monotonic_ns
+        self._prompt_until_ns = now.monotonic_ns + round(self.answer_timeout * SECOND_NS)
         if self._setup_step is None:
             commands = self._settings.make_setup_commands()[1:]
             steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
@@ -455,9 +453,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
 
     def _on_prompt(self, prompt: Prompt, now: HostTime) -> list[Output[bytes]]:
         """Set up again after a restart: a prompt that belongs to no response."""
-        answered_ns, timeout_ns = self._answered_ns, round(self.answer_timeout * SECOND_NS)
-        is_expected = answered_ns is not None and now.monotonic_ns - answered_ns < timeout_ns
-        if not self._is_novatel or self._setup.is_running or is_expected:
+        if not self._is_novatel or self._setup.is_running or now.monotonic_ns < self._prompt_until_ns:
             return []
         self._counts["restarts"] += 1
         self._fixes.clear()
