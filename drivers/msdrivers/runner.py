@@ -178,7 +178,8 @@ class ReconnectBackoff:
         self._min_wait, self._max_wait, self._rng = min_wait, max_wait, rng
         self._wait = min_wait
         self._opened_ns: int | None = None
-        self._failures = 0
+        self.failures = 0
+        """Consecutive failed attempts."""
 
     def on_open(self, at_ns: int) -> None:
         self._opened_ns = at_ns
@@ -187,7 +188,7 @@ class ReconnectBackoff:
         """Return whether the line is stable; if so, reset the backoff."""
         if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
             return False
-        self._wait, self._failures = self._min_wait, 0
+        self._wait, self.failures = self._min_wait, 0
         return True
 
     def on_lost(self, at_ns: int, *, is_orderly: bool, changes_baud: bool) -> float:
@@ -197,16 +198,12 @@ class ReconnectBackoff:
         is neither failure nor success.
         """
         was_stable = self.is_stable(at_ns)
-        self._failures += self._opened_ns is not None and not was_stable and not changes_baud
+        self.failures += self._opened_ns is not None and not was_stable and not changes_baud
         self._opened_ns = None
         if changes_baud or (is_orderly and was_stable):
             return 0.0
         wait, self._wait = self._wait, min(self._wait * 2.0, self._max_wait)
         return wait * self._rng.uniform(0.8, 1.2)
-
-    @property
-    def is_failing(self) -> bool:
-        return self._failures >= MIN_FAILURES_REPORTED
 
 
 MAX_COUNTERS = 200
@@ -384,7 +381,7 @@ class Runner(Generic[U]):
         at_ns = self._time_source.now().monotonic_ns
         wait = self._backoff.on_lost(at_ns, is_orderly=is_orderly, changes_baud=changes_baud)
         self._open_ns = at_ns + round(wait * 1e9)
-        if self._backoff.is_failing:
+        if self._backoff.failures >= MIN_FAILURES_REPORTED:
             reason += "; it is opened and closed again and again: does another program use it?"
         self._set_status(DriverPhase.CLOSED, reason)
 

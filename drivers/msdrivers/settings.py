@@ -40,7 +40,6 @@ from msdrivers.registry import (
     DeviceKind,
     EmulatorInputs,
     LineSettings,
-    ModbusSettings,
     NtripSettings,
     SerialSettings,
     TcpSettings,
@@ -343,21 +342,15 @@ def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
     """Yield lines that several drivers use exclusively; a CAN bus can be shared."""
     owners: dict[Hashable, str] = {}
     for driver in drivers:
-        owned = _exclusive_resource(driver.line)
-        owner = driver.name if owned is None else owners.setdefault(owned, driver.name)
+        if isinstance(driver.line, CanSettings):
+            continue
+        # a port has several names, e.g. below /dev/serial/by-id/
+        port = driver.line.port if isinstance(driver.line, SerialSettings) else ""
+        owner = owners.setdefault(os.path.realpath(port) if port else driver.line, driver.name)
         if owner != driver.name:
             message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"
             fix = "give each a line of its own, or start only one of them"
             yield driver.make_warning(message, fix, get_line_key(type(driver.line)))
-
-
-def _exclusive_resource(line: LineSettings) -> Hashable | None:
-    if isinstance(line, CanSettings):
-        return None
-    if isinstance(line, SerialSettings):
-        # a port has several names, e.g. below /dev/serial/by-id/
-        return os.path.realpath(line.port)
-    return (line.address, line.unit_id) if isinstance(line, ModbusSettings) else line.address
 
 
 def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:

@@ -593,13 +593,6 @@ MAX_SEEN = 8
 """Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
 
 
-def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
-    """Return the receive time of a frame that is read `now`: its own stamp if it has one."""
-    if not 0 < frame.utime <= now.utime:
-        return now
-    return HostTime(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
-
-
 class CanDriver(ABC):
     """Base of an `Endpoint` of CAN frames: decodes the needed frames and assembles those of one instant.
 
@@ -635,7 +628,7 @@ class CanDriver(ABC):
         self._seq = 0
         self._silence_deadline_ns: int | None = None
         self._received = 0
-        self._others: Counter[FrameKey] = Counter()
+        self._others: dict[FrameKey, None] = {}
         self._useless: Counter[str] = Counter()
         """Since the last usable data: frames, those that are not needed, and what is wrong with the others."""
         self._reasons: dict[str, None] = {}
@@ -659,8 +652,8 @@ class CanDriver(ABC):
         key, outputs = self._match(unit, now)
         if key is None:
             self.counts["other_frames"] += 1
-            if unit.key in self._others or len(self._others) < MAX_SEEN:
-                self._others[unit.key] += 1
+            if len(self._others) < MAX_SEEN:
+                self._others.setdefault(unit.key)
             return outputs
         if key in self._by_pgn.get(find_pgn(key.arbitration_id), ()):
             # J1939 pads frames to 8 bytes
@@ -673,8 +666,10 @@ class CanDriver(ABC):
             self._note_useless(f"{self._needed[unit.key]} ({unit.key}) {error.summary}")
             return self._warn_once(unit.key, f"{error}; such frames are counted and not used")
         self.counts["frames"] += 1
-        arrival = get_arrival_time(unit, now)
-        return outputs + self._publish(self._assembler.add(key, values, arrival.monotonic_ns, arrival.utime), now)
+        # its own receive time, if the interface stamped it
+        utime = unit.utime if 0 < unit.utime <= now.utime else now.utime
+        arrival_ns = now.monotonic_ns - (now.utime - utime) * 1000
+        return outputs + self._publish(self._assembler.add(key, values, arrival_ns, utime), now)
 
     def _match(self, frame: CanFrame, now: HostTime) -> tuple[FrameKey | None, list[Output[CanFrame]]]:
         """Return the kind of a frame, None if it is not needed; and a warning about a second source of a PGN."""
@@ -783,7 +778,7 @@ class CanDriver(ABC):
         return outputs
 
     def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
-        """Process an error frame of the interface; bus-off requests a reopening, once."""
+        """Request the reopening of a bus that is off, once."""
         self.counts["error_frames"] += 1
         if not frame.is_bus_off or self.is_bus_off:
             return []

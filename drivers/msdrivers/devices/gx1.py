@@ -76,11 +76,6 @@ class ReplyLayout(NamedTuple):
     def words(self) -> int:
         return sum(count for _, count in self.fields)
 
-    @property
-    def format(self) -> struct.Struct:
-        """Command, words as signed numbers, ticks, checksum."""
-        return struct.Struct(f">B{self.words}h{'H' * self.has_ticks}H")
-
 
 _VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
 
@@ -99,7 +94,8 @@ LAYOUTS: dict[int, ReplyLayout] = {
     CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
 }
 
-_STRUCTS = {command: layout.format for command, layout in LAYOUTS.items()}
+_STRUCTS = {command: struct.Struct(f">B{each.words}h{'H' * each.has_ticks}H") for command, each in LAYOUTS.items()}
+"""Command, words as signed numbers, ticks, checksum."""
 LENGTHS: dict[int, int] = {command: each.size for command, each in _STRUCTS.items()}
 """Bytes of the replies."""
 
@@ -301,15 +297,6 @@ def euler_to_words(orientation: Quaternion) -> tuple[int, int, int]:
     return (roll, pitch, yaw)
 
 
-def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
-    """Return the orientation of the sensor's axes in north, east, down from four words, scalar first.
-
-    Raises ValueError for four zeros.
-    """
-    w, x, y, z = (word * _QUATERNION_SCALE for word in words)
-    return so3.normalize((w, x, y, z))
-
-
 def quaternion_to_words(orientation: Quaternion) -> tuple[int, int, int, int]:
     w, x, y, z = (round(element / _QUATERNION_SCALE) for element in orientation)
     return (w, x, y, z)
@@ -446,10 +433,6 @@ def _read_tick() -> ScriptPart[float]:
     return tick_s
 
 
-_UP_NED: Vector3 = (0.0, 0.0, -1.0)
-"""In north, east, down."""
-
-
 def find_saturated_fields(packet: Gx1Packet) -> tuple[str, ...]:
     """Return the names of the saturated vectors."""
     return tuple(
@@ -474,7 +457,8 @@ def sample_from_packet(
     if packet.has("euler"):
         orientation = orientation_from_euler(packet.field("euler"))
     elif packet.has("quaternion"):
-        orientation = orientation_from_quaternion(packet.field("quaternion"))
+        w, x, y, z = (word * _QUATERNION_SCALE for word in packet.field("quaternion"))
+        orientation = so3.normalize((w, x, y, z))
     return ImuSample(
         header,
         angular_velocity=convert("rate", gains.gyro),
@@ -507,7 +491,7 @@ class GravityCheck:
         force, rate, orientation = sample.specific_force, sample.angular_velocity, sample.orientation
         if self._count >= self.MIN_SAMPLES or force is None or rate is None or orientation is None:
             return False
-        up = so3.rotate(so3.conjugate(orientation), _UP_NED)
+        up = so3.rotate(so3.conjugate(orientation), (0.0, 0.0, -1.0))
         along = sum(a * b for a, b in zip(force, up, strict=True))
         is_quiet = math.hypot(*rate) <= self.MAX_RATE and abs(math.hypot(*force) - G0) <= self.MAX_FORCE_ERROR
         # neither up nor down: not stationary

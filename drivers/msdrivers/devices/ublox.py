@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from pyubx2 import (
     GET,
+    POLL,
     SET,
     UBX_CLASSES,
     UBX_MSGIDS,
@@ -164,10 +165,6 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
 
 
 # --- configuration --------------------------------------------------------------------------------------------
-
-
-def make_version_poll() -> bytes:
-    return _encode(UBXMessage("MON", "MON-VER", 2))
 
 
 def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
@@ -341,7 +338,7 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         self._last_itow: int | None = None
 
     def _make_identification(self) -> bytes:
-        return make_version_poll()
+        return _encode(UBXMessage("MON", "MON-VER", POLL))
 
     def _on_start(self) -> None:
         self._epoch = None

@@ -18,7 +18,6 @@ from typing import Any, TypeAlias
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
-from modelserver.transforms.so3 import Vector3
 from msdrivers.devices import check_choice, check_ranges
 from msdrivers.devices.gps import (
     DAY,
@@ -34,7 +33,6 @@ from msdrivers.devices.gps.novatel import (
     BinaryFormat,
     CommandResponse,
     HeadingLog,
-    LogHeader,
     NovatelLog,
     Position,
     PositionType,
@@ -106,10 +104,6 @@ class GpsSettings(ByteSettings):
             return self.commands
         wanted = (f"log thisport {log.lower()}b ontime {1.0 / self.rate_hz:.6g}" for log in self.logs)
         return ("unlogall thisport", *self.commands, *wanted)
-
-    def make_undo_commands(self) -> tuple[str, ...]:
-        """Return the commands that stop the logs again."""
-        return tuple(f"unlog thisport {log.lower()}b" for log in self.logs)
 
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
@@ -199,6 +193,7 @@ def sample_from_novatel(
     height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
     velocity = velocity if velocity is not None and _is_solved(velocity) else None
     heading = heading if heading is not None and _is_solved(heading) else None
+    track = math.radians(velocity.track) if velocity else NAN
     return GpsSample(
         header,
         FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
@@ -209,7 +204,9 @@ def sample_from_novatel(
         undulation=undulation,
         satellites=position.used,
         position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
-        velocity=_to_enu(velocity) if velocity else None,
+        velocity=(velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical)
+        if velocity
+        else None,
         velocity_latency=max(0.0, velocity.latency - position.solution_age) if velocity else NAN,
         speed=velocity.horizontal if velocity else NAN,
         course=course_from_track(velocity.track) if velocity else NAN,
@@ -220,11 +217,6 @@ def sample_from_novatel(
 
 def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
     return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
-
-
-def _to_enu(velocity: Velocity) -> Vector3:
-    track = math.radians(velocity.track)
-    return velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical
 
 
 WGS84_DATUM = 61
@@ -314,8 +306,9 @@ class FixAssembler:
             self.counts["unknown_type"] += 1
         fixes = self._release()
         self._last_log = instant
-        device = get_log_utime(log.header, now.utime)
-        fix = GpsFix(host_utime, device, log.body, delay=max(0.0, log.body.solution_age))
+        is_usable = log.header.time_status in USABLE_TIME
+        device_utime = utime_of(instant[0], instant[1] * 1000, now.utime) if is_usable else 0
+        fix = GpsFix(host_utime, device_utime, log.body, delay=max(0.0, log.body.solution_age))
         self._waiting = (fix, instant, now.monotonic_ns + HOLD_NS)
         return fixes + self._release_if_complete(instant)
 
@@ -335,11 +328,6 @@ class FixAssembler:
             if when == instant:
                 fix = replace(fix, velocity=part) if isinstance(part, Velocity) else replace(fix, heading=part)
         return [fix]
-
-
-def get_log_utime(header: LogHeader, pivot: int) -> int:
-    """Return the utime of a log; 0 if the receiver's time is not usable."""
-    return utime_of(header.week, header.milliseconds * 1000, pivot) if header.time_status in USABLE_TIME else 0
 
 
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
@@ -408,7 +396,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Stop the requested logs."""
         self._setup.stop()
-        return [Send(_encode_command(each)) for each in self._settings.make_undo_commands()]
+        return [Send(_encode_command(f"unlog thisport {log.lower()}b")) for log in self._settings.logs]
 
     def _get_extra_deadline(self) -> int | None:
         return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)

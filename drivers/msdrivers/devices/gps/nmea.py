@@ -326,10 +326,12 @@ _MODE = {
 def determine_fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
     """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
     placed = _list_places(sentences)
-    if not placed or any(map(_is_invalid, sentences)) or _has_no_mode(sentences) or _has_no_satellites(sentences):
+    if not placed or any(map(_is_invalid, sentences)) or _has_no_mode(sentences):
         return FixType.NONE
+    # some receivers keep the last quality when they lose all satellites
+    is_empty = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
     dimension = max((each.dimension for each in sentences if each.dimension is not None), default=None)
-    if dimension == 1:
+    if dimension == 1 or (is_empty and count_satellites(sentences) == 0):
         return FixType.NONE
     types = (_QUALITY.get(each.quality) if each.quality is not None else _best_mode(each.mode) for each in placed)
     found = next((each for each in types if each is not None), FixType.FIX_3D)
@@ -380,12 +382,6 @@ def count_satellites(sentences: Sequence[NmeaSentence]) -> int:
     whole = [each for each in counts if each.has_position] or counts
     counted = max((each.satellites for each in whole if each.satellites is not None), default=-1)
     return counted or sum(each.listed for each in sentences)
-
-
-def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
-    """Return whether a GGA counts no satellites in use: some receivers keep the last quality when they lose all."""
-    counts = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
-    return counts and count_satellites(sentences) == 0
 
 
 POSITION_KINDS = ("GGA", "GNS", "RMC", "GLL")
