@@ -120,7 +120,6 @@ class HealthReporter:
         self.report_change(now)
 
     def report_change(self, now: HostTime) -> None:
-        """Log and report a change, if there is one."""
         state = self.state
         if state == self._reported:
             return
@@ -136,7 +135,6 @@ class HealthReporter:
         self._send(now)
 
     def on_timer(self, now: HostTime) -> None:
-        """Send the regular report if it is due."""
         if now.monotonic_ns < self.next_report_ns:
             return
         if self.state != self._logged and now.monotonic_ns - self._changed_ns >= STABLE_NS:

@@ -105,7 +105,6 @@ class RegisterMap(Strict):
 
     @property
     def word_count(self) -> int:
-        """The number of registers."""
         return self.registers if self.type is None else _TYPES[self.type][0]
 
     @property
@@ -122,7 +121,6 @@ class RegisterMap(Strict):
 
     @property
     def highest(self) -> int:
-        """The highest number that the registers hold."""
         return _MAX_FLOAT32 if self.is_float else self.lowest + (1 << (16 * self.word_count)) - 1
 
     def to_number(self, values: Sequence[int]) -> float:
@@ -283,7 +281,6 @@ class AxisSettings(Strict):
                 raise ValueError(f"nod cannot be done: {why}")
 
     def _find_nod_problem(self, nod: NodSettings) -> str:
-        """Describe why the axis cannot do a nodding motion; empty if it can."""
         if not self.registers.commanded:
             return "registers names no lower_limit, upper_limit and nod_rate"
         if nod.rate_deg != 0.0 and not self.slowest_deg <= nod.rate_deg <= self.fastest_deg:

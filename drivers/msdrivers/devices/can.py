@@ -67,7 +67,6 @@ _PDU1_FORMATS: Final = 240
 
 
 def find_pgn(arbitration_id: int) -> int:
-    """Return the PGN of a 29-bit identifier."""
     pgn = arbitration_id >> 8 & 0x3FFFF
     return pgn if pgn >> 8 & 0xFF >= _PDU1_FORMATS else pgn & 0x3FF00
 
@@ -190,7 +189,6 @@ class BoundSignal:
         return value if isfinite(value) and not self.find_reserved(raw) else None
 
     def is_outside(self, raw: float) -> bool:
-        """Return whether the physical value of raw bits is outside the file's range."""
         value, slack = raw * self.scale + self.offset, 1e-6 * abs(self.scale)
         return not self.minimum - slack <= value <= self.maximum + slack
 
@@ -278,7 +276,6 @@ class CanDatabase:
         return {signal.name: _bind_signal(found, signal, self.is_j1939) for signal in found.signals}
 
     def find_by_pgn(self, pgn: int) -> list[str]:
-        """Return the names of the messages of a PGN."""
         return [
             name for name, each in self.messages.items() if each.is_extended_frame and find_pgn(each.frame_id) == pgn
         ]
@@ -748,7 +745,6 @@ class CanDriver(ABC):
             self._useless[what] += 1
 
     def _note_empty(self) -> None:
-        """Count an instant without any value."""
         self.counts["rejected.empty"] += 1
         self._note_useless(f"no value that can be used ({', '.join(self._reasons) or 'no number'})")
 

@@ -123,7 +123,6 @@ class Gx1Packet(NamedTuple):
         return self.words[_SLICES[self.command][name]]
 
     def has(self, name: str) -> bool:
-        """Return whether its layout has the field."""
         return name in _SLICES[self.command]
 
     @property
@@ -179,7 +178,6 @@ class Gx1Stream(FrameScanner[Gx1Packet]):
         self._commands = frozenset(LAYOUTS)
 
     def set_commands(self, *commands: int) -> None:
-        """Set the commands whose replies are read."""
         self._commands = frozenset(commands)
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[Gx1Packet] | RejectedFrame | None:
@@ -282,7 +280,6 @@ def saturate(value: float) -> int:
 
 
 def is_saturated(words: Iterable[int]) -> bool:
-    """Return whether a word is at an end of its range."""
     return any(word in (MIN_WORD, MAX_WORD) for word in words)
 
 
@@ -434,7 +431,6 @@ def _read_tick() -> ScriptPart[float]:
 
 
 def find_saturated_fields(packet: Gx1Packet) -> tuple[str, ...]:
-    """Return the names of the saturated vectors."""
     return tuple(
         name for name in ("field", "acceleration", "rate") if packet.has(name) and is_saturated(packet.field(name))
     )
@@ -641,7 +637,6 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         return [*self._publish(sample, now, self._tick_s, line), *warnings]
 
     def _check_tick(self, count: int, now: HostTime) -> list[Output[bytes]]:
-        """Compare the length of a tick with the host's clock."""
         begin, begin_ns = self._tick_origin = self._tick_origin or (count, now.monotonic_ns)
         if self._is_tick_wrong or now.monotonic_ns - begin_ns < TICK_CHECK_NS:
             return []

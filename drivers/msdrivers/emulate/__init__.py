@@ -94,14 +94,12 @@ class FaultInjector(Generic[U]):
         return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
 
     def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
-        """Pass on a received unit unless the device is silent."""
         struck = self._apply_due_faults(now)
         if now.monotonic_ns < self._silent_until_ns:
             return struck
         return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
-        """Apply due faults; fire the device's timer."""
         outputs = self._apply_due_faults(now)
         if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
             self._is_restarting = False
@@ -113,7 +111,6 @@ class FaultInjector(Generic[U]):
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when the device, or a fault, is due."""
         inner = self._inner.get_deadline()
         device = None if inner is None else inner - self._clock_jump_ns
         dues = (self._silent_until_ns if self._is_restarting else device, self._get_fault_ns())
@@ -220,7 +217,6 @@ class SampleEmulator(Generic[S, U]):
         return [Send(each) for each in self._answer(unit) if each]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
-        """Send the samples up to now."""
         self._now = now
         out: list[Output[U]] = []
         while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:

@@ -59,7 +59,6 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
         samples: Iterable[WheelsSample],
         first_count: int = 0,
     ):
-        """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
         super().__init__(samples)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
@@ -141,7 +140,6 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         unit: VehicleUnit | None = None,
         samples: Iterable[VehicleStatusSample] = (),
     ):
-        """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
         super().__init__(samples)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
@@ -177,7 +175,6 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         return outputs
 
     def on_timer(self, now: HostTime) -> Sequence[Output[CanFrame]]:
-        """Send each status that is due."""
         super().on_timer(now)
         outputs: list[Output[CanFrame]] = []
         while self._status_ns <= now.monotonic_ns:

@@ -36,26 +36,21 @@ class Link(Protocol[U]):
     @property
     def description(self) -> str:
         """Path or address of the line."""
-        ...
 
     @property
     def baud(self) -> int: ...
 
     def open(self, baud: int | None = None) -> None:
         """Open the line, at another baud rate if one is given. Raises LinkError."""
-        ...
 
     def close(self) -> None:
         """Flush the output and close; closing twice is no error."""
-        ...
 
     def poll(self, timeout: float) -> Sequence[U]:
         """Return received units; wait at most `timeout` seconds for the first. Raises LinkError."""
-        ...
 
     def send(self, unit: U) -> None:
         """Send a unit. Raises LinkError."""
-        ...
 
 
 class LinkWrapper(Generic[U]):

@@ -135,7 +135,6 @@ class GpsStream(FrameScanner[Any]):
         return self._epochs.flush()
 
     def clear(self) -> None:
-        """Discard what is incomplete after the line was closed; counters and offsets continue."""
         super().clear()
         self._epochs.clear()
 
@@ -394,7 +393,6 @@ class GpsDriver(StreamDriver[GpsMessage]):
         return super().on_receive(unit, now)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Stop the requested logs."""
         self._setup.stop()
         return [Send(_encode_command(f"unlog thisport {log.lower()}b")) for log in self._settings.logs]
 

@@ -185,7 +185,6 @@ class NmeaSentence(NmeaValues):
 
     @property
     def has_position(self) -> bool:
-        """Whether there are coordinates, valid or not."""
         return self.latitude == self.latitude and self.longitude == self.longitude
 
 
@@ -346,7 +345,6 @@ def _list_places(sentences: Iterable[NmeaSentence]) -> list[NmeaSentence]:
 
 
 def _is_invalid(sentence: NmeaSentence) -> bool:
-    """Return whether a sentence flags the fix invalid."""
     if sentence.kind == "GGA":
         return sentence.quality not in _QUALITY
     if sentence.kind in ("RMC", "GLL"):

@@ -115,7 +115,6 @@ class LogHeader(NamedTuple):
 
     @property
     def is_secondary(self) -> bool:
-        """Whether the log is of the secondary antenna."""
         return self.antenna == 1
 
 
