@@ -20,17 +20,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    Problem,
-    Severity,
-    Suggestion,
-    find_suggestion,
-    quote,
-    suggest_key,
-    suggest_name,
-)
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
 from msdrivers.emulate import InjectedFault
 from msdrivers.endpoint import Endpoint
 from msdrivers.links import Link
@@ -362,9 +352,9 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
         what = f"sensors.wheels.frames has no {quote(name)}: what is measured of this wheel is not used"
         # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
         left = [frame for frame in frames if frame not in wheels]
-        near = find_suggestion(name, left)
-        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
-        fix = both if near else f"known: {', '.join(list(frames)[:10])}"
+        near = suggest_name(name, left)
+        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames"
+        fix = f"{both} {quote(near[0])}" if near else f"known: {', '.join(list(frames)[:10])}"
         yield driver.make_warning(what, fix, "wheels", name)
 
 

@@ -30,16 +30,7 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    ModelServerError,
-    Problem,
-    Severity,
-    Suggestion,
-    quote,
-    suggest_name,
-)
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.messages import Sample, SensorHeader
 from msdrivers.devices import Strict, check_factor, check_ranges
 from msdrivers.endpoint import (
@@ -150,7 +141,7 @@ _J1939_NAMES = {0xFF: "not available", 0xFE: "error"}
 """By the highest byte of a number of a byte and more: SAE J1939-71, 5.1.4."""
 
 
-class FrameError(ModelServerError, ValueError):
+class FrameError(ValueError):
     """A frame that does not match the DBC; `reason` is the counter's name, `summary` what is wrong in a few words."""
 
     def __init__(self, reason: str, message: str, summary: str = ""):

@@ -25,15 +25,7 @@ from typing import Any, Final
 from modelserver.errors import quote
 from modelserver.messages import NAN, FixType, GpsSample
 from msdrivers.devices.gps import course_from_track, to_covariance
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    StreamDriver,
-)
+from msdrivers.devices.stream import NO_FRAME, SECOND_NS, ByteSettings, ParsedFrame, RejectedFrame, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output
 
 MAX_LINE: Final = 16_384
@@ -149,11 +141,12 @@ class GpsdDriver(StreamDriver[GpsdReport]):
     device = "gpsd"
     description = "gpsd"
     awaited = "TPV"
+    formats = (GpsdFormat(),)
     answer_timeout = 2.0
     attempts = 2
 
     def __init__(self, settings: GpsdSettings) -> None:
-        super().__init__(settings, FrameScanner((GpsdFormat(),)))
+        super().__init__(settings)
         self._receiver = settings.receiver
         self._pending: tuple[GpsdReport, int, int] | None = None
         self._gst: GpsdReport | None = None

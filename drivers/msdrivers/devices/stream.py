@@ -21,8 +21,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
+from itertools import accumulate
 from operator import xor
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from modelserver.messages import Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
@@ -173,21 +174,15 @@ class KnownProtocol(NamedTuple):
     count: Callable[[bytes], int]
 
 
-def compute_fletcher(data: bytes) -> bytes:
-    """Return Fletcher's checksum of 2 bytes, as UBX messages have it."""
-    a = b = 0
-    for byte in data:
-        a = (a + byte) & 0xFF
-        b = (b + a) & 0xFF
-    return bytes((a, b))
-
-
 def _count_ubx(data: bytes) -> int:
     number = 0
     for found in re.finditer(rb"\xb5\x62", data):
         begin = found.end()
         end = begin + 4 + int.from_bytes(data[begin + 2 : begin + 4], "little")
-        number += end + 2 <= len(data) and compute_fletcher(data[begin:end]) == data[end : end + 2]
+        body = data[begin:end]
+        # Fletcher's checksum
+        checksum = bytes((sum(body) & 0xFF, sum(accumulate(body)) & 0xFF))
+        number += end + 2 <= len(data) and checksum == data[end : end + 2]
     return number
 
 
@@ -404,17 +399,14 @@ class ByteSettings:
         check_ranges(self, silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
         if any(baud <= 0 for baud in self.bauds):
             raise ValueError(f"bauds are above 0, got {self.bauds}")
+        rate_hz = getattr(self, "rate_hz", 0.0)
+        if 0.0 < rate_hz * self.silence < 1.5:
+            raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {self.silence:g}")
 
     @property
     def bauds(self) -> tuple[int, ...]:
         """Baud rates to try; the line is opened at the first. Empty: the line has none."""
         return ()
-
-
-def check_silence(silence: float, rate_hz: float) -> None:
-    """Raise ValueError for a timeout that a device at this rate would exceed."""
-    if silence < 1.5 / rate_hz:
-        raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {silence:g}")
 
 
 class StreamDriver(ABC, Generic[M]):
@@ -426,13 +418,15 @@ class StreamDriver(ABC, Generic[M]):
     """What is looked for, e.g. "u-blox receiver"."""
     awaited: str
     """What it streams, e.g. "NAV-PVT"."""
+    formats: ClassVar[Sequence[FrameFormat[Any]]] = ()
+    """Those of its frames, unless it has a scanner of its own."""
     answer_timeout = 0.5
     """Timeout for an answer, seconds."""
     attempts = 3
     """How often an unanswered message is sent."""
 
-    def __init__(self, settings: ByteSettings, stream: FrameScanner[M]) -> None:
-        self._settings, self._stream = settings, stream
+    def __init__(self, settings: ByteSettings, stream: FrameScanner[M] | None = None) -> None:
+        self._settings, self._stream = settings, stream or FrameScanner(self.formats)
         self.max_silence = settings.silence
         self._phase, self._reported = EndpointPhase.WAITING, ""
         self._setup = ScriptRunner()
@@ -447,8 +441,6 @@ class StreamDriver(ABC, Generic[M]):
         self._next_warning_ns = 0
         self._seq = 0
         self._counts: Counter[str] = Counter()
-
-    # --- what a device defines ---
 
     def _make_identification(self) -> bytes:
         """Return the request for the device's identity; nothing for one that is only read."""
@@ -468,8 +460,6 @@ class StreamDriver(ABC, Generic[M]):
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         """Do what the device's own deadline is for."""
         return []
-
-    # --- endpoint ---
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -511,8 +501,6 @@ class StreamDriver(ABC, Generic[M]):
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
         return []
-
-    # --- for the device ---
 
     def _on_identity(self, product: str, steps: Sequence[SetupStep], now: HostTime) -> list[Output[bytes]]:
         """Begin the setup of a device that has answered."""
@@ -561,8 +549,6 @@ class StreamDriver(ABC, Generic[M]):
             return []
         self._phase, self._reported = phase, text
         return [EndpointStatus(phase, text, is_warning)]
-
-    # --- setup ---
 
     def _run_setup(self) -> Script:
         """Find the device and configure it; then samples must come."""

@@ -27,15 +27,7 @@ from modelserver.errors import quote, suggest_name
 from modelserver.messages import NAN, ImuSample, JointSample, JointsSample, Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
 from msdrivers.devices import Strict, check_choice, check_factor, check_ranges
-from msdrivers.devices.stream import (
-    NEVER_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    Script,
-    StreamDriver,
-    recognize_line,
-)
+from msdrivers.devices.stream import NEVER_NS, ByteSettings, ParsedFrame, Script, StreamDriver, recognize_line
 from msdrivers.endpoint import EndpointPhase, HostTime, Output
 
 MAX_LINE: Final = 1024
@@ -133,10 +125,11 @@ class TextDriver(StreamDriver[TextLine]):
     """
 
     description = "device that sends lines of text"
+    formats = (LineFormat(),)
     _settings: TextSettings
 
     def __init__(self, settings: TextSettings) -> None:
-        super().__init__(settings, FrameScanner((LineFormat(),)))
+        super().__init__(settings)
         self.awaited = f"lines of {settings.columns} columns"
         self._is_partial = True
         """What comes next may be the end of a line."""

@@ -28,24 +28,14 @@ from pyubx2 import (
     UBXParseError,
     UBXReader,
     UBXTypeError,
+    calc_checksum,
 )
 
 from modelserver.messages import NAN, FixType, GpsSample, SensorHeader
 from modelserver.transforms.so3 import Matrix3
 from msdrivers.devices import check_ranges
 from msdrivers.devices.gps import course_from_track
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-    check_silence,
-    compute_fletcher,
-)
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 SYNC: Final = b"\xb5\x62"
@@ -103,7 +93,7 @@ class UbxFormat:
         if len(buffer) < end:
             return None
         frame = bytes(buffer[at:end])
-        if compute_fletcher(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
+        if calc_checksum(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
             return RejectedFrame("checksum")
         name = UBX_MSGIDS.get(frame[2:4], "") or f"{UBX_CLASSES.get(frame[2:3], 'UBX')}-{frame[2]:02X}{frame[3]:02X}"
         if name not in USED:
@@ -113,9 +103,6 @@ class UbxFormat:
         except (UBXParseError, UBXMessageError, UBXTypeError, ValueError):
             return RejectedFrame("ubx_payload")
         return ParsedFrame(end, f"ubx.{name}", UbxMessage(name, values, start))
-
-
-# --- values of messages ---------------------------------------------------------------------------------------
 
 
 def get_fix_type(pvt: Any) -> FixType:
@@ -162,9 +149,6 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
     stated = dict(text.replace("=", " ").partition(" ")[::2] for text in texts)
     protocol = re.match(r"\s*(\d+(?:\.\d*)?)(?!\S)", stated.get("PROTVER", ""))
     return stated.get("MOD", "").strip() or "u-blox receiver", float(protocol[1]) if protocol else 0.0
-
-
-# --- configuration --------------------------------------------------------------------------------------------
 
 
 def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
@@ -214,7 +198,7 @@ def _encode(message: UBXMessage) -> bytes:
 FIXED: Final = 2
 """carrSoln: ambiguities fixed."""
 
-HOLD_NS: Final = SECOND_NS // 10
+HOLD_NS: Final = 100_000_000
 """How long a position waits for the other messages of its epoch, where no NAV-EOE ends it: they are sent at once, 400
 bytes in 0.1 s at 38400 baud."""
 
@@ -240,7 +224,6 @@ class UbloxSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(0.1, 25.0))
-        check_silence(self.silence, self.rate_hz)
 
 
 class Epoch:
@@ -330,9 +313,10 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     device = "ublox"
     description = "u-blox receiver"
     awaited = "NAV-PVT"
+    formats = (UbxFormat(),)
 
     def __init__(self, settings: UbloxSettings) -> None:
-        super().__init__(settings, FrameScanner((UbxFormat(),)))
+        super().__init__(settings)
         self._rate_hz = settings.rate_hz
         self._epoch: Epoch | None = None
         self._last_itow: int | None = None

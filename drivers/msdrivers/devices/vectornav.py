@@ -20,15 +20,7 @@ from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
 from msdrivers.devices import check_choice, check_ranges, make_orientation
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-)
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 SYNC: Final = 0xFA
@@ -230,10 +222,11 @@ class VectornavDriver(StreamDriver[VnMessage]):
     device = "vectornav"
     description = "VectorNav unit"
     awaited = "binary output"
+    formats = (VnBinaryFormat(), VnTextFormat())
     answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
-        super().__init__(settings, FrameScanner((VnBinaryFormat(), VnTextFormat())))
+        super().__init__(settings)
         self._rate_hz, self._port = settings.rate_hz, settings.unit_port
         self._yaw_source = YawSource.MAGNETIC if settings.heading == "magnetic" else YawSource.NONE
         self._last_ns: int | None = None

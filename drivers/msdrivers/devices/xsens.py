@@ -16,15 +16,7 @@ from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
 from msdrivers.devices import check_choice, check_ranges, make_orientation
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-)
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 PREAMBLE: Final = 0xFA
@@ -243,11 +235,12 @@ class XsensDriver(StreamDriver[XbusMessage]):
     device = "xsens"
     description = "Xsens MTi"
     awaited = "MTData2"
+    formats = (XbusFormat(),)
     attempts = 5
     """Some units do not answer after power-up."""
 
     def __init__(self, settings: XsensSettings) -> None:
-        super().__init__(settings, FrameScanner((XbusFormat(),)))
+        super().__init__(settings)
         self._own = settings
         self._ticks = SampleTimeUnwrapper()
         self._last_counter: int | None = None

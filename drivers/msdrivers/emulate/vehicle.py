@@ -14,14 +14,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
 
-from modelserver.messages import (
-    JointsSample,
-    SensorHeader,
-    VehicleMode,
-    VehicleStatusSample,
-    WheelSample,
-    WheelsSample,
-)
+from modelserver.messages import JointsSample, SensorHeader, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line

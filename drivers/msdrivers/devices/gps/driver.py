@@ -19,14 +19,7 @@ from typing import Any, TypeAlias
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
 from msdrivers.devices import check_choice, check_ranges
-from msdrivers.devices.gps import (
-    DAY,
-    WEEK,
-    course_from_track,
-    resolve_rollover,
-    to_covariance,
-    utime_of,
-)
+from msdrivers.devices.gps import DAY, WEEK, course_from_track, resolve_rollover, to_covariance, utime_of
 from msdrivers.devices.gps.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
 from msdrivers.devices.gps.novatel import (
     AsciiFormat,
@@ -43,15 +36,7 @@ from msdrivers.devices.gps.novatel import (
     TimeStatus,
     Velocity,
 )
-from msdrivers.devices.stream import (
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    Script,
-    SetupStep,
-    StreamDriver,
-    check_silence,
-)
+from msdrivers.devices.stream import SECOND_NS, ByteSettings, FrameScanner, Script, SetupStep, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 POSITION_LOG = "BESTPOS"
@@ -91,7 +76,6 @@ class GpsSettings(ByteSettings):
         for command in self.commands:
             if not command.strip() or not command.isprintable() or not command.isascii():
                 raise ValueError(f"commands: {command!r} is no line of text")
-        check_silence(self.silence, self.rate_hz)
 
     @property
     def logs(self) -> tuple[str, ...]:
