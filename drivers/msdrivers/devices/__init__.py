@@ -49,3 +49,10 @@ def check_factor(value: float, key: str) -> None:
     """Raise ValueError for a factor that is 0 or not finite."""
     if not math.isfinite(value) or value == 0.0:
         raise ValueError(f"{key} is a number and not 0, got {value:g}")
+
+
+def check_signal(signal: str, key: str = "signal") -> None:
+    """Raise ValueError unless the text is a signal path."""
+    message, dot, name = signal.partition(".")
+    if not (message and dot and name) or "." in name:
+        raise ValueError(f"{key} is written Message.Signal as the DBC file names them, got {signal!r}")

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.messages import Sample, SensorHeader
-from msdrivers.devices import Strict, check_factor, check_ranges
+from msdrivers.devices import Strict, check_factor, check_ranges, check_signal
 from msdrivers.endpoint import (
     CanFrame,
     EndpointPhase,
@@ -68,13 +68,6 @@ def parse_pgn(name: str) -> int | None:
         return int(name, 16) if name[:2].lower() == "0x" else int(name) if name.isdecimal() else None
     except ValueError:
         return None
-
-
-def check_signal(signal: str, key: str = "signal") -> None:
-    """Raise ValueError unless the text is a signal path."""
-    message, dot, name = signal.partition(".")
-    if not (message and dot and name) or "." in name:
-        raise ValueError(f"{key} is written Message.Signal as the DBC file names them, got {signal!r}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,19 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from pyubx2 import (
-    GET,
-    POLL,
-    SET,
-    UBX_CLASSES,
-    UBX_MSGIDS,
-    UBXMessage,
-    UBXMessageError,
-    UBXParseError,
-    UBXReader,
-    UBXTypeError,
-    calc_checksum,
-)
+import pyubx2
 
 from modelserver.messages import NAN, FixType, GpsSample, SensorHeader
 from modelserver.transforms.so3 import Matrix3
@@ -93,14 +81,15 @@ class UbxFormat:
         if len(buffer) < end:
             return None
         frame = bytes(buffer[at:end])
-        if calc_checksum(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
+        if pyubx2.calc_checksum(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
             return RejectedFrame("checksum")
-        name = UBX_MSGIDS.get(frame[2:4], "") or f"{UBX_CLASSES.get(frame[2:3], 'UBX')}-{frame[2]:02X}{frame[3]:02X}"
+        kind = pyubx2.UBX_CLASSES.get(frame[2:3], "UBX")
+        name = pyubx2.UBX_MSGIDS.get(frame[2:4], "") or f"{kind}-{frame[2]:02X}{frame[3]:02X}"
         if name not in USED:
             return ParsedFrame(end, f"ubx.{name}", None)
         try:
-            values = UBXReader.parse(frame, msgmode=GET)
-        except (UBXParseError, UBXMessageError, UBXTypeError, ValueError):
+            values = pyubx2.UBXReader.parse(frame, msgmode=pyubx2.GET)
+        except (pyubx2.UBXParseError, pyubx2.UBXMessageError, pyubx2.UBXTypeError, ValueError):
             return RejectedFrame("ubx_payload")
         return ParsedFrame(end, f"ubx.{name}", UbxMessage(name, values, start))
 
@@ -156,7 +145,7 @@ def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
     period_ms = round(1000.0 / rate_hz)
     if protocol >= VALSET_VERSION:
         return _make_valset(period_ms)
-    rate = UBXMessage("CFG", "CFG-RATE", SET, measRate=period_ms, navRate=1, timeRef=1)
+    rate = pyubx2.UBXMessage("CFG", "CFG-RATE", pyubx2.SET, measRate=period_ms, navRate=1, timeRef=1)
     return (
         SetupStep(_encode(rate), f"a rate of {rate_hz:g} Hz"),
         *(_make_message_rate(name, is_optional=False) for name in REQUIRED_OUTPUT),
@@ -166,7 +155,7 @@ def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
 
 def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
     def configure(values: list[tuple[str, int]], what: str, is_optional: bool = False) -> SetupStep:
-        return SetupStep(_encode(UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
+        return SetupStep(_encode(pyubx2.UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
 
     setups = [
         configure([("CFG_RATE_MEAS", period_ms), ("CFG_RATE_NAV", 1)], f"a rate of {1000.0 / period_ms:g} Hz"),
@@ -181,16 +170,16 @@ def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
     return tuple(setups)
 
 
-_CODES: Final = {name.replace("-", "_"): code for code, name in UBX_MSGIDS.items()}
+_CODES: Final = {name.replace("-", "_"): code for code, name in pyubx2.UBX_MSGIDS.items()}
 
 
 def _make_message_rate(name: str, *, is_optional: bool) -> SetupStep:
     """Return the CFG-MSG that switches a message on at this port."""
-    frame = UBXMessage("CFG", "CFG-MSG", SET, payload=_CODES[name] + b"\x01")
+    frame = pyubx2.UBXMessage("CFG", "CFG-MSG", pyubx2.SET, payload=_CODES[name] + b"\x01")
     return SetupStep(_encode(frame), name.replace("_", "-"), is_optional)
 
 
-def _encode(message: UBXMessage) -> bytes:
+def _encode(message: pyubx2.UBXMessage) -> bytes:
     data: bytes = message.serialize()
     return data
 
@@ -322,7 +311,7 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         self._last_itow: int | None = None
 
     def _make_identification(self) -> bytes:
-        return _encode(UBXMessage("MON", "MON-VER", POLL))
+        return _encode(pyubx2.UBXMessage("MON", "MON-VER", pyubx2.POLL))
 
     def _on_start(self) -> None:
         self._epoch = None

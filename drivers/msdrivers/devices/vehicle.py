@@ -21,17 +21,8 @@ from typing import Literal, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
 from modelserver.messages import NAN, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices import Strict, check_choice, check_ranges
-from msdrivers.devices.can import (
-    BoundSignal,
-    BusSettings,
-    CanDatabase,
-    CanDriver,
-    CanFrameSet,
-    SignalBinder,
-    SignalMap,
-    check_signal,
-)
+from msdrivers.devices import Strict, check_choice, check_ranges, check_signal
+from msdrivers.devices.can import BoundSignal, BusSettings, CanDatabase, CanDriver, CanFrameSet, SignalBinder, SignalMap
 from msdrivers.endpoint import CanFrame, EndpointStatus, FrameKey, HostTime, Output, Send
 
 

@@ -19,17 +19,8 @@ from dataclasses import dataclass, replace
 
 from modelserver.errors import quote
 from modelserver.messages import NAN, Direction, WheelSample, WheelsSample
-from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.devices.can import (
-    BoundSignal,
-    BusSettings,
-    CanDatabase,
-    CanDriver,
-    CanFrameSet,
-    SignalBinder,
-    SignalMap,
-    check_signal,
-)
+from msdrivers.devices import Strict, check_factor, check_ranges, check_signal
+from msdrivers.devices.can import BoundSignal, BusSettings, CanDatabase, CanDriver, CanFrameSet, SignalBinder, SignalMap
 from msdrivers.endpoint import CanFrame, EndpointStatus, HostTime, Output
 
 

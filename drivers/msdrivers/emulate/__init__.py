@@ -12,18 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
-from msdrivers.endpoint import (
-    BUS_OFF_FRAME,
-    CanFrame,
-    Endpoint,
-    EndpointPhase,
-    EndpointStatus,
-    HostTime,
-    Output,
-    Registers,
-    Send,
-    U,
-)
+from msdrivers.endpoint import BUS_OFF_FRAME, Endpoint, EndpointPhase, EndpointStatus, HostTime, Output, Send, U
 
 S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample, JointsSample)
 
@@ -177,11 +166,8 @@ def corrupt_unit(unit: Any) -> Any:
     if isinstance(unit, bytes):
         middle = len(unit) // 2
         return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
-    if isinstance(unit, CanFrame):
-        return replace(unit, data=unit.data[:-1])
-    if isinstance(unit, Registers):
-        return replace(unit, values=unit.values[:-1])
-    return unit
+    field = next((each for each in ("data", "values") if hasattr(unit, each)), None)
+    return unit if field is None else replace(unit, **{field: getattr(unit, field)[:-1]})
 
 
 class SampleEmulator(Generic[S, U]):

@@ -19,20 +19,9 @@ from typing import Any, Final, NamedTuple
 from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseError, UBXReader, UBXTypeError
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea
+from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea, novatel
 from msdrivers.devices.gps.driver import WGS84_DATUM, GpsSettings
-from msdrivers.devices.gps.novatel import (
-    Body,
-    HeadingLog,
-    LogHeader,
-    NovatelLog,
-    Position,
-    PositionType,
-    SolutionStatus,
-    TimeStatus,
-    Velocity,
-    encode,
-)
+from msdrivers.devices.gps.novatel import HeadingLog, Position, PositionType, SolutionStatus, Velocity
 from msdrivers.devices.gpsd import WATCH
 from msdrivers.devices.stream import FrameScanner, ParsedFrame, RejectedFrame
 from msdrivers.devices.ublox import VALSET_VERSION, UbxFormat
@@ -71,8 +60,9 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_of(utime)
-    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, TimeStatus.FINESTEERING, port, 0, 0, True)
-    return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
+    time = week, microseconds // 1000, novatel.TimeStatus.FINESTEERING
+    header = novatel.LogHeader(name[:-1].upper(), *time, port, 0, 0, True)
+    return novatel.encode(novatel.NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
 def _nan_to_zero(value: float) -> float:
@@ -136,7 +126,7 @@ def _make_heading(sample: GpsSample) -> HeadingLog:
     return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
 
 
-NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
+NOVATEL: dict[str, Callable[[GpsSample], novatel.Body]] = {
     "bestpos": _make_position,
     "bestvel": _make_velocity,
     "heading": _make_heading,

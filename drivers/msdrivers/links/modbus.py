@@ -14,14 +14,7 @@ from typing import TypeAlias
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadHoldingRegistersResponse,
-    ReadInputRegistersRequest,
-    ReadInputRegistersResponse,
-    WriteMultipleRegistersRequest,
-    WriteMultipleRegistersResponse,
-)
+from pymodbus.pdu import register_message as pdu
 
 from msdrivers.endpoint import (
     ModbusFailure,
@@ -113,11 +106,12 @@ class ModbusLink(LinkWrapper[bytes]):
         """Send a request. Raises LinkError."""
         number = unit.transaction & 0xFFFF
         if isinstance(unit, ReadRegisters):
-            kind = ReadHoldingRegistersRequest if unit.table is RegisterTable.HOLDING else ReadInputRegistersRequest
+            holding = unit.table is RegisterTable.HOLDING
+            kind = pdu.ReadHoldingRegistersRequest if holding else pdu.ReadInputRegistersRequest
             message: ModbusPDU = kind(address=unit.address, count=unit.count)
         elif isinstance(unit, WriteRegisters):
             values = list(unit.values)
-            message = WriteMultipleRegistersRequest(address=unit.address, count=len(values), registers=values)
+            message = pdu.WriteMultipleRegistersRequest(address=unit.address, count=len(values), registers=values)
         else:
             raise TypeError(f"a driver sends requests, not {type(unit).__name__}")
         if len(self._pending) >= MAX_PENDING:
@@ -144,10 +138,10 @@ class ModbusLink(LinkWrapper[bytes]):
             code = message.exception_code
             return ModbusFailure(explain_exception(code), code, request.transaction)
         if isinstance(request, ReadRegisters) and isinstance(
-            message, ReadHoldingRegistersResponse | ReadInputRegistersResponse
+            message, pdu.ReadHoldingRegistersResponse | pdu.ReadInputRegistersResponse
         ):
             return Registers(request.address, tuple(message.registers), request.transaction)
-        if isinstance(request, WriteRegisters) and isinstance(message, WriteMultipleRegistersResponse):
+        if isinstance(request, WriteRegisters) and isinstance(message, pdu.WriteMultipleRegistersResponse):
             return RegistersWritten(message.address, message.count, request.transaction)
         return ModbusFailure("a reply that does not fit its request", transaction=request.transaction)
 
@@ -198,11 +192,11 @@ class ModbusServerLink(LinkWrapper[bytes]):
             return
         unit_id, function = self._pending.pop(number)
         if isinstance(unit, Registers):
-            holding = function == ReadHoldingRegistersResponse.function_code
-            kind = ReadHoldingRegistersResponse if holding else ReadInputRegistersResponse
+            holding = function == pdu.ReadHoldingRegistersResponse.function_code
+            kind = pdu.ReadHoldingRegistersResponse if holding else pdu.ReadInputRegistersResponse
             message: ModbusPDU = kind(registers=list(unit.values))
         elif isinstance(unit, RegistersWritten):
-            message = WriteMultipleRegistersResponse(address=unit.address, count=unit.count)
+            message = pdu.WriteMultipleRegistersResponse(address=unit.address, count=unit.count)
         elif isinstance(unit, ModbusFailure):
             message = ExceptionResponse(function, unit.code)
         else:
@@ -212,10 +206,10 @@ class ModbusServerLink(LinkWrapper[bytes]):
 
 def _convert_request(message: ModbusPDU | None, number: int) -> ModbusRequest | None:
     """Return the request in a message, None for what is not served here."""
-    if isinstance(message, ReadHoldingRegistersRequest | ReadInputRegistersRequest):
+    if isinstance(message, pdu.ReadHoldingRegistersRequest | pdu.ReadInputRegistersRequest):
         # the class of input registers is made from that of holding ones
-        table = RegisterTable.INPUT if isinstance(message, ReadInputRegistersRequest) else RegisterTable.HOLDING
+        table = RegisterTable.INPUT if isinstance(message, pdu.ReadInputRegistersRequest) else RegisterTable.HOLDING
         return ReadRegisters(message.address, message.count, table, number)
-    if isinstance(message, WriteMultipleRegistersRequest) and len(message.registers) == message.count:
+    if isinstance(message, pdu.WriteMultipleRegistersRequest) and len(message.registers) == message.count:
         return WriteRegisters(message.address, tuple(message.registers), number)
     return None

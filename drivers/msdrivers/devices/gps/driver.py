@@ -19,23 +19,9 @@ from typing import Any, TypeAlias
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
 from msdrivers.devices import check_choice, check_ranges
-from msdrivers.devices.gps import DAY, WEEK, course_from_track, resolve_rollover, to_covariance, utime_of
+from msdrivers.devices.gps import DAY, WEEK, course_from_track, novatel, resolve_rollover, to_covariance, utime_of
 from msdrivers.devices.gps.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
-from msdrivers.devices.gps.novatel import (
-    AsciiFormat,
-    BinaryFormat,
-    CommandResponse,
-    HeadingLog,
-    NovatelLog,
-    Position,
-    PositionType,
-    Prompt,
-    PromptFormat,
-    SolutionStatus,
-    TextFormat,
-    TimeStatus,
-    Velocity,
-)
+from msdrivers.devices.gps.novatel import CommandResponse, HeadingLog, NovatelLog, Position, Prompt, Velocity
 from msdrivers.devices.stream import SECOND_NS, ByteSettings, FrameScanner, Script, SetupStep, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
@@ -101,7 +87,7 @@ class GpsStream(FrameScanner[Any]):
     """
 
     def __init__(self) -> None:
-        super().__init__((SentenceFormat(), BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat()))
+        super().__init__((SentenceFormat(), *novatel.FORMATS))
         self._epochs = EpochAssembler()
 
     @property
@@ -123,16 +109,16 @@ class GpsStream(FrameScanner[Any]):
         self._epochs.clear()
 
 
-USABLE_TIME = frozenset(TimeStatus) - {
-    TimeStatus.UNKNOWN,
-    TimeStatus.APPROXIMATE,
-    TimeStatus.COARSEADJUSTING,
-    TimeStatus.SATTIME,
+USABLE_TIME = frozenset(novatel.TimeStatus) - {
+    novatel.TimeStatus.UNKNOWN,
+    novatel.TimeStatus.APPROXIMATE,
+    novatel.TimeStatus.COARSEADJUSTING,
+    novatel.TimeStatus.SATTIME,
 }
 """With the other statuses the header's time may be wrong by seconds or years."""
 
 FIX_TYPES: dict[int, FixType] = {
-    PositionType[name]: fix_type
+    novatel.PositionType[name]: fix_type
     for fix_type, names in {
         FixType.FIX_2D: "FIXEDHEIGHT",
         FixType.FIX_3D: "SINGLE INS_PSRSP",
@@ -172,7 +158,7 @@ def sample_from_novatel(
 ) -> GpsSample:
     """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
     # without a solution the receiver sends zeros
-    empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
+    empty = position.type == novatel.PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
     height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
     velocity = velocity if velocity is not None and _is_solved(velocity) else None
     heading = heading if heading is not None and _is_solved(heading) else None
@@ -199,7 +185,7 @@ def sample_from_novatel(
 
 
 def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
-    return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
+    return log.status == novatel.SolutionStatus.SOL_COMPUTED and log.type != novatel.PositionType.NONE
 
 
 WGS84_DATUM = 61
@@ -285,7 +271,7 @@ class FixAssembler:
         if log.body.datum != WGS84_DATUM:
             self.counts["rejected.datum"] += 1
             return []
-        if log.body.type not in PositionType.__members__.values():
+        if log.body.type not in novatel.PositionType.__members__.values():
             self.counts["unknown_type"] += 1
         fixes = self._release()
         self._last_log = instant

@@ -536,3 +536,6 @@ class PromptFormat:
             return ParsedFrame(prompt.end(), "novatel.prompt", Prompt(start, prompt[1].decode("ascii")))
         part = self._part.match(buffer, at, at + 12)
         return None if part is not None and part.end() == len(buffer) and len(buffer) - at < 12 else NO_FRAME
+
+
+FORMATS = (BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat())
