@@ -237,7 +237,8 @@ class ModbusFailure:
     transaction: int = 0
 
 
-ModbusUnit: TypeAlias = ReadRegisters | WriteRegisters | Registers | RegistersWritten | ModbusFailure
+ModbusRequest: TypeAlias = ReadRegisters | WriteRegisters
+ModbusUnit: TypeAlias = ModbusRequest | Registers | RegistersWritten | ModbusFailure
 
 EXCEPTION_TEXTS = {
     1: "it does not know the function: use the other table (holding, input)",
@@ -257,7 +258,7 @@ def explain_exception(code: int) -> str:
     return f"exception {code}: {EXCEPTION_TEXTS.get(code, 'a code that the standard does not have; see its manual')}"
 
 
-def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bool:
+def is_reply_to(unit: ModbusUnit, request: ModbusRequest) -> bool:
     """Return whether a unit is a reply to a request: of its kind, with its address and number of registers."""
     if isinstance(request, ReadRegisters):
         return (
@@ -268,7 +269,7 @@ def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bo
     return isinstance(unit, RegistersWritten) and (unit.address, unit.count) == (request.address, len(request.values))
 
 
-def describe_request(request: ReadRegisters | WriteRegisters) -> str:
+def describe_request(request: ModbusRequest) -> str:
     if isinstance(request, ReadRegisters):
         return f"reading {request.count} {request.table.value} registers from {request.address}"
     return f"writing {len(request.values)} registers from {request.address}"

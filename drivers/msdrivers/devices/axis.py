@@ -31,6 +31,7 @@ from msdrivers.endpoint import (
     HostTime,
     MeasuredSample,
     ModbusFailure,
+    ModbusRequest,
     ModbusUnit,
     Output,
     ReadRegisters,
@@ -295,7 +296,7 @@ class AxisSettings(Strict):
         return ""
 
 
-_Step: TypeAlias = tuple[str, ReadRegisters | WriteRegisters]
+_Step: TypeAlias = tuple[str, ModbusRequest]
 """What is done, and its request."""
 _Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
 
@@ -382,7 +383,7 @@ BUSY_EXCEPTIONS = (5, 6)
 class _PendingRequest(NamedTuple):
     """The request that awaits its reply."""
 
-    request: ReadRegisters | WriteRegisters
+    request: ModbusRequest
     sent_ns: int
     is_poll: bool
 
@@ -532,7 +533,7 @@ class AxisDriver:
         if not is_poll and not (self._step is not None and at >= self._step_ns):
             return []
         transaction = self._new_transaction()
-        request: ReadRegisters | WriteRegisters
+        request: ModbusRequest
         if self._step is not None and not is_poll:
             request = replace(self._step[1], transaction=transaction)
         else:

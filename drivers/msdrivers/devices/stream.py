@@ -95,8 +95,7 @@ class FrameScanner(Generic[M]):
         self._buffer = bytearray()
         self._offset = 0
         self._skipped = 0
-        self._frames = BoundedCounter()
-        self._rejected: Counter[str] = Counter()
+        self._counts = BoundedCounter()
 
     @property
     def offset(self) -> int:
@@ -111,12 +110,11 @@ class FrameScanner(Generic[M]):
     @property
     def counts(self) -> dict[str, int]:
         """Frames by kind, `rejected.<reason>`, and `skipped`: bytes in no frame, ends of lines not counted."""
-        rejected = {f"rejected.{reason}": number for reason, number in self._rejected.items()}
-        return {**self._frames, **rejected, "skipped": self._skipped}
+        return {**self._counts, "skipped": self._skipped}
 
     def reject(self, reason: str) -> None:
         """Count a message that was rejected for its content."""
-        self._rejected[reason] += 1
+        self._counts[f"rejected.{reason}"] += 1
 
     def clear(self) -> None:
         """Discard the incomplete frame after an interruption; counters and offsets continue."""
@@ -142,11 +140,11 @@ class FrameScanner(Generic[M]):
                 break
             if isinstance(verdict, RejectedFrame):
                 if verdict.reason:
-                    self._rejected[verdict.reason] += 1
+                    self.reject(verdict.reason)
                 self._skip(at, at + 1)
                 at += 1
                 continue
-            self._frames.add(verdict.kind)
+            self._counts.add(verdict.kind)
             if verdict.message is not None:
                 messages.append(verdict.message)
             at = verdict.end

@@ -30,6 +30,7 @@ from msdrivers.endpoint import (
     EndpointStatus,
     HostTime,
     ModbusFailure,
+    ModbusRequest,
     ModbusUnit,
     Output,
     ReadRegisters,
@@ -346,7 +347,7 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
             self.degrees = lower + (phase if phase < span else 2.0 * span - phase)
         return self._direction * rate
 
-    def _reply(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
+    def _reply(self, unit: ModbusRequest) -> ModbusUnit:
         if isinstance(unit, WriteRegisters):
             return self._write(unit)
         table = self._make_table(unit.table)
@@ -386,7 +387,7 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
         self.commanded = after
         return RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
-    def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
+    def _make_exception(self, unit: ModbusRequest, code: int) -> ModbusFailure:
         return ModbusFailure(explain_exception(code), code, unit.transaction)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Sequence
-from typing import TypeAlias
 
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
@@ -18,6 +17,7 @@ from pymodbus.pdu import register_message as pdu
 
 from msdrivers.endpoint import (
     ModbusFailure,
+    ModbusRequest,
     ModbusUnit,
     ReadRegisters,
     Registers,
@@ -40,8 +40,6 @@ ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
 
 # malformed messages are reported by us
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-
-ModbusRequest: TypeAlias = ReadRegisters | WriteRegisters
 
 
 class _TcpFramer:
