@@ -1,7 +1,7 @@
 """Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
 
 Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
-(`FixAssembler`), or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
+of one instant, or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
 
 A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
@@ -11,9 +11,8 @@ read.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
@@ -21,7 +20,7 @@ from modelserver.messages.values import NAN
 from msdrivers.devices import check_choice, check_ranges
 from msdrivers.devices.gps import DAY, WEEK, course_from_track, novatel, resolve_rollover, to_covariance, utime_of
 from msdrivers.devices.gps.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
-from msdrivers.devices.gps.novatel import CommandResponse, HeadingLog, NovatelLog, Position, Prompt, Velocity
+from msdrivers.devices.gps.novatel import CommandResponse, HeadingLog, LogHeader, NovatelLog, Position, Prompt, Velocity
 from msdrivers.devices.stream import SECOND_NS, ByteSettings, FrameScanner, Script, SetupStep, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
@@ -191,114 +190,6 @@ def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
 WGS84_DATUM = 61
 
 
-@dataclass(frozen=True, slots=True)
-class GpsFix:
-    """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
-    than that."""
-
-    host_utime: int
-    device_utime: int
-    solution: NmeaEpoch | Position
-    velocity: Velocity | None = None
-    heading: HeadingLog | None = None
-    delay: float = 0.0
-
-    def to_sample(self, header: SensorHeader) -> GpsSample:
-        if isinstance(self.solution, NmeaEpoch):
-            return sample_from_nmea(header, self.solution)
-        return sample_from_novatel(header, self.solution, self.velocity, self.heading)
-
-
-class FixAssembler:
-    """Assembles logs and epochs to fixes, each instant once.
-
-    logs: the names of the position log and of what belongs to it; empty for NMEA only.
-    """
-
-    def __init__(self, logs: Sequence[str]) -> None:
-        self._logs = tuple(logs)
-        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
-        self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
-        self._last_log: tuple[int, int] | None = None
-        self._last_epoch: tuple[int, int | None] | None = None
-        self._last_solution = -1
-        self.counts: Counter[str] = Counter()
-        """`repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
-        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
-        `unknown_type`: fixes published as none for their type."""
-
-    def clear(self) -> None:
-        """Discard pending data: the line was closed, or the receiver has restarted."""
-        self._parts.clear()
-        self._waiting = None
-
-    def get_deadline(self) -> int | None:
-        return self._waiting[2] if self._waiting else None
-
-    def on_timer(self, now: HostTime) -> list[GpsFix]:
-        """Release a position whose hold time has passed."""
-        return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
-
-    def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
-        """Process an NMEA epoch whose first byte was received at `host_utime`."""
-        if self._logs:
-            self.counts["superseded"] += 1
-            return []
-        instant = (epoch.utime, epoch.time_of_day)
-        if epoch.time_of_day is not None and instant == self._last_epoch:
-            self.counts["repeated"] += 1
-            return []
-        self._last_epoch = instant
-        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), epoch)]
-
-    def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
-        """Process a log whose first byte was received at `host_utime`."""
-        if log.header.name not in self._logs or log.body is None:
-            return []
-        if log.header.is_secondary:
-            self.counts["rejected.secondary_antenna"] += 1
-            return []
-        instant = (log.header.week, log.header.milliseconds)
-        if not isinstance(log.body, Position):
-            assert isinstance(log.body, (Velocity, HeadingLog))
-            self._parts[log.header.name] = (instant, log.body)
-            return self._release_if_complete(instant)
-        solution = instant[0] * WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
-        if instant == self._last_log or (log.body.solution_age > 0.0 and solution == self._last_solution):
-            self.counts["repeated"] += 1
-            return []
-        self._last_solution = solution
-        if log.body.datum != WGS84_DATUM:
-            self.counts["rejected.datum"] += 1
-            return []
-        if log.body.type not in novatel.PositionType.__members__.values():
-            self.counts["unknown_type"] += 1
-        fixes = self._release()
-        self._last_log = instant
-        is_usable = log.header.time_status in USABLE_TIME
-        device_utime = utime_of(instant[0], instant[1] * 1000, now.utime) if is_usable else 0
-        fix = GpsFix(host_utime, device_utime, log.body, delay=max(0.0, log.body.solution_age))
-        self._waiting = (fix, instant, now.monotonic_ns + HOLD_NS)
-        return fixes + self._release_if_complete(instant)
-
-    def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
-        """Release the pending position if its velocity and heading are complete."""
-        if self._waiting is None or self._waiting[1] != instant:
-            return []
-        here = {name for name, (when, _) in self._parts.items() if when == instant}
-        return self._release() if here.issuperset(self._logs[1:]) else []
-
-    def _release(self) -> list[GpsFix]:
-        if self._waiting is None:
-            return []
-        fix, instant, _ = self._waiting
-        self._waiting = None
-        for when, part in self._parts.values():
-            if when == instant:
-                fix = replace(fix, velocity=part) if isinstance(part, Velocity) else replace(fix, heading=part)
-        return [fix]
-
-
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
     if epoch.time_of_day is None:
         return 0
@@ -314,7 +205,7 @@ _PROBLEMS = {
     "rejected.datum": 'positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`',
     "unknown_type": "the receiver names a position type that is not known here: its fixes are published as none",
 }
-"""What is reported once, by the counter of the fixes."""
+"""What is reported once, by its counter."""
 
 _EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_field")
 """Counters by which the baud rate is right."""
@@ -323,7 +214,9 @@ _EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_fie
 class GpsDriver(StreamDriver[GpsMessage]):
     """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`.
 
-    Further counts: what was left out and why, `restarts`.
+    Further counts: `repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
+    positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna. `unknown_type`:
+    fixes published as none for their type. `restarts`.
     """
 
     answer_timeout = 1.0
@@ -336,25 +229,25 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self.device = settings.protocol
         self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
         self.awaited = POSITION_LOG if self._is_novatel else "NMEA"
-        self._fixes = FixAssembler(settings.logs)
+        self._waiting: tuple[LogHeader, Position, int, int] | None = None
+        """The position that waits for its velocity, when it was received, utime, and until when, monotonic."""
+        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
+        self._last_log: tuple[int, int] | None = None
+        self._last_epoch: tuple[int, int | None] | None = None
+        self._last_solution = -1
         self._counts_before: Mapping[str, int] = {}
         """Those of the stream at the last fix or search."""
-        self._seen_problems: set[str] = set()
         self._gap_ns: int | None = None
         """When the line has paused long enough."""
         self._prompt_until_ns = 0
         """Until then a prompt belongs to a response."""
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        return {**super().counts, **self._fixes.counts}
 
     def _make_identification(self) -> bytes:
         # an end of line first, to flush partial input
         return b"\r\n" + _encode_command(self._settings.make_setup_commands()[0])
 
     def _on_start(self) -> None:
-        self._fixes.clear()
+        self._forget_logs()
         self._gap_ns = None
         self._counts_before = self._stream.counts
 
@@ -367,7 +260,8 @@ class GpsDriver(StreamDriver[GpsMessage]):
         return [Send(_encode_command(f"unlog thisport {log.lower()}b")) for log in self._settings.logs]
 
     def _get_extra_deadline(self) -> int | None:
-        return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)
+        deadlines = self._gap_ns, self._waiting[-1] if self._waiting else None
+        return min((each for each in deadlines if each is not None), default=None)
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
@@ -375,7 +269,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
             self._gap_ns = None
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
-        return out + self._publish_fixes(self._fixes.on_timer(now), now)
+        return out + (self._release(now) if self._waiting and now.monotonic_ns >= self._waiting[-1] else [])
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
@@ -384,19 +278,79 @@ class GpsDriver(StreamDriver[GpsMessage]):
             return self._on_prompt(message, now)
         arrival = self._find_arrival(message.start, now)
         if isinstance(message, NovatelLog):
-            return self._publish_fixes(self._fixes.add_log(message, arrival, now), now)
-        return self._publish_fixes(self._fixes.add_epoch(message, arrival, now), now)
+            return self._on_log(message, arrival, now)
+        return self._on_epoch(message, arrival, now)
 
-    def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
-        out: list[Output[bytes]] = []
-        for fix in fixes:
-            self._counts_before = self._stream.counts
-            header = self._make_header(fix.host_utime, fix.device_utime)
-            out += self._publish(fix.to_sample(header), now, delay=fix.delay)
-        for name in [each for each in _PROBLEMS if self._fixes.counts[each] and each not in self._seen_problems]:
-            self._seen_problems.add(name)
-            out += self._set_status(self._phase, _PROBLEMS[name])
-        return out
+    def _on_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[Output[bytes]]:
+        if self._is_novatel:
+            return self._leave_out("superseded")
+        instant = (epoch.utime, epoch.time_of_day)
+        if epoch.time_of_day is not None and instant == self._last_epoch:
+            return self._leave_out("repeated")
+        self._last_epoch = instant
+        header = self._make_header(host_utime, _get_epoch_utime(epoch, now.utime))
+        return self._publish_fix(sample_from_nmea(header, epoch), now)
+
+    def _on_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[Output[bytes]]:
+        header, body = log.header, log.body
+        if header.name not in self._settings.logs or body is None:
+            return []
+        if header.is_secondary:
+            return self._leave_out("rejected.secondary_antenna")
+        instant = (header.week, header.milliseconds)
+        if not isinstance(body, Position):
+            self._parts[header.name] = (instant, body)
+            return self._release_if_complete(now)
+        solution = instant[0] * WEEK // 1000 + instant[1] - round(body.solution_age * 1000.0)
+        if instant == self._last_log or (body.solution_age > 0.0 and solution == self._last_solution):
+            return self._leave_out("repeated")
+        self._last_solution = solution
+        if body.datum != WGS84_DATUM:
+            return self._leave_out("rejected.datum")
+        out = self._release(now)
+        if body.type not in novatel.PositionType.__members__.values():
+            out += self._leave_out("unknown_type")
+        self._last_log = instant
+        self._waiting = (header, body, host_utime, now.monotonic_ns + HOLD_NS)
+        return out + self._release_if_complete(now)
+
+    def _release_if_complete(self, now: HostTime) -> list[Output[bytes]]:
+        """Publish the waiting position if its velocity and heading are there."""
+        if self._waiting is None:
+            return []
+        header = self._waiting[0]
+        here = {name for name, (when, _) in self._parts.items() if when == (header.week, header.milliseconds)}
+        return self._release(now) if here.issuperset(self._settings.logs[1:]) else []
+
+    def _release(self, now: HostTime) -> list[Output[bytes]]:
+        """Publish the waiting position with what there is of its instant."""
+        if self._waiting is None:
+            return []
+        (log, position, host_utime, _), self._waiting = self._waiting, None
+        velocity, heading = None, None
+        for when, part in self._parts.values():
+            if when == (log.week, log.milliseconds) and isinstance(part, Velocity):
+                velocity = part
+            elif when == (log.week, log.milliseconds):
+                heading = part
+        is_usable = log.time_status in USABLE_TIME
+        device_utime = utime_of(log.week, log.milliseconds * 1000, now.utime) if is_usable else 0
+        sample = sample_from_novatel(self._make_header(host_utime, device_utime), position, velocity, heading)
+        return self._publish_fix(sample, now, max(0.0, position.solution_age))
+
+    def _publish_fix(self, sample: GpsSample, now: HostTime, delay: float = 0.0) -> list[Output[bytes]]:
+        self._counts_before = self._stream.counts
+        return self._publish(sample, now, delay=delay)
+
+    def _leave_out(self, name: str) -> list[Output[bytes]]:
+        """Count what is not used, and report it once."""
+        self._counts[name] += 1
+        is_first = self._counts[name] == 1 and name in _PROBLEMS
+        return self._set_status(self._phase, _PROBLEMS[name]) if is_first else []
+
+    def _forget_logs(self) -> None:
+        self._waiting = None
+        self._parts.clear()
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
         self._prompt_until_ns = now.monotonic_ns + round(self.answer_timeout * SECOND_NS)
@@ -412,7 +366,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
         if not self._is_novatel or self._setup.is_running or now.monotonic_ns < self._prompt_until_ns:
             return []
         self._counts["restarts"] += 1
-        self._fixes.clear()
+        self._forget_logs()
         text = f"the receiver has restarted (prompt [{prompt.port}] without a command), setting it up again"
         return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._setup.start(self._run_setup(), now)]
 
