@@ -169,41 +169,6 @@ MIN_FAILURES_REPORTED = 3
 """Consecutive failed attempts from which on the status text mentions them."""
 
 
-class ReconnectBackoff:
-    """Exponential backoff with jitter for opening a line. Waits in seconds, instants in monotonic nanoseconds."""
-
-    def __init__(self, min_wait: float, max_wait: float, rng: random.Random):
-        self._min_wait, self._max_wait, self._rng = min_wait, max_wait, rng
-        self._wait = min_wait
-        self._opened_ns: int | None = None
-        self.failures = 0
-        """Consecutive failed attempts."""
-
-    def on_open(self, at_ns: int) -> None:
-        self._opened_ns = at_ns
-
-    def is_stable(self, at_ns: int) -> bool:
-        """Return whether the line is stable; if so, reset the backoff."""
-        if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
-            return False
-        self._wait, self.failures = self._min_wait, 0
-        return True
-
-    def on_lost(self, at_ns: int, *, is_orderly: bool, changes_baud: bool) -> float:
-        """Return how long to wait before the next attempt; 0 for an orderly close of a stable line.
-
-        A lost line always waits: a program that competes for it must not cause a busy loop. A change of the baud rate
-        is neither failure nor success.
-        """
-        was_stable = self.is_stable(at_ns)
-        self.failures += self._opened_ns is not None and not was_stable and not changes_baud
-        self._opened_ns = None
-        if changes_baud or (is_orderly and was_stable):
-            return 0.0
-        wait, self._wait = self._wait, min(self._wait * 2.0, self._max_wait)
-        return wait * self._rng.uniform(0.8, 1.2)
-
-
 MAX_COUNTERS = 200
 """Largest number of the endpoint's counters in a health report; the runner's own come on top."""
 
@@ -268,7 +233,9 @@ class Runner(Generic[U]):
         self._endpoint, self._settings, self._time_source = endpoint, settings, time_source
         self._link = link
         self._publish, self._publish_health = publish, publish_health
-        self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
+        self._rng = rng or random.Random()
+        self._wait_s, self._failures = settings.min_backoff, 0
+        self._opened_ns: int | None = None
         max_silence = getattr(endpoint, "max_silence", 0.0)
         self._silence = max(settings.silence, max_silence)
         self._reopen_timeout = max(settings.reopen_timeout, 2.0 * max_silence)
@@ -357,7 +324,7 @@ class Runner(Generic[U]):
         self._is_open = self._was_open = True
         now = self._time_source.now()
         self._received_ns = now.monotonic_ns
-        self._backoff.on_open(now.monotonic_ns)
+        self._opened_ns = now.monotonic_ns
         self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
         self._call_guarded("on_open", lambda: self._endpoint.on_open(now))
 
@@ -377,11 +344,26 @@ class Runner(Generic[U]):
         """Close the line and schedule its reopening: at once to change the baud rate, else when the backoff allows."""
         self._close_line()
         at_ns = self._time_source.now().monotonic_ns
-        wait = self._backoff.on_lost(at_ns, is_orderly=is_orderly, changes_baud=changes_baud)
+        is_stable = self._check_stability(at_ns)
+        # a change of the baud rate is neither failure nor success
+        self._failures += self._opened_ns is not None and not is_stable and not changes_baud
+        self._opened_ns = None
+        wait = 0.0
+        # a lost line always waits: a program that competes for it must not cause a busy loop
+        if not changes_baud and not (is_orderly and is_stable):
+            wait = self._wait_s * self._rng.uniform(0.8, 1.2)
+            self._wait_s = min(self._wait_s * 2.0, self._settings.max_backoff)
         self._open_ns = at_ns + round(wait * 1e9)
-        if self._backoff.failures >= MIN_FAILURES_REPORTED:
+        if self._failures >= MIN_FAILURES_REPORTED:
             reason += "; it is opened and closed again and again: does another program use it?"
         self._set_status(DriverPhase.CLOSED, reason)
+
+    def _check_stability(self, at_ns: int) -> bool:
+        """Return whether the line is stable; if so, reset the backoff."""
+        if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
+            return False
+        self._wait_s, self._failures = self._settings.min_backoff, 0
+        return True
 
     def _close_line(self) -> None:
         with contextlib.suppress(LinkError), self._guard_link("close"):
@@ -459,7 +441,7 @@ class Runner(Generic[U]):
             self._reporter.sample_ns = now.monotonic_ns
 
     def _check_silence(self, now: HostTime) -> None:
-        self._backoff.is_stable(now.monotonic_ns)
+        self._check_stability(now.monotonic_ns)
         quiet = (now.monotonic_ns - self._received_ns) * 1e-9
         if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True

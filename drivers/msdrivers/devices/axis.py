@@ -3,7 +3,7 @@
 Polling: one request at a time, at `poll_hz`. The angle is stamped in the middle between request and reply; delay and
 delay_sigma are half the round trip and the deviation of a uniform distribution over it.
 
-Validation (`ReadingValidator`): an angle is plausible if an axis of at most `fastest_deg` could have reached it from
+Validation (`_validate`): an angle is plausible if an axis of at most `fastest_deg` could have reached it from
 the last plausible one. An implausible one becomes the suspect; if the next is plausible from it, it was the earlier
 one that was wrong.
 
@@ -318,58 +318,6 @@ class _TimedAngle(NamedTuple):
     half_interval_ns: int
 
 
-class ReadingValidator:
-    """Validates consecutive readings; see the module."""
-
-    def __init__(self, settings: AxisSettings):
-        self._settings = settings
-        self.clear()
-
-    def clear(self) -> None:
-        self._last: _TimedAngle | None = None
-        self._suspect: _TimedAngle | None = None
-        self._number: float | None = None
-
-    def validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
-        """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
-
-        `at_ns` is when they were read, give or take `half_interval_ns`. Words: `repeated`, `range`, `jump`, `rate`.
-        """
-        settings, registers = self._settings, self._settings.registers
-
-        def get_words(name: str) -> Sequence[int]:
-            mapped = registers.measured[name]
-            begin = mapped.address - registers.begin
-            return values[begin : begin + mapped.word_count]
-
-        if registers.sequence is not None:
-            number = registers.sequence.to_number(get_words("sequence"))
-            if number == self._number:
-                return None, "repeated"
-            self._number = number
-        degrees = registers.angle.to_degrees(get_words("angle"))
-        if not settings.lowest_deg - settings.step_deg <= degrees <= settings.highest_deg + settings.step_deg:
-            return None, "range"
-        place = _TimedAngle(degrees, at_ns, half_interval_ns)
-        believed = self._last is None or self._can_reach(self._last, place)
-        if not believed and not (self._suspect is not None and self._can_reach(self._suspect, place)):
-            self._suspect = place
-            return None, "jump"
-        self._last, self._suspect = place, None
-        rate, word = NAN, ""
-        if registers.rate is not None:
-            rate = registers.rate.to_degrees(get_words("rate"))
-            if abs(rate) > RATE_MARGIN * settings.fastest_deg:
-                rate, word = NAN, "rate"
-        sigma = settings.step_deg / math.sqrt(12.0)
-        return JointSample(settings.joint, math.radians(degrees), math.radians(sigma), math.radians(rate)), word
-
-    def _can_reach(self, before: _TimedAngle, after: _TimedAngle) -> bool:
-        seconds = (after.at_ns - before.at_ns + before.half_interval_ns + after.half_interval_ns) * 1e-9
-        reach = RATE_MARGIN * self._settings.fastest_deg * seconds + 2.0 * self._settings.step_deg
-        return abs(after.degrees - before.degrees) <= reach
-
-
 REPLY_TIMEOUT_NS = 100_000_000
 """A controller on the vehicle's network answers within milliseconds; a lost request must not cost many readings."""
 
@@ -402,7 +350,9 @@ class AxisDriver:
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
         self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.word_count for each in registers.measured.values()) - registers.begin
-        self._readings = ReadingValidator(settings)
+        self._last: _TimedAngle | None = None
+        self._suspect: _TimedAngle | None = None
+        self._number: float | None = None
         self._commanded: Mapping[str, RegisterMap] = registers.commanded
         self._steps: _Steps | None = None
         self._step: _Step | None = None
@@ -424,7 +374,7 @@ class AxisDriver:
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self._is_open, self._pending = True, None
-        self._readings.clear()
+        self._last = self._suspect = self._number = None
         self._reported.clear()
         self._phase = EndpointPhase.WAITING
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = now.monotonic_ns
@@ -551,7 +501,7 @@ class AxisDriver:
 
     def _publish_reading(self, unit: Registers, pending: _PendingRequest, now: HostTime) -> list[Output[ModbusUnit]]:
         round_trip_ns = now.monotonic_ns - pending.sent_ns
-        joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
+        joint, word = self._validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
             self.counts[word if word == "repeated" else f"rejected.{word}"] += 1
         outputs = self._warn_once(word, _WARNINGS[word]) if word else []
@@ -572,6 +522,45 @@ class AxisDriver:
             *outputs,
             MeasuredSample(JointsSample(header, (joint,)), round_trip / 2.0, round_trip / math.sqrt(12.0)),
         ]
+
+    def _validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
+        """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
+
+        `at_ns` is when they were read, give or take `half_interval_ns`. Words: `repeated`, `range`, `jump`, `rate`.
+        """
+        settings, registers = self.settings, self.settings.registers
+
+        def get_words(name: str) -> Sequence[int]:
+            mapped = registers.measured[name]
+            begin = mapped.address - registers.begin
+            return values[begin : begin + mapped.word_count]
+
+        if registers.sequence is not None:
+            number = registers.sequence.to_number(get_words("sequence"))
+            if number == self._number:
+                return None, "repeated"
+            self._number = number
+        degrees = registers.angle.to_degrees(get_words("angle"))
+        if not settings.lowest_deg - settings.step_deg <= degrees <= settings.highest_deg + settings.step_deg:
+            return None, "range"
+        place = _TimedAngle(degrees, at_ns, half_interval_ns)
+        believed = self._last is None or self._can_reach(self._last, place)
+        if not believed and not (self._suspect is not None and self._can_reach(self._suspect, place)):
+            self._suspect = place
+            return None, "jump"
+        self._last, self._suspect = place, None
+        rate, word = NAN, ""
+        if registers.rate is not None:
+            rate = registers.rate.to_degrees(get_words("rate"))
+            if abs(rate) > RATE_MARGIN * settings.fastest_deg:
+                rate, word = NAN, "rate"
+        sigma = settings.step_deg / math.sqrt(12.0)
+        return JointSample(settings.joint, math.radians(degrees), math.radians(sigma), math.radians(rate)), word
+
+    def _can_reach(self, before: _TimedAngle, after: _TimedAngle) -> bool:
+        seconds = (after.at_ns - before.at_ns + before.half_interval_ns + after.half_interval_ns) * 1e-9
+        reach = RATE_MARGIN * self.settings.fastest_deg * seconds + 2.0 * self.settings.step_deg
+        return abs(after.degrees - before.degrees) <= reach
 
     def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self.counts["unanswered"] += 1

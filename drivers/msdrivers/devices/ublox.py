@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -215,75 +216,68 @@ class UbloxSettings(ByteSettings):
         check_ranges(self, rate_hz=(0.1, 25.0))
 
 
-class Epoch:
-    """The messages of one instant of the receiver, by name."""
+def to_sample(header: SensorHeader, parts: Mapping[str, Any]) -> GpsSample:
+    """Return the fix of the messages of one instant, which are in degrees, millimeters and millimeters per second."""
+    pvt = parts["NAV-PVT"]
+    fix_type = get_fix_type(pvt)
+    is_placed = has_place(pvt)
+    latitude, longitude, height, msl = pvt.lat, pvt.lon, pvt.height * 1e-3, pvt.hMSL * 1e-3
+    precise = parts.get("NAV-HPPOSLLH")
+    if precise is not None and not precise.invalidLlh:
+        latitude, longitude = precise.lat, precise.lon
+        height, msl = precise.height * 1e-3, precise.hMSL * 1e-3
+    dop = parts.get("NAV-DOP")
+    position, velocity = _find_covariances(pvt, parts.get("NAV-COV"))
+    yaw, yaw_sigma = _find_baseline(parts.get("NAV-RELPOSNED"))
+    return GpsSample(
+        header,
+        fix_type,
+        latitude if is_placed else NAN,
+        longitude if is_placed else NAN,
+        height_ellipsoidal=height if is_placed else NAN,
+        height_msl=msl if is_placed else NAN,
+        undulation=height - msl if is_placed else NAN,
+        satellites=pvt.numSV,
+        hdop=NAN if dop is None else dop.hDOP,
+        vdop=NAN if dop is None else dop.vDOP,
+        pdop=pvt.pDOP,
+        position_covariance=position if is_placed else None,
+        velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if is_placed else None,
+        velocity_covariance=velocity if is_placed else None,
+        velocity_latency=0.0 if is_placed else NAN,
+        speed=pvt.gSpeed * 1e-3 if is_placed else NAN,
+        course=course_from_track(pvt.headMot) if is_placed and pvt.gSpeed * 1e-3 > MOVING else NAN,
+        baseline_yaw=yaw,
+        baseline_yaw_sigma=yaw_sigma,
+    )
 
-    def __init__(self, itow: int, host_utime: int, deadline_ns: int):
-        self.itow, self.host_utime, self.deadline_ns = itow, host_utime, deadline_ns
-        self.parts: dict[str, Any] = {}
 
-    def to_sample(self, header: SensorHeader) -> GpsSample:
-        """Return the fix. The messages are in degrees, millimeters and millimeters per second."""
-        pvt = self.parts["NAV-PVT"]
-        fix_type = get_fix_type(pvt)
-        is_placed = has_place(pvt)
-        latitude, longitude, height, msl = pvt.lat, pvt.lon, pvt.height * 1e-3, pvt.hMSL * 1e-3
-        precise = self.parts.get("NAV-HPPOSLLH")
-        if precise is not None and not precise.invalidLlh:
-            latitude, longitude = precise.lat, precise.lon
-            height, msl = precise.height * 1e-3, precise.hMSL * 1e-3
-        dop = self.parts.get("NAV-DOP")
-        position, velocity = self._find_covariances(pvt)
-        yaw, yaw_sigma = self._find_baseline()
-        return GpsSample(
-            header,
-            fix_type,
-            latitude if is_placed else NAN,
-            longitude if is_placed else NAN,
-            height_ellipsoidal=height if is_placed else NAN,
-            height_msl=msl if is_placed else NAN,
-            undulation=height - msl if is_placed else NAN,
-            satellites=pvt.numSV,
-            hdop=NAN if dop is None else dop.hDOP,
-            vdop=NAN if dop is None else dop.vDOP,
-            pdop=pvt.pDOP,
-            position_covariance=position if is_placed else None,
-            velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if is_placed else None,
-            velocity_covariance=velocity if is_placed else None,
-            velocity_latency=0.0 if is_placed else NAN,
-            speed=pvt.gSpeed * 1e-3 if is_placed else NAN,
-            course=course_from_track(pvt.headMot) if is_placed and pvt.gSpeed * 1e-3 > MOVING else NAN,
-            baseline_yaw=yaw,
-            baseline_yaw_sigma=yaw_sigma,
-        )
+def _find_covariances(pvt: Any, cov: Any) -> tuple[Matrix3 | None, Matrix3 | None]:
+    """Return those of position (m2) and velocity (m2/s2) along east, north, up.
 
-    def _find_covariances(self, pvt: Any) -> tuple[Matrix3 | None, Matrix3 | None]:
-        """Return those of position (m2) and velocity (m2/s2) along east, north, up.
+    Without NAV-COV the horizontal accuracy is shared by both axes, as the length of a circular error; that of the
+    speed is taken for each pair of axes in the same way.
+    """
+    a, b, c = pvt.hAcc * 1e-3, pvt.vAcc * 1e-3, pvt.sAcc * 1e-3
+    position: Matrix3 | None = (a * a / 2, 0.0, 0.0, 0.0, a * a / 2, 0.0, 0.0, 0.0, b * b)
+    velocity: Matrix3 | None = (c * c / 2, 0.0, 0.0, 0.0, c * c / 2, 0.0, 0.0, 0.0, c * c / 2)
+    if cov is not None and cov.posCovValid:
+        position = _to_enu(*(getattr(cov, f"posCov{axes}") for axes in _AXES))
+    if cov is not None and cov.velCovValid:
+        velocity = _to_enu(*(getattr(cov, f"velCov{axes}") for axes in _AXES))
+    return position if a > 0.0 else None, velocity if c > 0.0 else None
 
-        Without NAV-COV the horizontal accuracy is shared by both axes, as the length of a circular error; that of the
-        speed is taken for each pair of axes in the same way.
-        """
-        cov = self.parts.get("NAV-COV")
-        a, b, c = pvt.hAcc * 1e-3, pvt.vAcc * 1e-3, pvt.sAcc * 1e-3
-        position: Matrix3 | None = (a * a / 2, 0.0, 0.0, 0.0, a * a / 2, 0.0, 0.0, 0.0, b * b)
-        velocity: Matrix3 | None = (c * c / 2, 0.0, 0.0, 0.0, c * c / 2, 0.0, 0.0, 0.0, c * c / 2)
-        if cov is not None and cov.posCovValid:
-            position = _to_enu(*(getattr(cov, f"posCov{axes}") for axes in _AXES))
-        if cov is not None and cov.velCovValid:
-            velocity = _to_enu(*(getattr(cov, f"velCov{axes}") for axes in _AXES))
-        return position if a > 0.0 else None, velocity if c > 0.0 else None
 
-    def _find_baseline(self) -> tuple[float, float]:
-        """Return the direction to the moving base's antenna and its sigma, radians; nan if it is not known.
+def _find_baseline(relative: Any) -> tuple[float, float]:
+    """Return the direction to the moving base's antenna and its sigma, radians; nan if it is not known.
 
-        NAV-RELPOSNED has the vector from the base to this antenna, whose position NAV-PVT gives.
-        """
-        relative = self.parts.get("NAV-RELPOSNED")
-        if relative is None or not (relative.isMoving and relative.carrSoln == FIXED):
-            return NAN, NAN
-        if not (relative.relPosValid and getattr(relative, "relPosHeadingValid", 0)):
-            return NAN, NAN
-        return course_from_track(relative.relPosHeading + 180.0), math.radians(relative.accHeading)
+    NAV-RELPOSNED has the vector from the base to this antenna, whose position NAV-PVT gives.
+    """
+    if relative is None or not (relative.isMoving and relative.carrSoln == FIXED):
+        return NAN, NAN
+    if not (relative.relPosValid and getattr(relative, "relPosHeadingValid", 0)):
+        return NAN, NAN
+    return course_from_track(relative.relPosHeading + 180.0), math.radians(relative.accHeading)
 
 
 _AXES: Final = ("NN", "NE", "ND", "EE", "ED", "DD")
@@ -307,17 +301,19 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     def __init__(self, settings: UbloxSettings) -> None:
         super().__init__(settings)
         self._rate_hz = settings.rate_hz
-        self._epoch: Epoch | None = None
+        self._parts: dict[str, Any] = {}
+        """The messages of the epoch under way, by name."""
+        self._itow = self._host_utime = self._deadline_ns = 0
         self._last_itow: int | None = None
 
     def _make_identification(self) -> bytes:
         return _encode(pyubx2.UBXMessage("MON", "MON-VER", pyubx2.POLL))
 
     def _on_start(self) -> None:
-        self._epoch = None
+        self._parts.clear()
 
     def _get_extra_deadline(self) -> int | None:
-        return None if self._epoch is None else self._epoch.deadline_ns
+        return self._deadline_ns if self._parts else None
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         return self._publish_epoch(now)
@@ -346,24 +342,24 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         """Add a message to the epoch of its time of week; a later one, or NAV-EOE, completes the one before."""
         itow = message.values.iTOW
         out: list[Output[bytes]] = []
-        if self._epoch is not None and self._epoch.itow != itow:
+        if self._parts and self._itow != itow:
             out += self._publish_epoch(now)
-        if self._epoch is None:
+        if not self._parts:
             if itow == self._last_itow:
                 if message.name == "NAV-PVT":
                     self._counts["repeated"] += 1
                 return out
-            self._epoch = Epoch(itow, self._find_arrival(message.start, now), now.monotonic_ns + HOLD_NS)
-        self._epoch.parts[message.name] = message.values
+            self._itow, self._host_utime = itow, self._find_arrival(message.start, now)
+            self._deadline_ns = now.monotonic_ns + HOLD_NS
+        self._parts[message.name] = message.values
         if message.name == "NAV-EOE":
             out += self._publish_epoch(now)
         return out
 
     def _publish_epoch(self, now: HostTime) -> list[Output[bytes]]:
-        epoch, self._epoch = self._epoch, None
-        assert epoch is not None
-        self._last_itow = epoch.itow
-        if "NAV-PVT" not in epoch.parts:
+        parts, self._parts = self._parts, {}
+        self._last_itow = self._itow
+        if "NAV-PVT" not in parts:
             return []
-        header = self._make_header(epoch.host_utime, get_utime(epoch.parts["NAV-PVT"]))
-        return self._publish(epoch.to_sample(header), now)
+        header = self._make_header(self._host_utime, get_utime(parts["NAV-PVT"]))
+        return self._publish(to_sample(header, parts), now)
