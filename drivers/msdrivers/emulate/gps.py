@@ -20,7 +20,7 @@ from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseEr
 
 from modelserver.messages import FixType, GpsSample
 from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea, novatel
-from msdrivers.devices.gps.driver import WGS84_DATUM, GpsSettings
+from msdrivers.devices.gps.driver import GpsSettings
 from msdrivers.devices.gps.novatel import HeadingLog, Position, PositionType, SolutionStatus, Velocity
 from msdrivers.devices.gpsd import WATCH
 from msdrivers.devices.stream import FrameScanner, ParsedFrame, RejectedFrame
@@ -100,12 +100,12 @@ def _get_motion(sample: GpsSample) -> tuple[float, float, float]:
 def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
-        return Position(status, PositionType.NONE, *zeros, WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
+        return Position(status, PositionType.NONE, *zeros, novatel.WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
     used, kind = max(0, sample.satellites), _FIXES[sample.fix_type].position
     heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
     place = (sample.latitude_deg, sample.longitude_deg, *heights)
     return Position(
-        SolutionStatus.SOL_COMPUTED, kind, *place, WGS84_DATUM, *_get_sigmas(sample), "", 0.0, 0.0, used, used
+        SolutionStatus.SOL_COMPUTED, kind, *place, novatel.WGS84_DATUM, *_get_sigmas(sample), "", 0.0, 0.0, used, used
     )
 
 
@@ -220,18 +220,13 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
         super().__init__(samples, self._unit.latency)
-        self._logs: dict[str, int] = {}
-        """Periods of the logs that are on, microseconds."""
+        self.logs: dict[str, int] = {}
+        """Periods of the logs that are on, e.g. of "bestposb", microseconds."""
         self._written: dict[str, int] = {}
         """When each log was written last."""
         self._line = bytearray()
         for line in self._unit.saved:
             self._execute(line)
-
-    @property
-    def logs(self) -> tuple[str, ...]:
-        """The logs that are on, e.g. "bestposb"."""
-        return tuple(self._logs)
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """The host's end of the line is open. A receiver does not notice, but greets when it was just switched on."""
@@ -260,7 +255,7 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         utime = sample.header.utime
         logs = b""
-        for name, period in self._logs.items():
+        for name, period in self.logs.items():
             # half a millisecond of grace: stamps are rounded
             if utime - self._written.get(name, 0) < period - 500:
                 continue
@@ -274,12 +269,12 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
         command, *fields = line.lower().split()
         try:
             if command == "unlogall":
-                self._logs.clear()
+                self.logs.clear()
             elif command == "unlog":
-                self._logs.pop(fields[1], None)
+                self.logs.pop(fields[1], None)
             elif command == "log" and is_known(fields[1]):
                 # log PORT NAME ontime SECONDS
-                self._logs[fields[1]] = round(float(fields[3]) * 1e6)
+                self.logs[fields[1]] = round(float(fields[3]) * 1e6)
             elif command not in _NO_EFFECT_COMMANDS:
                 return f"Invalid Message. Field = {command}"
         except (IndexError, ValueError):
@@ -380,12 +375,8 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
         self._scanner: FrameScanner[bytes] = FrameScanner((_CommandFormat(),))
         self._period_ms = _FACTORY_PERIOD_MS
         self._last_ms: int | None = None
-        self._messages: set[str] = set()
-
-    @property
-    def messages(self) -> frozenset[str]:
+        self.messages: set[str] = set()
         """The messages that are on, e.g. "NAV-PVT"."""
-        return frozenset(self._messages)
 
     def _answer(self, unit: bytes) -> list[bytes]:
         return [self._execute(frame) for frame in self._scanner.feed(unit)]
@@ -430,7 +421,7 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
     def _switch(self, message: str, is_on: bool) -> bool:
         if message in self._unit.missing or message not in (*ORDER, "RXM-RTCM"):
             return False
-        (self._messages.add if is_on else self._messages.discard)(message)
+        (self.messages.add if is_on else self.messages.discard)(message)
         return True
 
     def _make_version(self) -> bytes:
@@ -444,7 +435,7 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
         if self._last_ms is not None and milliseconds - self._last_ms < self._period_ms - 1:
             return ()
         self._last_ms = milliseconds
-        names = [name for name in ORDER if name in self._messages]
+        names = [name for name in ORDER if name in self.messages]
         self.counts.update(names)
         return (b"".join(encode_ubx(name, sample) for name in names),)
 

@@ -107,39 +107,28 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
 MAX_REJECTED_COUNT = 255
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleUnit:
-    """The controller and its vehicle: seconds, m/s, radians."""
-
-    mode: VehicleMode = VehicleMode.AUTONOMOUS
-    status_period: float = 0.05
-    dead_man: float = 0.25
-    """Dead-man timeout."""
-    max_speed: float = 5.0
-    """Faster commands are rejected."""
-    max_steering: float = 0.6
-    supply_voltage: float = 13.8
-    engine_speed: float = 150.0
-    fault_bits: int = 0
-
-
 class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
-    """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones."""
+    """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones.
+
+    Commands faster than MAX_SPEED, m/s, or beyond MAX_STEERING, radians, are rejected.
+    """
+
+    STATUS_PERIOD_NS, DEAD_MAN_NS = 50_000_000, 250_000_000
+    MAX_SPEED, MAX_STEERING = 5.0, 0.6
+    SUPPLY_VOLTAGE, ENGINE_SPEED = 13.8, 150.0
 
     def __init__(
         self,
         database: CanDatabase,
         status: StatusMap | None,
         command: CommandMap | None = None,
-        unit: VehicleUnit | None = None,
         samples: Iterable[VehicleStatusSample] = (),
     ):
         super().__init__(samples)
-        self.unit = unit or VehicleUnit()
-        self.mode = self.unit.mode
+        self.mode = VehicleMode.AUTONOMOUS
         """Driving mode; set it to press the emergency stop."""
-        self.speed = 0.0
-        self.steering = 0.0
+        self.fault_bits = 0
+        self.speed = self.steering = 0.0
         self.rejected = 0
         """Number of rejected commands."""
         self._database = database
@@ -173,7 +162,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         outputs: list[Output[CanFrame]] = []
         while self._status_ns <= now.monotonic_ns:
             outputs += [Send(each) for each in self._make_status(self._status_ns)]
-            self._status_ns += round(self.unit.status_period * 1e9)
+            self._status_ns += self.STATUS_PERIOD_NS
         return outputs
 
     def get_deadline(self) -> int | None:
@@ -197,7 +186,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         for signal, mapped in command.motion:
             physical = signal.to_physical(raw[signal.name])
             requested.append(math.nan if physical is None else mapped.to_si(physical))
-        fits = abs(requested[0]) <= self.unit.max_speed and abs(requested[1]) <= self.unit.max_steering
+        fits = abs(requested[0]) <= self.MAX_SPEED and abs(requested[1]) <= self.MAX_STEERING
         if not fits or (enabled and self.mode is not VehicleMode.AUTONOMOUS):
             self.rejected += 1
             self.counts["rejected"] += 1
@@ -210,7 +199,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         """Follow the command at once, until the dead-man timer expires."""
         if self._follows_samples:
             return
-        ends = 0 if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
+        ends = 0 if self._commanded_ns is None else self._commanded_ns + self.DEAD_MAN_NS
         is_driving = self.mode is VehicleMode.AUTONOMOUS and at_ns < ends
         self.speed, self.steering = self._target if is_driving else (0.0, self.steering)
 
@@ -226,8 +215,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         status = self._status
         if status is None:
             return []
-        unit = self.unit
-        numbers = (self.speed, self.steering, unit.supply_voltage, unit.engine_speed)
+        numbers = (self.speed, self.steering, self.SUPPLY_VOLTAGE, self.ENGINE_SPEED)
         values = dict(zip(NUMERIC_FIELDS, numbers, strict=True))
         raw: dict[str, dict[str, float]] = {}
         for name, signal in status.signals.items():
@@ -237,7 +225,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
             elif name == "mode":
                 bits = status.map.modes.get(self.mode.name.lower(), 0)
             else:
-                bits = unit.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
+                bits = self.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
             message[signal.name] = bits
         return [self._database.encode(name, values) for name, values in raw.items()]
 

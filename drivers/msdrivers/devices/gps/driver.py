@@ -187,9 +187,6 @@ def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
     return log.status == novatel.SolutionStatus.SOL_COMPUTED and log.type != novatel.PositionType.NONE
 
 
-WGS84_DATUM = 61
-
-
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
     if epoch.time_of_day is None:
         return 0
@@ -305,7 +302,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
         if instant == self._last_log or (body.solution_age > 0.0 and solution == self._last_solution):
             return self._leave_out("repeated")
         self._last_solution = solution
-        if body.datum != WGS84_DATUM:
+        if body.datum != novatel.WGS84_DATUM:
             return self._leave_out("rejected.datum")
         out = self._release(now)
         if body.type not in novatel.PositionType.__members__.values():
@@ -327,12 +324,9 @@ class GpsDriver(StreamDriver[GpsMessage]):
         if self._waiting is None:
             return []
         (log, position, host_utime, _), self._waiting = self._waiting, None
-        velocity, heading = None, None
-        for when, part in self._parts.values():
-            if when == (log.week, log.milliseconds) and isinstance(part, Velocity):
-                velocity = part
-            elif when == (log.week, log.milliseconds):
-                heading = part
+        parts = [part for when, part in self._parts.values() if when == (log.week, log.milliseconds)]
+        velocity = next((part for part in parts if isinstance(part, Velocity)), None)
+        heading = next((part for part in parts if isinstance(part, HeadingLog)), None)
         is_usable = log.time_status in USABLE_TIME
         device_utime = utime_of(log.week, log.milliseconds * 1000, now.utime) if is_usable else 0
         sample = sample_from_novatel(self._make_header(host_utime, device_utime), position, velocity, heading)
