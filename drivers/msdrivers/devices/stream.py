@@ -291,7 +291,7 @@ class ScriptRunner:
     def start(self, script: Script, now: HostTime) -> list[Output[bytes]]:
         self.stop()
         self._script = script
-        return self._advance(partial(next, script), now)
+        return self._advance(now)
 
     def stop(self) -> None:
         if self._script is not None:
@@ -300,7 +300,7 @@ class ScriptRunner:
 
     def reopen(self, now: HostTime) -> list[Output[bytes]] | None:
         """Continue a script that has requested the reopening of the line; None if none has."""
-        return self._resume(None, now) if isinstance(self.step, Reopen) else None
+        return self._advance(now) if isinstance(self.step, Reopen) else None
 
     def on_reply(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
         """Complete the request under way."""
@@ -308,7 +308,7 @@ class ScriptRunner:
         if not isinstance(step, RequestStep):
             return []
         if self._attempt == 1:
-            return self._resume(reply, now)
+            return self._advance(now, reply)
         self._wait(PauseStep(self._attempt * step.timeout), now, reply)
         return []
 
@@ -317,25 +317,19 @@ class ScriptRunner:
         if due is None or now.monotonic_ns < due:
             return []
         if not isinstance(step, RequestStep):
-            return self._resume(self._reply, now)
+            return self._advance(now, self._reply)
         if self._attempt < step.attempts:
             return [self._send_request(step, now)]
-        assert self._script is not None
-        error = NoReplyError(f"{step.what} was sent {step.attempts} times and not answered")
-        return self._advance(partial(self._script.throw, error), now)
+        return self._advance(now, error=NoReplyError(f"{step.what} was sent {step.attempts} times and not answered"))
 
-    def _resume(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
-        assert self._script is not None
-        return self._advance(partial(self._script.send, reply), now)
-
-    def _advance(self, resume: Callable[[], Step], now: HostTime) -> list[Output[bytes]]:
-        """Continue to the next step that waits; return the outputs until there."""
+    def _advance(self, now: HostTime, reply: Any = None, error: NoReplyError | None = None) -> list[Output[bytes]]:
+        """Continue with a reply or an error to the next step that waits; return the outputs until there."""
         script, self.step = self._script, None
         assert script is not None
         outputs: list[Output[bytes]] = []
         while True:
             try:
-                step = resume()
+                step = script.send(reply) if error is None else script.throw(error)
             except StopIteration:
                 self._script = None
                 return outputs
@@ -349,7 +343,7 @@ class ScriptRunner:
             if isinstance(step, Reopen):
                 self.step = step
                 return outputs
-            resume = partial(next, script)
+            reply = error = None
 
     def _wait(self, step: PauseStep, now: HostTime, reply: Any = None) -> None:
         self.step, self._reply = step, reply
