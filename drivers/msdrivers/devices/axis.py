@@ -46,19 +46,19 @@ from msdrivers.endpoint import (
     is_reply_to,
 )
 
-_TYPES: Final = {
-    "int16": (1, True),
-    "uint16": (1, False),
-    "int32": (2, True),
-    "uint32": (2, False),
-    "float32": (2, True),
-}
-"""Registers and sign of each type."""
-
-_ORDERS: Final = ("ABCD", "CDAB", "BADC", "DCBA")
-
 _MAX_FLOAT32: Final = (2**24 - 1) << 104
 """IEEE 754, binary32: 24 bits of 1 at the highest exponent, which is a whole number."""
+
+_TYPES: Final = {
+    "int16": ("h", -0x8000, 0x7FFF),
+    "uint16": ("H", 0, 0xFFFF),
+    "int32": ("i", -0x8000_0000, 0x7FFF_FFFF),
+    "uint32": ("I", 0, 0xFFFF_FFFF),
+    "float32": ("f", -_MAX_FLOAT32, _MAX_FLOAT32),
+}
+"""Each type's code of `struct`, its lowest and its highest number."""
+
+_ORDERS: Final = ("ABCD", "CDAB", "BADC", "DCBA")
 
 _FLOAT32_TOLERANCE: Final = 4 * 2.0**-23
 """Relative: a device that stores another unit rounds twice on writing and twice on reading."""
@@ -89,11 +89,11 @@ class RegisterMap(Strict):
     def __post_init__(self) -> None:
         check_choice(self, registers=(1, 2), type=(None, *_TYPES), order=(None, *_ORDERS))
         if self.type is not None:
-            count, is_signed = _TYPES[self.type]
             # a default that is written cannot be distinguished from nothing written, and contradicts nothing
-            if self.registers not in (1, count):
+            if self.registers not in (1, self.word_count):
+                count = self.word_count
                 raise ValueError(f"registers is left out with type: {self.type} has {count}, got {self.registers}")
-            if not self.is_signed and is_signed:
+            if not self.is_signed and self.lowest < 0:
                 raise ValueError(f"is_signed is left out with type: {self.type} is signed, got false")
         if self.order in ("ABCD", "BADC") and not self.high_word_first:
             raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
@@ -105,8 +105,12 @@ class RegisterMap(Strict):
             raise ValueError(f"offset_deg is a number, got {self.offset_deg:g}")
 
     @property
+    def _type(self) -> tuple[str, int, int]:
+        return _TYPES[self.type or f"{'' if self.is_signed else 'u'}int{16 * self.registers}"]
+
+    @property
     def word_count(self) -> int:
-        return self.registers if self.type is None else _TYPES[self.type][0]
+        return struct.calcsize(f">{self._type[0]}") // 2
 
     @property
     def is_float(self) -> bool:
@@ -114,31 +118,23 @@ class RegisterMap(Strict):
 
     @property
     def lowest(self) -> int:
-        """The lowest number that the registers hold."""
-        if self.is_float:
-            return -_MAX_FLOAT32
-        is_signed = self.is_signed if self.type is None else _TYPES[self.type][1]
-        return -(1 << (16 * self.word_count - 1)) if is_signed else 0
+        return self._type[1]
 
     @property
     def highest(self) -> int:
-        return _MAX_FLOAT32 if self.is_float else self.lowest + (1 << (16 * self.word_count)) - 1
+        return self._type[2]
 
     def to_number(self, values: Sequence[int]) -> float:
         """Return the number of the registers: a whole one except of float32, which may be non-finite."""
         data = struct.pack(f">{len(values)}H", *self._reorder(values))
-        if self.is_float:
-            (real,) = struct.unpack(">f", data)
-            return float(real)
-        number = int.from_bytes(data, "big")
-        return number - (1 << 16 * self.word_count) if number > self.highest else number
+        number: float = struct.unpack(f">{self._type[0]}", data)[0]
+        return number
 
     def to_words(self, number: float) -> tuple[int, ...]:
         """Return the registers of a number. Raises ValueError for one that they do not hold."""
         if not self.lowest <= number <= self.highest:
             raise ValueError(f"{number} is not within {self.lowest} to {self.highest}")
-        bits = 16 * self.word_count
-        data = struct.pack(">f", number) if self.is_float else (int(number) % (1 << bits)).to_bytes(bits // 8, "big")
+        data = struct.pack(f">{self._type[0]}", number if self.is_float else int(number))
         return self._reorder(struct.unpack(f">{self.word_count}H", data))
 
     def to_degrees(self, values: Sequence[int]) -> float:
