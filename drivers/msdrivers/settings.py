@@ -63,12 +63,11 @@ class SectionReader(SettingsReader):
         known = f"kinds: {', '.join(kinds)}"
         if given is None:
             self.report("device", "device is missing", f"add a line: device: ... ({known})")
+        elif given in KINDS.problems:
+            why = f"device {quote(str(given))} of an installed package cannot be used: {KINDS.problems[given]}"
+            self.report("device", why, "repair or reinstall that package")
         else:
             near = suggest_name(str(given), kinds)
-            if given in KINDS.problems:
-                why = f"device {quote(str(given))} of an installed package cannot be used: {KINDS.problems[given]}"
-                self.report("device", why, "repair or reinstall that package")
-                raise ConfigError(self.problems)
             self.report("device", f"unknown device {quote(str(given))}", f"write {near[0]}" if near else known, near)
         raise ConfigError(self.problems)
 

@@ -188,7 +188,6 @@ class TcpServerLink(DescriptorLink):
         self._address = (host, port)
         self.description = f"tcp {host}:{port}"
         self._server: socket.socket | None = None
-        self._client: socket.socket | None = None
         self.clients_accepted = 0
         """Number of clients so far."""
 
@@ -216,12 +215,12 @@ class TcpServerLink(DescriptorLink):
         """Return bytes from the client. A disconnect is no error: another client may connect."""
         if self._server is None:
             raise LinkError(self.description, "the line is not open")
-        known = [each for each in (self._server, self._client) if each is not None]
+        known = [each for each in (self._server, self._file) if each is not None]
         ready, _, _ = select.select(known, (), (), max(0.0, timeout))
         data: Sequence[bytes] = ()
-        if self._client is not None and self._client in ready:
+        if self._file in ready:
             try:
-                data = self.read_available(self._client.fileno())
+                data = self.read_available(self.fileno())
             except LinkError:
                 self.disconnect_client()
         if self._server in ready:
@@ -230,22 +229,20 @@ class TcpServerLink(DescriptorLink):
                 self.disconnect_client()
                 caller.setblocking(False)
                 caller.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._client = caller
+                self._file = caller
                 self.clients_accepted += 1
         return data
 
     def send(self, unit: bytes) -> None:
         """Send bytes to the client; a missing or blocked client is no error."""
-        if self._client is None:
+        if self._file is None:
             return
         try:
-            self._client.sendall(unit)
+            self._file.sendall(unit)
         except BlockingIOError:
             pass
         except OSError:
             self.disconnect_client()
 
     def disconnect_client(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
+        super().close()

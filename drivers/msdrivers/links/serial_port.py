@@ -10,6 +10,7 @@ import errno
 import getpass
 import glob
 import grp
+import io
 import os
 import termios
 import time
@@ -222,47 +223,39 @@ class PtyLink(DescriptorLink):
         self.description = str(link) if link else "pty"
         self._link = link
         self._path = ""
-        self._emulator_fd = self._driver_fd = -1
+        self._driver_fd = -1
 
     def open(self, baud: int | None = None) -> None:
         """Make the pair, unless there is one. Raises LinkError."""
-        if self._emulator_fd >= 0:
+        if self._file is not None:
             return
         try:
-            # the other end stays open here, so that a driver that closes it causes no hang-up
-            self._emulator_fd, self._driver_fd = os.openpty()
-            tty.setraw(self._driver_fd)
-            os.set_blocking(self._emulator_fd, False)
-            self._path = os.ttyname(self._driver_fd)
             if self._link is not None:
                 remove_stale_link(self._link)
+            # the other end stays open here, so that a driver that closes it causes no hang-up
+            emulator_fd, self._driver_fd = os.openpty()
+            self._file = io.FileIO(emulator_fd, "r+")
+            tty.setraw(self._driver_fd)
+            os.set_blocking(emulator_fd, False)
+            self._path = os.ttyname(self._driver_fd)
+            if self._link is not None:
                 self._link.symlink_to(self._path)
         except OSError as error:
             self.close()
             raise LinkError(self.description, error.strerror or str(error), "give another path") from None
-        except LinkError:
-            self.close()
-            raise
         self.description = str(self._link) if self._link else self._path
 
     def close(self) -> None:
         """End both; a driver that has it open sees its port vanish."""
-        for file in (self._emulator_fd, self._driver_fd):
-            if file >= 0:
-                os.close(file)
+        if self._file is not None:
+            super().close()
+            os.close(self._driver_fd)
         if self._link is not None and self._path:
             # what is not this pseudo-terminal's own link stays: a file, or the link of another emulator
             with contextlib.suppress(OSError):
                 if os.readlink(self._link) == self._path:
                     self._link.unlink()
         self._path = ""
-        self._emulator_fd = self._driver_fd = -1
-
-    def fileno(self) -> int:
-        """Return the emulator's end. Raises LinkError if it is not open."""
-        if self._emulator_fd < 0:
-            raise LinkError(self.description, "the line is not open")
-        return self._emulator_fd
 
     def send(self, unit: bytes) -> None:
         """Send bytes; they are lost when the terminal's buffer is full, as on a real line."""
