@@ -418,6 +418,8 @@ class EpochAssembler:
 
     def __init__(self) -> None:
         self._sentences: list[NmeaSentence] = []
+        self._timed: NmeaSentence | None = None
+        """The first of them with a time."""
         self._reference: int | None = None
         self._last_instant: int | None = None
         self._cycle: Counter[str] = Counter()
@@ -435,7 +437,7 @@ class EpochAssembler:
         """Return the epochs that the sentence completes: at most the one before it, and its own."""
         closed = []
         timed = sentence.kind in _TIMED
-        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._get_instant()[0]:
+        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._timed:
             closed += self._close(by_end=False)
         if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
             self.late += 1
@@ -444,9 +446,10 @@ class EpochAssembler:
             self._reference = sentence.day * DAY + sentence.time_of_day
         if not self._sentences:
             self._starts_after_silence, self._is_line_silent = self._is_line_silent, False
-        elif timed and self._starts_after_silence and not self._get_instant()[0]:
+        elif timed and self._starts_after_silence and self._timed is None:
             self._learn_order(self._sentences, leads=True)
         self._sentences.append(sentence)
+        self._timed = self._timed or (sentence if timed else None)
         if self._is_end(sentence):
             closed += self._close(by_end=True)
         return closed
@@ -460,7 +463,7 @@ class EpochAssembler:
 
     def clear(self) -> None:
         """Forget the epoch under way, and the order of sentences: another receiver may speak."""
-        self._sentences, self._is_line_silent = [], False
+        self._sentences, self._timed, self._is_line_silent = [], None, False
         self._order_counts.clear()
 
     def _learn_order(self, sentences: list[NmeaSentence], leads: bool) -> None:
@@ -484,22 +487,15 @@ class EpochAssembler:
 
         return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or is_selected(n, each.kind)]
 
-    def _get_instant(self) -> tuple[bool, int | None]:
-        """Return whether the pending epoch has a timed sentence, and its time."""
-        return next(((True, each.time_of_day) for each in self._sentences if each.kind in _TIMED), (False, None))
-
     def _starts_epoch(self, sentence: NmeaSentence) -> bool:
-        started, instant = self._get_instant()
-        if not started:
-            return False
-        if sentence.time_of_day != instant:
-            return True
-        return instant is None and any(each.kind == sentence.kind for each in self._sentences)
+        if self._timed is None or sentence.time_of_day != self._timed.time_of_day:
+            return self._timed is not None
+        return sentence.time_of_day is None and any(each.kind == sentence.kind for each in self._sentences)
 
     def _is_late(self, sentence: NmeaSentence, timed: bool) -> bool:
         if timed:
-            started, _ = self._get_instant()
-            late = not started and sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            is_same = sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            late = is_same and self._timed is None
             self._is_regular = self._is_regular and not (late and self._is_closed_by_end)
             return late
         if not self._sentences and self._is_closed_by_end and sentence.kind != self._first:
@@ -518,10 +514,11 @@ class EpochAssembler:
         return all(received[kind] >= number for kind, number in self._cycle.items())
 
     def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
-        sentences, self._sentences = self._sentences, []
-        if not any(each.kind in _TIMED for each in sentences):
+        sentences, timed = self._sentences, self._timed
+        self._sentences, self._timed = [], None
+        if timed is None:
             return []
-        instant = next(each.time_of_day for each in sentences if each.kind in _TIMED)
+        instant = timed.time_of_day
         cycle = Counter(each.kind for each in sentences)
         if cycle != self._cycle or self._stable_since is None or instant is None or instant < self._stable_since:
             self._stable_since = instant
