@@ -76,7 +76,8 @@ MAX_LOGGED_STATES = 100
 class HealthReporter:
     """Tracks the status of one driver and calls `send` when a report is due. Times in seconds."""
 
-    def __init__(self, source: str, silence: float, period: float, now: HostTime, send: Callable[[HostTime], object]):
+    def __init__(self, source: str, silence: float, period: float, time: TimeSource, send: Callable[[], object]):
+        now = time.now()
         self.samples = 0
         self.rate_hz = 0.0
         self.is_silent = False
@@ -86,7 +87,7 @@ class HealthReporter:
         self.next_report_ns = now.monotonic_ns
         """Deadline of the next report, monotonic nanoseconds."""
         self._source, self._silence, self._period_ns = source, silence, round(period * 1e9)
-        self._send = send
+        self._time_source, self._send = time, send
         self.sample_ns: int | None = None
         """When the last sample was published, monotonic nanoseconds."""
         self._counted_ns, self._counted = now.monotonic_ns, 0
@@ -107,7 +108,7 @@ class HealthReporter:
             text += f"; before that: {self._last_warning}"
         return phase, text
 
-    def set_status(self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False) -> None:
+    def set_status(self, phase: DriverPhase, text: str, is_warning: bool = False) -> None:
         """Set phase and text and report a change.
 
         A warning is repeated with a silence that follows it, until data arrives or the line is reopened.
@@ -117,10 +118,10 @@ class HealthReporter:
         elif phase in (DriverPhase.WAITING, DriverPhase.STREAMING):
             self._last_warning = ""
         self._phase, self._text, self._is_warning = phase, text, is_warning
-        self.report_change(now)
+        self.report_change()
 
-    def report_change(self, now: HostTime) -> None:
-        state = self.state
+    def report_change(self) -> None:
+        now, state = self._time_source.now(), self.state
         if state == self._reported:
             return
         self._reported, self._changed_ns = state, now.monotonic_ns
@@ -132,9 +133,10 @@ class HealthReporter:
         is_new = now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS
         if self.is_ending or (is_new and not (is_starting and self._is_bad)):
             self._log(now)
-        self._send(now)
+        self._send()
 
-    def on_timer(self, now: HostTime) -> None:
+    def on_timer(self) -> None:
+        now = self._time_source.now()
         if now.monotonic_ns < self.next_report_ns:
             return
         if self.state != self._logged and now.monotonic_ns - self._changed_ns >= STABLE_NS:
@@ -144,7 +146,7 @@ class HealthReporter:
         since = (now.monotonic_ns - self._counted_ns) * 1e-9
         self.rate_hz = (self.samples - self._counted) / since if since > 0 else 0.0
         self._counted_ns, self._counted = now.monotonic_ns, self.samples
-        self._send(now)
+        self._send()
 
     @property
     def _is_bad(self) -> bool:
@@ -243,9 +245,9 @@ class Runner(Generic[U]):
         self._is_stopping, self._close_reason = False, "ended"
         self._is_open = self._was_open = False
         self._baud: int | None = None
-        now = time_source.now()
-        self._open_ns = self._received_ns = now.monotonic_ns
-        self._reporter = HealthReporter(settings.source, self._silence, settings.report_period, now, self._send_report)
+        self._open_ns = self._received_ns = time_source.now().monotonic_ns
+        period, send = settings.report_period, self._send_report
+        self._reporter = HealthReporter(settings.source, self._silence, period, time_source, send)
 
     @property
     def samples(self) -> int:
@@ -304,7 +306,7 @@ class Runner(Generic[U]):
                 self.stop()
             except LinkError as error:
                 self._close(str(error))
-        self._reporter.on_timer(self._time_source.now())
+        self._reporter.on_timer()
 
     def _open_when_due(self) -> None:
         now = self._time_source.now()
@@ -325,7 +327,7 @@ class Runner(Generic[U]):
         now = self._time_source.now()
         self._received_ns = now.monotonic_ns
         self._opened_ns = now.monotonic_ns
-        self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
+        self._reporter.set_status(DriverPhase.WAITING, f"{self._link.description} is open")
         self._call_guarded("on_open", lambda: self._endpoint.on_open(now))
 
     def _call_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
@@ -356,7 +358,7 @@ class Runner(Generic[U]):
         self._open_ns = at_ns + round(wait * 1e9)
         if self._failures >= MIN_FAILURES_REPORTED:
             reason += "; it is opened and closed again and again: does another program use it?"
-        self._set_status(DriverPhase.CLOSED, reason)
+        self._reporter.set_status(DriverPhase.CLOSED, reason)
 
     def _check_stability(self, at_ns: int) -> bool:
         """Return whether the line is stable; if so, reset the backoff."""
@@ -428,7 +430,7 @@ class Runner(Generic[U]):
             elif isinstance(output, MeasuredSample):
                 self._publish_sample(output)
             elif isinstance(output, EndpointStatus):
-                self._set_status(DriverPhase[output.phase.name], output.text, output.is_warning)
+                self._reporter.set_status(DriverPhase[output.phase.name], output.text, output.is_warning)
             else:
                 self._reopen(output)
                 return
@@ -445,16 +447,13 @@ class Runner(Generic[U]):
         quiet = (now.monotonic_ns - self._received_ns) * 1e-9
         if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True
-            self._reporter.report_change(now)
+            self._reporter.report_change()
         if quiet >= self._reopen_timeout:
             self._reopen(Reopen(f"nothing received for {quiet:.0f} s"))
 
-    def _set_status(self, phase: DriverPhase, text: str, is_warning: bool = False) -> None:
-        self._reporter.set_status(phase, text, self._time_source.now(), is_warning=is_warning)
-
-    def _send_report(self, now: HostTime) -> None:
+    def _send_report(self) -> None:
         with self._continue_on_error("report"):
-            self._publish_health(self.make_health(now))
+            self._publish_health(self.make_health(self._time_source.now()))
 
     def make_health(self, now: HostTime) -> DriverHealth:
         phase, text = self._reporter.state
@@ -486,7 +485,7 @@ class Runner(Generic[U]):
             except LinkError as error:
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._close_line()
-        self._set_status(DriverPhase.CLOSED, self._close_reason)
+        self._reporter.set_status(DriverPhase.CLOSED, self._close_reason)
 
 
 COMMAND_TYPE = "vehicle_command_t"

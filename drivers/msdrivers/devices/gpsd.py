@@ -64,16 +64,12 @@ class GpsdReport:
     @property
     def utime(self) -> int:
         """The instant of the report, microseconds of UTC; 0 if it has none."""
-        text = self.fields.get("time")
-        if not isinstance(text, str):
-            return 0
         try:
-            when = datetime.fromisoformat(text)
-        except ValueError:
+            since = datetime.fromisoformat(str(self.fields.get("time"))) - datetime(1970, 1, 1, tzinfo=UTC)
+        # TypeError: without a time zone
+        except (ValueError, TypeError):
             return 0
-        if when.tzinfo is None:
-            return 0
-        return max(0, (when - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1))
+        return max(0, since // timedelta(microseconds=1))
 
     @property
     def fix_type(self) -> FixType:

@@ -81,11 +81,7 @@ class DirectionMap(Strict):
 
     @property
     def numbers(self) -> dict[Direction, int]:
-        return {
-            Direction.STOPPED: self.stopped,
-            Direction.FORWARD: self.forward,
-            Direction.BACKWARD: self.backward,
-        }
+        return {Direction.STOPPED: self.stopped, Direction.FORWARD: self.forward, Direction.BACKWARD: self.backward}
 
     def __post_init__(self) -> None:
         check_signal(self.signal)

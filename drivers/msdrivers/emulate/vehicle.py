@@ -347,16 +347,14 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
 
     def _make_table(self, table: RegisterTable) -> dict[int, int]:
         registers = self._registers
-        words: dict[int, int] = {}
-        if table is RegisterTable(registers.table):
-            values = {"angle": self._measured_deg, "rate": self._measured_rate}
-            for name, mapped in registers.measured.items():
-                found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
-                words |= {mapped.address + index: word for index, word in enumerate(found)}
+        values = self.commanded | {"angle": self._measured_deg, "rate": self._measured_rate}
+        present = dict(registers.measured) if table is RegisterTable(registers.table) else {}
         if table is RegisterTable.HOLDING:
-            for name, mapped in registers.commanded.items():
-                found = mapped.from_degrees(self.commanded[name])
-                words |= {mapped.address + index: word for index, word in enumerate(found)}
+            present |= registers.commanded
+        words: dict[int, int] = {}
+        for name, mapped in present.items():
+            found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
+            words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
     def _write(self, unit: WriteRegisters) -> ModbusUnit:
