@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from modelserver.messages import Sample, VehicleCommand
+from modelserver.messages import DriverPhase, Sample, VehicleCommand
 
 
 class HostTime(NamedTuple):
@@ -36,17 +36,11 @@ class TimeSource(Protocol):
         """Wait."""
 
 
-class EndpointPhase(Enum):
-    """Phase of the connection to the device."""
-
-    WAITING = "waiting"
-    """Nothing received since the line was opened."""
-    CONFIGURING = "configuring"
-    """The device answers and is being configured."""
-    STREAMING = "streaming"
-    """Samples arrive."""
-    SILENT = "silent"
-    """The device has stopped to speak, or speaks what cannot be used."""
+EndpointPhase: TypeAlias = DriverPhase
+"""Phase of the connection to the device. WAITING: nothing received since the line was opened. CONFIGURING: the device
+answers and is being configured. STREAMING: samples arrive. SILENT: the device has stopped to speak, or speaks what
+cannot be used. CLOSED is the runner's.
+"""
 
 
 U = TypeVar("U")

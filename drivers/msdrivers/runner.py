@@ -430,7 +430,7 @@ class Runner(Generic[U]):
             elif isinstance(output, MeasuredSample):
                 self._publish_sample(output)
             elif isinstance(output, EndpointStatus):
-                self._reporter.set_status(DriverPhase[output.phase.name], output.text, output.is_warning)
+                self._reporter.set_status(output.phase, output.text, output.is_warning)
             else:
                 self._reopen(output)
                 return
