@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from modelserver.messages import DriverPhase, Sample, VehicleCommand
 
@@ -176,13 +175,9 @@ MAX_WRITE = 123
 LAST_ADDRESS = 0xFFFF
 
 
-class RegisterTable(Enum):
-    """Table of a register; each table has its own addresses."""
-
-    HOLDING = "holding"
-    """Read and written (functions 3 and 16)."""
-    INPUT = "input"
-    """Only read (function 4)."""
+RegisterTable: TypeAlias = Literal["holding", "input"]
+"""Table of a register; each has its own addresses. holding: read and written (functions 3 and 16). input: only read
+(function 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +186,7 @@ class ReadRegisters:
 
     address: int
     count: int
-    table: RegisterTable = RegisterTable.HOLDING
+    table: RegisterTable = "holding"
     transaction: int = 0
 
 
@@ -265,5 +260,5 @@ def is_reply_to(unit: ModbusUnit, request: ModbusRequest) -> bool:
 
 def describe_request(request: ModbusRequest) -> str:
     if isinstance(request, ReadRegisters):
-        return f"reading {request.count} {request.table.value} registers from {request.address}"
+        return f"reading {request.count} {request.table} registers from {request.address}"
     return f"writing {len(request.values)} registers from {request.address}"

@@ -37,7 +37,6 @@ from msdrivers.endpoint import (
     ReadRegisters,
     Registers,
     RegistersWritten,
-    RegisterTable,
     Reopen,
     Send,
     WriteRegisters,
@@ -344,7 +343,6 @@ class AxisDriver:
         self.max_silence = settings.silence
         self.counts = BoundedCounter()
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
-        self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.word_count for each in registers.measured.values()) - registers.begin
         self._last: _TimedAngle | None = None
         self._suspect: _TimedAngle | None = None
@@ -483,7 +481,8 @@ class AxisDriver:
         if self._step is not None and not is_poll:
             request = replace(self._step[1], transaction=transaction)
         else:
-            request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
+            registers = self.settings.registers
+            request = ReadRegisters(registers.begin, self._length, registers.table, transaction)
             self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
             self.counts["skipped"] += late

@@ -348,8 +348,8 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
     def _make_table(self, table: RegisterTable) -> dict[int, int]:
         registers = self._registers
         values = self.commanded | {"angle": self._measured_deg, "rate": self._measured_rate}
-        present = dict(registers.measured) if table is RegisterTable(registers.table) else {}
-        if table is RegisterTable.HOLDING:
+        present = dict(registers.measured) if table == registers.table else {}
+        if table == "holding":
             present |= registers.commanded
         words: dict[int, int] = {}
         for name, mapped in present.items():

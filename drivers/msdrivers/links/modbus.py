@@ -104,7 +104,7 @@ class ModbusLink(LinkWrapper[bytes]):
         """Send a request. Raises LinkError."""
         number = unit.transaction & 0xFFFF
         if isinstance(unit, ReadRegisters):
-            holding = unit.table is RegisterTable.HOLDING
+            holding = unit.table == "holding"
             kind = pdu.ReadHoldingRegistersRequest if holding else pdu.ReadInputRegistersRequest
             message: ModbusPDU = kind(address=unit.address, count=unit.count)
         elif isinstance(unit, WriteRegisters):
@@ -206,7 +206,7 @@ def _convert_request(message: ModbusPDU | None, number: int) -> ModbusRequest | 
     """Return the request in a message, None for what is not served here."""
     if isinstance(message, pdu.ReadHoldingRegistersRequest | pdu.ReadInputRegistersRequest):
         # the class of input registers is made from that of holding ones
-        table = RegisterTable.INPUT if isinstance(message, pdu.ReadInputRegistersRequest) else RegisterTable.HOLDING
+        table: RegisterTable = "input" if isinstance(message, pdu.ReadInputRegistersRequest) else "holding"
         return ReadRegisters(message.address, message.count, table, number)
     if isinstance(message, pdu.WriteMultipleRegistersRequest) and len(message.registers) == message.count:
         return WriteRegisters(message.address, tuple(message.registers), number)

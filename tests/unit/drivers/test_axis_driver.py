@@ -25,7 +25,6 @@ from msdrivers.endpoint import (
     ReadRegisters,
     Registers,
     RegistersWritten,
-    RegisterTable,
     Reopen,
     Send,
     WriteRegisters,
@@ -118,7 +117,7 @@ def test_given_no_rate_and_no_number_then_rate_is_nan() -> None:
     wire.run(1.0)
     assert degrees(wire)[0] == pytest.approx(7.2)
     assert math.isnan(joints(wire)[0].joints[0].rate)
-    assert wire.sent[0][1] == ReadRegisters(7, 1, RegisterTable.INPUT, 1)
+    assert wire.sent[0][1] == ReadRegisters(7, 1, "input", 1)
     assert driver.on_close(at(1.0)) == []
 
 
@@ -301,7 +300,7 @@ def test_given_an_angle_that_jumps_then_one_reading_is_rejected() -> None:
 def test_given_replies_that_do_not_belong_to_the_request_then_they_are_not_used() -> None:
     driver = AxisDriver(axis_settings(nod=None))
     (_, request) = driver.on_open(at(0.0))
-    assert request == Send(ReadRegisters(0, 4, RegisterTable.HOLDING, 1))
+    assert request == Send(ReadRegisters(0, 4, "holding", 1))
     assert driver.on_receive(Registers(0, (0, 0, 0, 1), 7), at(0.001)) == []
     assert driver.counts["rejected.stale"] == 1
     assert any(isinstance(each, MeasuredSample) for each in driver.on_receive(Registers(0, (0, 0, 0, 1), 1), at(0.002)))
@@ -404,7 +403,7 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
         if kind == 1:
             return RegistersWritten(rng.choice((16, 18, 20)), rng.randrange(4), transaction)
         if kind == 2:
-            return ReadRegisters(0, 4, RegisterTable.HOLDING, transaction)
+            return ReadRegisters(0, 4, "holding", transaction)
         words = tuple(
             rng.choice((0, 1, 0xFFFF, 70_000, -1, rng.randrange(1 << 16))) for _ in range(rng.choice((1, 2, 4, 200)))
         )
@@ -449,7 +448,7 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
         (ReadRegisters(100, 1, transaction=4), 2),
         (ReadRegisters(0, 0, transaction=4), 2),
         (ReadRegisters(0, 126, transaction=4), 2),
-        (ReadRegisters(0, 4, RegisterTable.INPUT, 4), 2),
+        (ReadRegisters(0, 4, "input", 4), 2),
         (WriteRegisters(0, (1, 2), 4), 2),
         (WriteRegisters(20, (100,), 4), 3),
         (WriteRegisters(16, (0, 5000), 4), 3),

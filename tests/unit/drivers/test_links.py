@@ -21,7 +21,6 @@ from msdrivers.endpoint import (
     ReadRegisters,
     Registers,
     RegistersWritten,
-    RegisterTable,
     WriteRegisters,
 )
 from msdrivers.links import Link, LinkError, TcpLink, TcpServerLink
@@ -460,14 +459,14 @@ def modbus(server: TcpServerLink) -> Iterator[tuple[ModbusLink, ModbusServerLink
 def test_given_requests_then_each_has_its_reply_in_any_order(modbus: tuple[ModbusLink, ModbusServerLink]) -> None:
     driver, device = modbus
     requests: list[ModbusUnit] = [
-        ReadRegisters(5, 3, RegisterTable.INPUT, 70_001),
+        ReadRegisters(5, 3, "input", 70_001),
         ReadRegisters(6, 2, transaction=70_002),
         WriteRegisters(9, (1, 2, 65_535), 70_003),
     ]
     for request in requests:
         driver.send(request)
     came = receive(device, 3)
-    assert came[0] == ReadRegisters(5, 3, RegisterTable.INPUT, 70_001 & 0xFFFF)
+    assert came[0] == ReadRegisters(5, 3, "input", 70_001 & 0xFFFF)
     assert came[2] == WriteRegisters(9, (1, 2, 65_535), 70_003 & 0xFFFF)
     numbers = [unit.transaction for unit in came]
     device.send(RegistersWritten(9, 3, numbers[2]))
