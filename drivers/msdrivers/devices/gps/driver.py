@@ -87,11 +87,7 @@ class GpsStream(FrameScanner[Any]):
 
     def __init__(self) -> None:
         super().__init__((SentenceFormat(), *novatel.FORMATS))
-        self._epochs = EpochAssembler()
-
-    @property
-    def counts(self) -> dict[str, int]:
-        return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
+        self._epochs = EpochAssembler(self.reject)
 
     def feed(self, data: bytes) -> list[GpsMessage]:
         messages: list[GpsMessage] = []

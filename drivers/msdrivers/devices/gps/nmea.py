@@ -414,9 +414,13 @@ class NmeaEpoch(NmeaValues):
 
 
 class EpochAssembler:
-    """Sentences in, epochs out. Memory is bounded by one epoch."""
+    """Sentences in, epochs out. Memory is bounded by one epoch.
 
-    def __init__(self) -> None:
+    reject: counts, as `late`, sentences that are not used: received after their epoch was complete, or too many.
+    """
+
+    def __init__(self, reject: Callable[[str], object]) -> None:
+        self._reject = reject
         self._sentences: list[NmeaSentence] = []
         self._timed: NmeaSentence | None = None
         """The first of them with a time."""
@@ -430,8 +434,6 @@ class EpochAssembler:
         self._is_line_silent = self._starts_after_silence = False
         self._order_counts: Counter[tuple[str, bool]] = Counter()
         """How often a pause showed that a kind of sentence comes first, or not."""
-        self.late = 0
-        """Unused sentences: received after their epoch was complete, or too many."""
 
     def add(self, sentence: NmeaSentence) -> list[NmeaEpoch]:
         """Return the epochs that the sentence completes: at most the one before it, and its own."""
@@ -440,7 +442,7 @@ class EpochAssembler:
         if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._timed:
             closed += self._close(by_end=False)
         if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
-            self.late += 1
+            self._reject("late")
             return closed
         if sentence.day is not None and sentence.time_of_day is not None:
             self._reference = sentence.day * DAY + sentence.time_of_day
