@@ -67,13 +67,6 @@ class GpsSettings(ByteSettings):
         """The names of the logs that a NovAtel receiver is asked for."""
         return (POSITION_LOG, "BESTVEL", *filter(None, [self.heading_log])) if self.protocol == "novatel" else ()
 
-    def make_setup_commands(self) -> tuple[str, ...]:
-        """Return the commands that set the receiver up, in order."""
-        if self.protocol != "novatel":
-            return self.commands
-        wanted = (f"log thisport {log.lower()}b ontime {1.0 / self.rate_hz:.6g}" for log in self.logs)
-        return ("unlogall thisport", *self.commands, *wanted)
-
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
 """Each has `start`: offset of its first byte in the stream, to find its receive time."""
@@ -104,12 +97,7 @@ class GpsStream(FrameScanner[Any]):
         self._epochs.clear()
 
 
-USABLE_TIME = frozenset(novatel.TimeStatus) - {
-    novatel.TimeStatus.UNKNOWN,
-    novatel.TimeStatus.APPROXIMATE,
-    novatel.TimeStatus.COARSEADJUSTING,
-    novatel.TimeStatus.SATTIME,
-}
+USABLE_TIME = {each for each in novatel.TimeStatus if novatel.TimeStatus.COARSE <= each < novatel.TimeStatus.SATTIME}
 """With the other statuses the header's time may be wrong by seconds or years."""
 
 FIX_TYPES: dict[int, FixType] = {
@@ -237,7 +225,7 @@ class GpsDriver(StreamDriver[GpsMessage]):
 
     def _make_identification(self) -> bytes:
         # an end of line first, to flush partial input
-        return b"\r\n" + _encode_command(self._settings.make_setup_commands()[0])
+        return b"\r\n" + _encode_command("unlogall thisport")
 
     def _on_start(self) -> None:
         self._forget_logs()
@@ -345,8 +333,9 @@ class GpsDriver(StreamDriver[GpsMessage]):
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
         self._prompt_until_ns = now.monotonic_ns + round(self.answer_timeout * SECOND_NS)
         if self._setup_step is None:
-            commands = self._settings.make_setup_commands()[1:]
-            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
+            interval = f"{1.0 / self._settings.rate_hz:.6g}"
+            wanted = (f"log thisport {log.lower()}b ontime {interval}" for log in self._settings.logs)
+            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in (*self._settings.commands, *wanted)]
             return self._on_identity("a NovAtel receiver", steps, now)
         fix = "check the settings `commands` and the logs"
         return self._on_acknowledgement(now, f"{answer.error}; {fix}" if answer.error else "")
