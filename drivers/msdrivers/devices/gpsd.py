@@ -138,6 +138,7 @@ class GpsdDriver(StreamDriver[GpsdReport]):
     description = "gpsd"
     awaited = "TPV"
     formats = (GpsdFormat(),)
+    identification = WATCH
     answer_timeout = 2.0
     attempts = 2
 
@@ -152,9 +153,6 @@ class GpsdDriver(StreamDriver[GpsdReport]):
         self._receivers: dict[str, bool] | None = None
         """Paths of gpsd's receivers, and whether it reads them; None while unknown."""
         self._error = ""
-
-    def _make_identification(self) -> bytes:
-        return WATCH
 
     def _on_start(self) -> None:
         self._pending = self._gst = self._receivers = None

@@ -412,6 +412,8 @@ class StreamDriver(ABC, Generic[M]):
     """What it streams, e.g. "NAV-PVT"."""
     formats: ClassVar[Sequence[FrameFormat[Any]]] = ()
     """Those of its frames, unless it has a scanner of its own."""
+    identification = b""
+    """Request for the device's identity; nothing for one that is only read."""
     answer_timeout = 0.5
     """Timeout for an answer, seconds."""
     attempts = 3
@@ -433,10 +435,6 @@ class StreamDriver(ABC, Generic[M]):
         self._next_warning_ns = 0
         self._seq = 0
         self._counts: Counter[str] = Counter()
-
-    def _make_identification(self) -> bytes:
-        """Return the request for the device's identity; nothing for one that is only read."""
-        return b""
 
     @abstractmethod
     def _on_message(self, message: M, now: HostTime) -> list[Output[bytes]]:
@@ -548,7 +546,7 @@ class StreamDriver(ABC, Generic[M]):
         while True:
             self._setup_step, self._first_bytes, seq = None, b"", self._seq
             try:
-                self._product, steps = yield RequestStep(self._make_identification(), *limits)
+                self._product, steps = yield RequestStep(self.identification, *limits)
                 break
             except NoReplyError:
                 if self._seq > seq:

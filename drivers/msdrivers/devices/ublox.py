@@ -297,6 +297,7 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     description = "u-blox receiver"
     awaited = "NAV-PVT"
     formats = (UbxFormat(),)
+    identification = _encode(pyubx2.UBXMessage("MON", "MON-VER", pyubx2.POLL))
 
     def __init__(self, settings: UbloxSettings) -> None:
         super().__init__(settings)
@@ -305,9 +306,6 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         """The messages of the epoch under way, by name."""
         self._itow = self._host_utime = self._deadline_ns = 0
         self._last_itow: int | None = None
-
-    def _make_identification(self) -> bytes:
-        return _encode(pyubx2.UBXMessage("MON", "MON-VER", pyubx2.POLL))
 
     def _on_start(self) -> None:
         self._parts.clear()

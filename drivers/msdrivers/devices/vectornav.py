@@ -223,6 +223,7 @@ class VectornavDriver(StreamDriver[VnMessage]):
     description = "VectorNav unit"
     awaited = "binary output"
     formats = (VnBinaryFormat(), VnTextFormat())
+    identification = encode_text("RRG,01")
     answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
@@ -230,9 +231,6 @@ class VectornavDriver(StreamDriver[VnMessage]):
         self._rate_hz, self._port = settings.rate_hz, settings.unit_port
         self._yaw_source = YawSource.MAGNETIC if settings.heading == "magnetic" else YawSource.NONE
         self._last_ns: int | None = None
-
-    def _make_identification(self) -> bytes:
-        return encode_text("RRG,01")
 
     def _on_start(self) -> None:
         self._last_ns = None

@@ -236,6 +236,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
     description = "Xsens MTi"
     awaited = "MTData2"
     formats = (XbusFormat(),)
+    identification = encode(MessageId.GO_TO_CONFIG)
     attempts = 5
     """Some units do not answer after power-up."""
 
@@ -245,9 +246,6 @@ class XsensDriver(StreamDriver[XbusMessage]):
         self._ticks = SampleTimeUnwrapper()
         self._last_counter: int | None = None
         self._celsius = NAN
-
-    def _make_identification(self) -> bytes:
-        return encode(MessageId.GO_TO_CONFIG)
 
     def _on_start(self) -> None:
         self._last_counter = None

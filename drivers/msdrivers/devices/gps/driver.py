@@ -200,6 +200,8 @@ class GpsDriver(StreamDriver[GpsMessage]):
     fixes published as none for their type. `restarts`.
     """
 
+    # an end of line first, to flush partial input
+    identification = b"\r\nunlogall thisport\r\n"
     answer_timeout = 1.0
     _settings: GpsSettings
     _stream: GpsStream
@@ -222,10 +224,6 @@ class GpsDriver(StreamDriver[GpsMessage]):
         """When the line has paused long enough."""
         self._prompt_until_ns = 0
         """Until then a prompt belongs to a response."""
-
-    def _make_identification(self) -> bytes:
-        # an end of line first, to flush partial input
-        return b"\r\n" + _encode_command("unlogall thisport")
 
     def _on_start(self) -> None:
         self._forget_logs()
