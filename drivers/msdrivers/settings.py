@@ -21,21 +21,11 @@ from typing import Any, get_args
 
 from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
+from msdrivers import registry
 from msdrivers.emulate import InjectedFault
 from msdrivers.endpoint import Endpoint
 from msdrivers.links import Link
-from msdrivers.registry import (
-    KINDS,
-    CanSettings,
-    DeviceKind,
-    EmulatorInputs,
-    LineSettings,
-    NtripSettings,
-    SerialSettings,
-    TcpSettings,
-    get_line_key,
-    split_address,
-)
+from msdrivers.registry import KINDS, DeviceKind, LineSettings, NtripSettings, get_line_key
 
 
 def list_keys(*kinds: type) -> list[str]:
@@ -241,7 +231,7 @@ def read_driver(
         reader.report("baud", "both baud and bauds are given", "keep one of baud or bauds")
     elif baud and "bauds" in station_keys:
         given["bauds"] = [baud]
-    if line is TcpSettings and "bauds" in station_keys:
+    if line is registry.TcpSettings and "bauds" in station_keys:
         # the device server owns the rate; it cannot be changed from here
         given["bauds"] = []
     values = reader.read_values(settings, given)
@@ -268,18 +258,18 @@ def make_link(settings: DriverSettings) -> Link[Any]:
     """Return a driver's line, not opened yet."""
     line = settings.line
     # each kind of line needs another library, and some of them are slow to load
-    if isinstance(line, SerialSettings):
+    if isinstance(line, registry.SerialSettings):
         from msdrivers.links.serial_port import SerialLink
 
         return SerialLink(line.port, choose_first_baud(settings))
-    if isinstance(line, CanSettings):
+    if isinstance(line, registry.CanSettings):
         from msdrivers.links.can_bus import CanLink
 
         return CanLink(line.can, line.interface, line.bitrate)
     from msdrivers.links import TcpLink
 
-    link = TcpLink(*split_address(line.address))
-    if isinstance(line, TcpSettings):
+    link = TcpLink(*registry.split_address(line.address))
+    if isinstance(line, registry.TcpSettings):
         return link
     from msdrivers.links.modbus import ModbusLink
 
@@ -289,7 +279,7 @@ def make_link(settings: DriverSettings) -> Link[Any]:
 def choose_first_baud(settings: DriverSettings) -> int:
     """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
     bauds = getattr(settings.device_settings, "bauds", ())
-    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
+    given = settings.line.baud if isinstance(settings.line, registry.SerialSettings) else 0
     return bauds[0] if bauds else given or settings.kind.baud
 
 
@@ -307,7 +297,7 @@ def make_emulator(
 ) -> Endpoint[Any]:
     """Return the endpoint of the emulated device; see `EmulatorInputs`. Raises ConfigError."""
     with _locate_errors(driver):
-        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults))
+        return driver.kind.make_emulator(registry.EmulatorInputs(driver.device_settings, folder, samples, faults))
 
 
 @contextmanager
@@ -331,10 +321,10 @@ def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
     """Yield lines that several drivers use exclusively; a CAN bus can be shared."""
     owners: dict[Hashable, str] = {}
     for driver in drivers:
-        if isinstance(driver.line, CanSettings):
+        if isinstance(driver.line, registry.CanSettings):
             continue
         # a port has several names, e.g. below /dev/serial/by-id/
-        port = driver.line.port if isinstance(driver.line, SerialSettings) else ""
+        port = driver.line.port if isinstance(driver.line, registry.SerialSettings) else ""
         owner = owners.setdefault(os.path.realpath(port) if port else driver.line, driver.name)
         if owner != driver.name:
             message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"

@@ -32,21 +32,8 @@ from typing import NamedTuple
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
-from msdrivers.devices import check_choice, check_ranges
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    NoReplyError,
-    ParsedFrame,
-    PauseStep,
-    RejectedFrame,
-    RequestStep,
-    Script,
-    ScriptPart,
-    StreamDriver,
-)
+from msdrivers.devices import check_choice, check_ranges, stream
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, FrameScanner, ParsedFrame, RejectedFrame, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 
@@ -350,7 +337,7 @@ _YAW_SOURCES = {"vertical_gyro": YawSource.NONE, "magnetic": YawSource.MAGNETIC}
 
 
 @dataclass(frozen=True, slots=True)
-class CommandStep(RequestStep):
+class CommandStep(stream.RequestStep):
     """A request and the first word of its reply, None for any."""
 
     value: int | None = None
@@ -382,7 +369,7 @@ class UnusableDeviceError(Exception):
     """The device answers, but its data cannot be used."""
 
 
-def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
+def read_words(addresses: Iterable[int]) -> stream.ScriptPart[tuple[int, ...]]:
     """Read words of the EEPROM, unsigned."""
     words: tuple[int, ...] = ()
     for address in addresses:
@@ -391,7 +378,7 @@ def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
     return words
 
 
-def read_gains() -> ScriptPart[Gains]:
+def read_gains() -> stream.ScriptPart[Gains]:
     """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have.
 
     They are read twice: a reply does not contain its address, and a delayed one would pass for the next.
@@ -419,7 +406,7 @@ def read_gains() -> ScriptPart[Gains]:
     return gains
 
 
-def _read_tick() -> ScriptPart[float]:
+def _read_tick() -> stream.ScriptPart[float]:
     words = yield from read_words(EepromAddress.TIMER)
     tick_s = tick_from_timer_words(words)
     if not 1e-3 <= tick_s <= 0.1:
@@ -500,10 +487,10 @@ class GravityCheck:
         return self._count >= self.MIN_SAMPLES
 
 
-TEMPERATURE_PERIOD_NS = 10 * SECOND_NS
+TEMPERATURE_PERIOD_NS = 10 * stream.SECOND_NS
 """Period of the polls of the temperature, which changes within minutes."""
 
-TICK_CHECK_NS = 20 * SECOND_NS
+TICK_CHECK_NS = 20 * stream.SECOND_NS
 TICK_TOLERANCE = 0.05
 """Over 20 s a host that is late by a second seems to change a tick by this much; the device's own two settings of the
 timer differ by 35 %, and `device_clock` follows a drift of 1 %."""
@@ -551,13 +538,13 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         self._setup.stop()
         return [Send(STOP)] if self._is_found else []
 
-    def _run_setup(self) -> Script:
+    def _run_setup(self) -> stream.Script:
         while True:
             self._stream.set_commands(*LAYOUTS)
             self._first_bytes = b""
             try:
                 self._product = yield from self._find_device()
-            except NoReplyError:
+            except stream.NoReplyError:
                 yield from self._try_next_baud()
                 continue
             self._tried, self._is_found = [], True
@@ -569,13 +556,13 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
                 self._tick_s = self._settings.tick or (yield from _read_tick())
                 yield CommandStep(make_stream(self._settings.message), value=self._settings.message)
                 break
-            except NoReplyError as silence:
+            except stream.NoReplyError as silence:
                 why = f"{self._product} fell silent while it was set up: {silence}; check its cable and power"
             except UnusableDeviceError as unusable:
                 why = f"{self._product} cannot be used: {unusable}"
             text = f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
             yield from self._set_status(EndpointPhase.SILENT, text)
-            yield PauseStep(RETRY_DELAY_S)
+            yield stream.PauseStep(RETRY_DELAY_S)
         self._stream.set_commands(self._settings.message, CommandByte.TEMPERATURE)
         self._ticks.reset()
         self._ticks.set_tick(self._tick_s)
@@ -584,13 +571,13 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         self._celsius, self._poll_ns = NAN, self._now.monotonic_ns
         self._restart_silence_timer()
 
-    def _find_device(self) -> ScriptPart[str]:
+    def _find_device(self) -> stream.ScriptPart[str]:
         """Stop what the device streams; return its serial number and firmware."""
-        yield PauseStep(LISTEN_S)
+        yield stream.PauseStep(LISTEN_S)
         if self._first_bytes:
             # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
             yield Send(STOP)
-            yield PauseStep(FLUSH_S)
+            yield stream.PauseStep(FLUSH_S)
         yield CommandStep(STOP, value=0)
         serial = yield CommandStep(bytes((CommandByte.SERIAL,)))
         firmware = yield CommandStep(bytes((CommandByte.FIRMWARE,)))

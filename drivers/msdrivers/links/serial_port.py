@@ -193,11 +193,8 @@ class SerialLink(DescriptorLink):
         # pyserial reports a failed lock only as text
         if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
             users = find_users(path)
-            return LinkError(
-                f"{path} is in use",
-                f"by {', '.join(users)}" if users else "by a process of another user",
-                "end it, or name another port",
-            )
+            holder = ", ".join(users) or "a process of another user"
+            return LinkError(f"{path} is in use", f"by {holder}", "end it, or name another port")
         if number in (errno.EACCES, errno.EPERM):
             return LinkError(f"{path} may not be opened", "permission denied", explain_permission(path))
         if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
