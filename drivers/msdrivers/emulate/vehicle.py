@@ -15,32 +15,14 @@ from itertools import count
 from typing import Any, Final
 
 from modelserver.messages import JointsSample, SensorHeader, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from msdrivers import endpoint
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
 from msdrivers.emulate import InjectedFault, SampleEmulator
-from msdrivers.endpoint import (
-    MAX_READ,
-    MAX_WRITE,
-    CanFrame,
-    Endpoint,
-    EndpointPhase,
-    EndpointStatus,
-    HostTime,
-    ModbusFailure,
-    ModbusRequest,
-    ModbusUnit,
-    Output,
-    ReadRegisters,
-    Registers,
-    RegistersWritten,
-    RegisterTable,
-    Send,
-    WriteRegisters,
-    explain_exception,
-)
+from msdrivers.endpoint import CanFrame, Endpoint, HostTime, ModbusRequest, ModbusUnit, Output, Send
 
 
 class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
@@ -271,15 +253,15 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
         """Power on at the first opening; later the axis has continued."""
         if self._started_ns is None:
             self._started_ns = self._updated_ns = now.monotonic_ns
-        return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
+        return [endpoint.EndpointStatus(endpoint.EndpointPhase.STREAMING, "axis emulated")]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        if not isinstance(unit, ReadRegisters | WriteRegisters):
+        if not isinstance(unit, ModbusRequest):
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
         reply = self._make_exception(unit, code) if code else self._reply(unit)
-        self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
+        self.counts["exceptions" if isinstance(reply, endpoint.ModbusFailure) else "replies"] += 1
         return [Send(reply)]
 
     def _switch_on(self, at_ns: int) -> None:
@@ -336,16 +318,16 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
         return self._direction * rate
 
     def _reply(self, unit: ModbusRequest) -> ModbusUnit:
-        if isinstance(unit, WriteRegisters):
+        if isinstance(unit, endpoint.WriteRegisters):
             return self._write(unit)
         table = self._make_table(unit.table)
         wanted = range(unit.address, unit.address + unit.count)
         # between its registers it has others, which are 0
-        if not 0 < unit.count <= MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
+        if not 0 < unit.count <= endpoint.MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
             return self._make_exception(unit, ILLEGAL_ADDRESS)
-        return Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
+        return endpoint.Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
 
-    def _make_table(self, table: RegisterTable) -> dict[int, int]:
+    def _make_table(self, table: endpoint.RegisterTable) -> dict[int, int]:
         registers = self._registers
         values = self.commanded | {"angle": self._measured_deg, "rate": self._measured_rate}
         present = dict(registers.measured) if table == registers.table else {}
@@ -357,10 +339,10 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
             words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
-    def _write(self, unit: WriteRegisters) -> ModbusUnit:
+    def _write(self, unit: endpoint.WriteRegisters) -> ModbusUnit:
         places = {(mapped.address, mapped.word_count): name for name, mapped in self._registers.commanded.items()}
         name = places.get((unit.address, len(unit.values)))
-        if name is None or len(unit.values) > MAX_WRITE:
+        if name is None or len(unit.values) > endpoint.MAX_WRITE:
             return self._make_exception(unit, ILLEGAL_ADDRESS)
         after = self.commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
         axis, rate = self.unit, after["nod_rate"]
@@ -371,10 +353,10 @@ class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
         if not fits:
             return self._make_exception(unit, ILLEGAL_VALUE)
         self.commanded = after
-        return RegistersWritten(unit.address, len(unit.values), unit.transaction)
+        return endpoint.RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
-    def _make_exception(self, unit: ModbusRequest, code: int) -> ModbusFailure:
-        return ModbusFailure(explain_exception(code), code, unit.transaction)
+    def _make_exception(self, unit: ModbusRequest, code: int) -> endpoint.ModbusFailure:
+        return endpoint.ModbusFailure(endpoint.explain_exception(code), code, unit.transaction)
 
 
 PERIOD_US: Final = 20_000
