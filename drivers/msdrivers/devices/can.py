@@ -645,7 +645,7 @@ class CanDriver(ABC):
         except FrameError as error:
             self.counts[f"rejected.{error.reason}"] += 1
             self._note_useless(f"{self._needed[unit.key]} ({unit.key}) {error.summary}")
-            return self._warn_once(unit.key, f"{error}; such frames are counted and not used")
+            return self._report_once(unit.key, f"{error}; such frames are counted and not used")
         self.counts["frames"] += 1
         # its own receive time, if the interface stamped it
         utime = unit.utime if 0 < unit.utime <= now.utime else now.utime
@@ -671,7 +671,7 @@ class CanDriver(ABC):
             first, second = sorted((source, used))
             what = f"source addresses 0x{first:02X} and 0x{second:02X} send PGN {pgn} ({name})"
             fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
-            outputs = self._warn_once(("sources", key), f"{what}; {fix}")
+            outputs = self._report_once(("sources", key), f"{what}; {fix}")
             if not is_own:
                 return None, outputs
         self._sources[key] = (source, now.monotonic_ns)
@@ -716,12 +716,12 @@ class CanDriver(ABC):
         self.phase = EndpointPhase.STREAMING
         return [EndpointStatus(EndpointPhase.STREAMING, text), measured]
 
-    def _warn_once(self, what: object, text: str) -> list[Output[CanFrame]]:
-        """Return a warning, once for what it is about since the line was opened."""
+    def _report_once(self, what: object, text: str, is_warning: bool = True) -> list[Output[CanFrame]]:
+        """Return a status, once for what it is about since the line was opened."""
         if what in self._reported:
             return []
         self._reported.add(what)
-        return [EndpointStatus(self.phase, text, is_warning=True)]
+        return [EndpointStatus(self.phase, text, is_warning)]
 
     def _note_useless(self, what: str) -> None:
         """Note what is wrong with a frame, or with the frames of an instant."""
@@ -754,7 +754,7 @@ class CanDriver(ABC):
                 )
             else:
                 continue
-            outputs += self._warn_once((signal.path, name), text)
+            outputs += self._report_once((signal.path, name), text)
         return outputs
 
     def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:

@@ -21,7 +21,7 @@ from modelserver.errors import quote
 from modelserver.messages import NAN, Direction, WheelSample, WheelsSample
 from msdrivers.devices import Strict, check_factor, check_ranges, check_signal
 from msdrivers.devices.can import BoundSignal, BusSettings, CanDatabase, CanDriver, CanFrameSet, SignalBinder, SignalMap
-from msdrivers.endpoint import CanFrame, EndpointStatus, HostTime, Output
+from msdrivers.endpoint import CanFrame, HostTime, Output
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +329,8 @@ class WheelsDriver(CanDriver):
 
     A sample holds the frames of one instant; missing and implausible values are nan, a missing direction UNKNOWN. After
     an implausible count or a counter reset one sample or more has no travel; then the travel continues from where it
-    was, without the distance travelled meanwhile (see `odometer`).
+    was, without the distance travelled meanwhile (see `odometer`). The odometers continue when the line was opened
+    again, since the counters may have.
     """
 
     settings: WheelsSettings
@@ -345,12 +346,6 @@ class WheelsDriver(CanDriver):
         self._odometers = {name: odometer for name, odometer in odometers.items() if odometer is not None}
         measured = ("count", "speed", "steering")
         self._measured = [wheel.signals[key] for wheel in self._wheels for key in measured if key in wheel.signals]
-        self._warned: set[tuple[str, str]] = set()
-
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start; the odometers continue, since the counters may have."""
-        self._warned.clear()
-        return super().on_open(now)
 
     def _publish_instant(self, instant: CanFrameSet, now: HostTime) -> list[Output[CanFrame]]:
         warnings = self._check_values(self._measured, instant)
@@ -389,11 +384,8 @@ class WheelsDriver(CanDriver):
         key = reason if reason == "resumed" else f"rejected.{reason}"
         self.counts[key] += 1
         self._reasons[reason] = None
-        if (name, reason) in self._warned:
-            return
-        self._warned.add((name, reason))
         text = f"wheel {name}: {_WARNINGS[reason].format(self.settings.max_speed)}"
-        warnings.append(EndpointStatus(self.phase, text, is_warning=reason != "resumed"))
+        warnings += self._report_once(("wheel", name, reason), text, is_warning=reason != "resumed")
 
 
 _WARNINGS = {
