@@ -103,24 +103,11 @@ class BoundStatus:
     map: StatusMap
     signals: dict[str, BoundSignal]
 
-    def get_mode(self, instant: CanFrameSet) -> VehicleMode:
-        """Return the driving mode; UNKNOWN if it is missing or its number is not mapped."""
-        raw = instant.raw(self.signals.get("mode"))
-        numbers = {number: VehicleMode[name.upper()] for name, number in self.map.modes.items()}
-        return VehicleMode.UNKNOWN if raw is None else numbers.get(int(raw), VehicleMode.UNKNOWN)
-
     def get_number(self, name: str, instant: CanFrameSet) -> float:
         """Return one of `NUMERIC_FIELDS` in SI units; nan if it is missing."""
         physical = instant.physical(self.signals.get(name))
         mapped: SignalMap | None = getattr(self.map, name)
         return NAN if physical is None or mapped is None else mapped.to_si(physical)
-
-    def get_word(self, name: str, instant: CanFrameSet) -> int | None:
-        """Return `fault_bits` or `commands_rejected`: 0 if not mapped, None if not received."""
-        if name not in self.signals:
-            return 0
-        raw = instant.raw(self.signals[name])
-        return None if raw is None else int(raw)
 
 
 def bind_status(status: StatusMap, database: CanDatabase, place: str) -> BoundStatus:
@@ -483,21 +470,24 @@ class VehicleDriver(CanDriver):
         status = self._status
         assert status is not None
         outputs = self._check_values((status.signals.get(name) for name in NUMERIC_FIELDS), instant)
-        faults, rejected = status.get_word("fault_bits", instant), status.get_word("commands_rejected", instant)
+        raw = {name: instant.raw(signal) for name, signal in status.signals.items()}
+        # 0 if not mapped, None if not received
+        faults, rejected = raw.get("fault_bits", 0), raw.get("commands_rejected", 0)
         if faults is None or rejected is None:
             # these have no number for "missing"
             self.counts["rejected.incomplete"] += 1
             self._note_useless("without fault_bits or commands_rejected")
             return outputs
         numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
-        mode = status.get_mode(instant)
+        known = (VehicleMode[name.upper()] for name, number in status.map.modes.items() if number == raw.get("mode"))
+        mode = next(known, VehicleMode.UNKNOWN)
         is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
         if not is_known and not self._has_status_words:
             self._note_empty()
             return outputs
         # the highest of the 32 bits is the sign on the wire
-        faults = (faults + (1 << 31)) % (1 << 32) - (1 << 31)
-        rejected = max(0, rejected + self._rejected)
+        faults = (int(faults) + (1 << 31)) % (1 << 32) - (1 << 31)
+        rejected = max(0, int(rejected) + self._rejected)
         header = self._make_header(instant)
         sample = VehicleStatusSample(header, mode, **numbers, fault_bits=faults, commands_rejected=rejected)
         outputs += self._publish_sample(sample, f"the vehicle controller sends its status; {_MODE_TEXTS[mode]}", now)
