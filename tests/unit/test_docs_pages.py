@@ -22,7 +22,7 @@ from modelserver.estimation.raw.settings import RawSettings
 from modelserver.messages import Invalid
 from modelserver.wire.channels import CHANNELS
 from msdrivers.registry import KINDS
-from msdrivers.settings import COMMON_KEYS, SOURCE_FIELD
+from msdrivers.settings import COMMON_KEYS
 from mstools.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -111,7 +111,7 @@ DEVICES = {
 def test_given_the_page_of_a_device_then_its_tables_have_every_setting(pages: ModuleType, page: str) -> None:
     found = find_names(read(page))
     for name in DEVICES[page]:
-        missing = settings_of(KINDS[name].load().settings) - found - {SOURCE_FIELD, "protocol"}
+        missing = settings_of(KINDS[name].load().settings) - found - {"source", "protocol"}
         assert not missing, f"{page} lacks {missing}"
 
 
