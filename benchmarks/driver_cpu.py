@@ -20,7 +20,7 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import RAPTOR, free_url, print_verdict, run_process
+from benchmarks.support import MODELSERVER, RAPTOR, free_url, print_verdict, run_process
 from modelserver.messages import DriverHealth
 from modelserver.wire.codec import decode
 
@@ -77,8 +77,6 @@ KINDS: dict[str, tuple[str, float]] = {
 }
 """The line of each driver, and the samples a second that it is to bring."""
 
-_RUN = "import sys; sys.stdout = open('/dev/null', 'w'); from mstools.cli import main; main()"
-
 
 def cpu_seconds(pid: int) -> float:
     """Return the CPU time of a process in user and kernel mode."""
@@ -127,8 +125,8 @@ def measure(name: str, line: str) -> tuple[float, float]:
             "tcp": ("--tcp", str(port)),
             "can": ("--can", f"{GROUP}:{port}"),
         }
-        stack.enter_context(run_process("-c", _RUN, "emulate", name, "-c", str(path), *lines[line], url=url))
-        driver = stack.enter_context(run_process("-c", _RUN, "driver", name, "-c", str(path), url=url))
+        stack.enter_context(run_process("-c", MODELSERVER, "emulate", name, "-c", str(path), *lines[line], url=url))
+        driver = stack.enter_context(run_process("-c", MODELSERVER, "driver", name, "-c", str(path), url=url))
         wait(lambda: bool(reports) and reports[-1].samples >= WARM_UP)
         first, begin, used = reports[-1], time.monotonic(), cpu_seconds(driver.pid)
         wait(lambda: time.monotonic() >= begin + SECONDS)

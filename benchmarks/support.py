@@ -38,6 +38,10 @@ def build_large_model(frames: int = 10_000, per_body: int = 20) -> ModelBuilder:
     return builder
 
 
+MODELSERVER = "import sys; sys.stdout = open('/dev/null', 'w'); from mstools.cli import main; main()"
+"""Program of Python that is the command `modelserver`, without its output."""
+
+
 def free_url() -> str:
     """Return an LCM provider on loopback with an unused port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -64,8 +68,10 @@ def run_process(*arguments: str, url: str) -> Iterator[subprocess.Popen[bytes]]:
 @contextlib.contextmanager
 def run_daemon(url: str, config: Path) -> Iterator[Platform]:
     """Run the daemon and return a client that it has answered."""
-    run = "from mstools.cli import main; main()"
-    with run_process("-c", run, "run", "-c", str(config), "--log-level", "error", url=url), Platform(url) as platform:
+    with (
+        run_process("-c", MODELSERVER, "run", "-c", str(config), "--log-level", "error", url=url),
+        Platform(url) as platform,
+    ):
         wait_until_answered(platform)
         yield platform
 

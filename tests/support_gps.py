@@ -75,7 +75,7 @@ class Line:
 
     @property
     def status_text(self) -> str:
-        return "\n".join(f"{each.phase.value}: {each.text}" for each in self.statuses)
+        return "\n".join(f"{each.phase.name.lower()}: {each.text}" for each in self.statuses)
 
     @property
     def phases(self) -> list[EndpointPhase]:

@@ -11,7 +11,7 @@ from modelserver.signing import Key, sign
 from modelserver.wire.codec import encode
 
 KEY = Key("test", bytes(range(32)))
-ALLOWED = "commands: {reload: true, set_pose: true, key_file: commands.key}\n"
+ALLOWED = "commands: {reload: true, frames: true, set_pose: true, key_file: commands.key}\n"
 """For a vehicle file: everything is allowed to who has the key of `write_test_key`."""
 
 

@@ -164,7 +164,7 @@ class Wire(Generic[U]):
         return [each.sample for t, each in self.samples if t >= begin]  # type: ignore[misc]
 
     def status_text(self) -> str:
-        return "\n".join(f"{status.phase.value}: {status.text}" for _, status in self.statuses)
+        return "\n".join(f"{status.phase.name.lower()}: {status.text}" for _, status in self.statuses)
 
     def _step(self) -> None:
         now = at(self.t)

@@ -21,6 +21,7 @@ import logging
 import math
 import re
 import socket
+import ssl
 import threading
 import time
 from base64 import b64encode
@@ -168,7 +169,7 @@ class NtripSession:
         """Return what follows the header; None while it is incomplete."""
         line, end, rest = self._buffer.partition(b"\n")
         if self._buffer.startswith(b"\x15\x03"):  # a TLS alert
-            raise NtripError("the caster wants TLS, which is not supported: use its port without TLS, customarily 2101")
+            raise NtripError("the caster wants TLS at this port: set tls: true")
         if not end:
             if len(self._buffer) > MAX_HEADER:
                 raise NtripError("the server's answer is not that of an NTRIP caster: check caster")
@@ -284,6 +285,25 @@ def make_gga(sample: GpsSample, time_of_day_us: int) -> bytes:
     heights = (nmea.format_number(height if height == height else 0.0, 2), "M", "0.0", "M")
     quality = ("1", str(max(sample.satellites, 4)), "1.0")
     return nmea.encode("GP", "GGA", (nmea.format_time_of_day(time_of_day_us), *place, *quality, *heights, "", ""))
+
+
+def _open_line(settings: NtripSettings) -> socket.socket:
+    """Return a connection to a caster, with TLS once it has proved who it is. Raises OSError, NtripError."""
+    host, _ = address = split_address(settings.caster)
+    context = ssl.create_default_context() if settings.tls else None
+    connection = socket.create_connection(address, CONNECT_TIMEOUT_S)
+    if context is None:
+        return connection
+    try:
+        return context.wrap_socket(connection, server_hostname=host)
+    except ssl.SSLCertVerificationError as error:
+        fix = "check caster and the clock; the certificates of an authority of your own: SSL_CERT_FILE"
+        raise NtripError(
+            f"the certificate of {host} is not valid ({error.verify_message.rstrip('.')}): {fix}"
+        ) from None
+    except ssl.SSLError as error:
+        why = error.reason or error.strerror
+        raise NtripError(f"the caster does not speak TLS ({why}): leave tls out, or give its port with TLS") from None
 
 
 log = logging.getLogger(__name__)
@@ -418,12 +438,10 @@ class CorrectionsClient:
 
     @contextlib.contextmanager
     def _connect(self, mountpoint: str, gga: bytes = b"") -> Iterator[socket.socket]:
-        with contextlib.closing(
-            socket.create_connection(split_address(self._settings.caster), CONNECT_TIMEOUT_S)
-        ) as connection:
-            connection.sendall(encode_request(self._settings, mountpoint, gga))
-            connection.settimeout(POLL_S)
-            yield connection
+        with contextlib.closing(_open_line(self._settings)) as line:
+            line.sendall(encode_request(self._settings, mountpoint, gga))
+            line.settimeout(POLL_S)
+            yield line
 
     def _finish(self, session: NtripSession) -> None:
         try:

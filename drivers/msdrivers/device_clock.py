@@ -252,10 +252,10 @@ class DeviceClock:
 
         `device_us`: the device's time without wraps. `host_us`: receive time on the host's monotonic clock.
         """
-        # no delay lasts as long as a line was closed
-        max_delay_us = STEP_US if self._is_reconnected else MAX_DELAY_US
-        clock = replace(self, _is_reconnected=False) if self._is_reconnected else self
-        return clock._update(device_us, host_us, max_delay_us)
+        if self._is_reconnected:
+            # no delay lasts as long as a line was closed
+            return replace(self, _is_reconnected=False)._update(device_us, host_us, STEP_US)
+        return self._update(device_us, host_us, MAX_DELAY_US)
 
     def _update(self, device_us: int, host_us: int, max_delay_us: float) -> tuple[DeviceClock, int, float]:
         difference = host_us - device_us
@@ -265,15 +265,14 @@ class DeviceClock:
         excess = difference - offset
         usual = self.tick_us + self._fit.jitter + 3.0 * math.sqrt(variance)
         if excess > max_delay_us:
-            return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, 0.0)
+            return self._restart(device_us, difference, 0.0)
         if excess < -usual - SLACK_US:
-            return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, self._step_us + excess)
+            return self._restart(device_us, difference, self._step_us + excess)
         if excess > usual + SLACK_US:
             since = self._delayed_since_us if self._delayed_count else host_us
             late = self._delayed_count + 1
             if late >= MIN_DELAYED_SAMPLES and host_us - since >= MIN_DELAYED_US:
-                clock = replace(self, restarts=self.restarts + 1)
-                return clock._restart(device_us, difference, self._step_us + excess)
+                return self._restart(device_us, difference, self._step_us + excess)
             clock = replace(self, _delayed_count=late, _delayed_since_us=since, _last_us=device_us)
             return clock._estimate(device_us, excess)
         clock = self
@@ -288,6 +287,7 @@ class DeviceClock:
         block = _start_block(ClockOffsetSample(device_us, difference), difference)
         clock = replace(
             self,
+            restarts=self.restarts + (self._fit is not None),
             _blocks=(block,),
             _fit=fit_lower_envelope((block,), device_us, 0.0, self.max_drift),
             _last_us=device_us,

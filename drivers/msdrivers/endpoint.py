@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from modelserver.messages import Sample, VehicleCommand
+from modelserver.messages import DriverPhase, Sample, VehicleCommand
 
 
 class HostTime(NamedTuple):
@@ -36,17 +35,11 @@ class TimeSource(Protocol):
         """Wait."""
 
 
-class EndpointPhase(Enum):
-    """Phase of the connection to the device."""
-
-    WAITING = "waiting"
-    """Nothing received since the line was opened."""
-    CONFIGURING = "configuring"
-    """The device answers and is being configured."""
-    STREAMING = "streaming"
-    """Samples arrive."""
-    SILENT = "silent"
-    """The device has stopped to speak, or speaks what cannot be used."""
+EndpointPhase: TypeAlias = DriverPhase
+"""Phase of the connection to the device. WAITING: nothing received since the line was opened. CONFIGURING: the device
+answers and is being configured. STREAMING: samples arrive. SILENT: the device has stopped to speak, or speaks what
+cannot be used. CLOSED is the runner's.
+"""
 
 
 U = TypeVar("U")
@@ -172,10 +165,8 @@ class CanFrame:
         return self.is_error and bool(self.arbitration_id & BUS_OFF)
 
 
-def make_bus_off_frame() -> CanFrame:
-    """Make the error frame of an interface that went bus-off."""
-    return CanFrame(BUS_OFF, is_error=True)
-
+BUS_OFF_FRAME = CanFrame(BUS_OFF, is_error=True)
+"""The error frame of an interface that went bus-off."""
 
 MAX_READ = 125
 MAX_WRITE = 123
@@ -184,24 +175,9 @@ MAX_WRITE = 123
 LAST_ADDRESS = 0xFFFF
 
 
-class RegisterTable(Enum):
-    """Table of a register; each table has its own addresses."""
-
-    HOLDING = "holding"
-    """Read and written (functions 3 and 16)."""
-    INPUT = "input"
-    """Only read (function 4)."""
-
-
-class FailureKind(Enum):
-    """Why there is no reply."""
-
-    EXCEPTION = "exception"
-    """The device rejected the request; see `code`."""
-    TIMEOUT = "silence"
-    """No reply in time."""
-    LINE = "line"
-    """The line failed, or the data was not Modbus."""
+RegisterTable: TypeAlias = Literal["holding", "input"]
+"""Table of a register; each has its own addresses. holding: read and written (functions 3 and 16). input: only read
+(function 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +186,7 @@ class ReadRegisters:
 
     address: int
     count: int
-    table: RegisterTable = RegisterTable.HOLDING
+    table: RegisterTable = "holding"
     transaction: int = 0
 
 
@@ -243,15 +219,15 @@ class RegistersWritten:
 
 @dataclass(frozen=True, slots=True)
 class ModbusFailure:
-    """A request without reply; `code` is the device's for an EXCEPTION."""
+    """An exception by which the device rejects a request; with code 0 the line failed, or the data was not Modbus."""
 
-    kind: FailureKind
     text: str = ""
     code: int = 0
     transaction: int = 0
 
 
-ModbusUnit: TypeAlias = ReadRegisters | WriteRegisters | Registers | RegistersWritten | ModbusFailure
+ModbusRequest: TypeAlias = ReadRegisters | WriteRegisters
+ModbusUnit: TypeAlias = ModbusRequest | Registers | RegistersWritten | ModbusFailure
 
 EXCEPTION_TEXTS = {
     1: "it does not know the function: use the other table (holding, input)",
@@ -271,7 +247,7 @@ def explain_exception(code: int) -> str:
     return f"exception {code}: {EXCEPTION_TEXTS.get(code, 'a code that the standard does not have; see its manual')}"
 
 
-def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bool:
+def is_reply_to(unit: ModbusUnit, request: ModbusRequest) -> bool:
     """Return whether a unit is a reply to a request: of its kind, with its address and number of registers."""
     if isinstance(request, ReadRegisters):
         return (
@@ -282,7 +258,7 @@ def is_reply_to(unit: ModbusUnit, request: ReadRegisters | WriteRegisters) -> bo
     return isinstance(unit, RegistersWritten) and (unit.address, unit.count) == (request.address, len(request.values))
 
 
-def describe_request(request: ReadRegisters | WriteRegisters) -> str:
+def describe_request(request: ModbusRequest) -> str:
     if isinstance(request, ReadRegisters):
-        return f"reading {request.count} {request.table.value} registers from {request.address}"
+        return f"reading {request.count} {request.table} registers from {request.address}"
     return f"writing {len(request.values)} registers from {request.address}"

@@ -98,7 +98,7 @@ class NtripSettings:
     """A caster and its mountpoint. Raises ValueError for an invalid value."""
 
     caster: str
-    """`HOST:PORT` of the caster; the port is customarily 2101."""
+    """`HOST:PORT` of the caster; the port is customarily 2101, with TLS 2102 or 443."""
     mountpoint: str
     """Name of the stream."""
     user: str = ""
@@ -108,6 +108,8 @@ class NtripSettings:
     gga_period: float | None = None
     """Seconds between positions that are sent to the caster, which networks of stations (VRS) need; None: 10 for a
     stream that sends nothing and needs them by the source table; 0: none."""
+    tls: bool = False
+    """Whether the caster's port is one with TLS; without it the password is sent readable."""
 
     def __post_init__(self) -> None:
         try:
@@ -250,32 +252,35 @@ class DeviceKind:
     takes_corrections: bool = False
 
 
-def _load(module: str, prefix: str, has_dbc: bool = False) -> Callable[[], DeviceModules]:
-    """Return a function that imports the settings and the driver of a kind, below `msdrivers.devices`."""
+def _make_kind(
+    name: str,
+    description: str,
+    sample: type[Sample],
+    lines: tuple[type[LineSettings], ...],
+    driver: str,
+    baud: int = 0,
+    **more: Any,
+) -> DeviceKind:
+    """Return a kind of `msdrivers.devices`; its driver is given as MODULE.PREFIX, and imported on demand."""
+    module, _, prefix = driver.rpartition(".")
+
+    def load_databases(settings: Any, folder: Path) -> tuple[CanDatabase, ...]:
+        return (_load_dbc(settings, folder),) if CanSettings in lines else ()
 
     def load() -> DeviceModules:
         device = import_module(f"msdrivers.devices.{module}")
         make = getattr(device, f"{prefix}Driver")
         return DeviceModules(
-            getattr(device, f"{prefix}Settings"),
-            lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])),
+            getattr(device, f"{prefix}Settings"), lambda values, folder: make(values, *load_databases(values, folder))
         )
 
-    return load
-
-
-def _emulate(
-    module: str, make: Callable[[Any, EmulatorInputs], Endpoint[Any]]
-) -> Callable[[EmulatorInputs], Endpoint[Any]]:
-    """Return a function that imports a module below `msdrivers.emulate` and makes the emulator of a kind."""
-
     def make_emulator(inputs: EmulatorInputs) -> Endpoint[Any]:
-        emulators = import_module(f"msdrivers.emulate.{module}")
+        emulators = import_module(f"msdrivers.emulate.{_EMULATORS.get(sample, 'vehicle')}").EMULATORS
         # one series for the device before and after a restart
-        inputs = inputs._replace(samples=iter(inputs.samples))
-        return FaultInjector(lambda: make(emulators, inputs), inputs.faults)
+        parts = (inputs.settings, iter(inputs.samples), *load_databases(inputs.settings, inputs.folder))
+        return FaultInjector(lambda: emulators[name](*parts), inputs.faults)
 
-    return make_emulator
+    return DeviceKind(name, description, sample, lines, load, make_emulator, baud, **more)
 
 
 def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
@@ -298,159 +303,95 @@ def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
     return parse_dbc(text, str(file))
 
 
-_CAN_FAULTS = {**FAULT_AMOUNTS, "jump": "counts by which counters jump", "bus_off": "seconds for which the bus is left"}
+_EMULATORS: Mapping[type[Sample], str] = {GpsSample: "gps", ImuSample: "imu"}
+"""Module of the emulators below `msdrivers.emulate`; the others are of the vehicle."""
 
-_BYTE_LINES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
+_CAN_FAULTS = {**FAULT_AMOUNTS, "jump": "counts by which counters jump", "bus_off": "seconds for which the bus is left"}
+_GX1_FAULTS = {**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"}
+_AXIS_FAULTS = {
+    **FAULT_AMOUNTS,
+    "jump": "degrees by which its angle jumps",
+    "exception": "the code that a request gets",
+}
+
+_GPS, _NOVATEL, _NMEA = "gps.driver.Gps", {"protocol": "novatel"}, {"protocol": "nmea"}
+
+_TEXT_IMU_EXAMPLE = (
+    "columns: 7   # MEASURE: the columns of a line: time, force x y z, rate x y z",
+    "fields:",
+    "  time: {column: 0, scale: 0.001}   # milliseconds",
+    "  specific_force_x: {column: 1, scale: 9.80665}   # g",
+    "  specific_force_y: {column: 2, scale: 9.80665}",
+    "  specific_force_z: {column: 3, scale: 9.80665}",
+    "  angular_velocity_x: {column: 4, scale: 0.0174533}   # degrees per second",
+    "  angular_velocity_y: {column: 5, scale: 0.0174533}",
+    "  angular_velocity_z: {column: 6, scale: 0.0174533}",
+)
+
+_BYTES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
+_CAN = (CanSettings,)
 
 _KINDS = (
-    DeviceKind(
-        "ublox",
-        "u-blox receiver, by its protocol UBX",
-        GpsSample,
-        _BYTE_LINES,
-        _load("ublox", "Ublox"),
-        _emulate("gps", lambda emulators, inputs: emulators.UbloxEmulator(inputs.samples)),
-        38400,
-        takes_corrections=True,
+    _make_kind(
+        "ublox", "u-blox receiver, by its protocol UBX", GpsSample, _BYTES, "ublox.Ublox", 38400, takes_corrections=True
     ),
-    *(
-        DeviceKind(
-            name,
-            text,
-            GpsSample,
-            _BYTE_LINES,
-            _load("gps.driver", "Gps"),
-            _emulate("gps", lambda emulators, inputs: emulators.make_gps_emulator(inputs.settings, inputs.samples)),
-            baud,
-            presets={"protocol": name},
-            takes_corrections=True,
-        )
-        for name, text, baud in (
-            ("novatel", "NovAtel OEM4 and heirs", 9600),
-            ("nmea", "receiver that speaks NMEA 0183", 4800),
-        )
+    _make_kind(
+        "novatel", "NovAtel OEM4 and heirs", GpsSample, _BYTES, _GPS, 9600, presets=_NOVATEL, takes_corrections=True
     ),
-    DeviceKind(
-        "gpsd",
-        "gpsd, by its JSON reports",
-        GpsSample,
-        (TcpSettings,),
-        _load("gpsd", "Gpsd"),
-        _emulate("gps", lambda emulators, inputs: emulators.GpsdEmulator(inputs.samples)),
+    _make_kind(
+        "nmea", "receiver that speaks NMEA 0183", GpsSample, _BYTES, _GPS, 4800, presets=_NMEA, takes_corrections=True
     ),
-    DeviceKind(
+    _make_kind("gpsd", "gpsd, by its JSON reports", GpsSample, (TcpSettings,), "gpsd.Gpsd"),
+    _make_kind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
-        _BYTE_LINES,
-        _load("gx1", "Gx1"),
-        _emulate("imu", lambda emulators, inputs: emulators.Gx1Emulator(inputs.samples)),
+        _BYTES,
+        "gx1.Gx1",
         38400,
-        faults={**FAULT_AMOUNTS, "jump": "ticks by which its time jumps"},
+        faults=_GX1_FAULTS,
         has_z_down=True,
     ),
-    DeviceKind(
-        "vectornav",
-        "VectorNav VN-100 inertial unit",
-        ImuSample,
-        _BYTE_LINES,
-        _load("vectornav", "Vectornav"),
-        _emulate("imu", lambda emulators, inputs: emulators.VectornavEmulator(inputs.samples)),
-        115200,
-        has_z_down=True,
+    _make_kind(
+        "vectornav", "VectorNav VN-100 inertial unit", ImuSample, _BYTES, "vectornav.Vectornav", 115200, has_z_down=True
     ),
-    DeviceKind(
-        "xsens",
-        "Xsens MTi inertial unit",
-        ImuSample,
-        _BYTE_LINES,
-        _load("xsens", "Xsens"),
-        _emulate(
-            "imu",
-            lambda emulators, inputs: emulators.XsensEmulator(
-                inputs.samples, field_strength=inputs.settings.field_strength or 5e-5
-            ),
-        ),
-        115200,
-    ),
-    DeviceKind(
+    _make_kind("xsens", "Xsens MTi inertial unit", ImuSample, _BYTES, "xsens.Xsens", 115200),
+    _make_kind(
         "text_imu",
         "inertial unit that sends lines of text",
         ImuSample,
-        _BYTE_LINES,
-        _load("text", "TextImu"),
-        _emulate("imu", lambda emulators, inputs: emulators.TextImuEmulator(inputs.samples, inputs.settings)),
+        _BYTES,
+        "text.TextImu",
         115200,
-        example=(
-            "columns: 7   # MEASURE: the columns of a line: time, force x y z, rate x y z",
-            "fields:",
-            "  time: {column: 0, scale: 0.001}   # milliseconds",
-            "  specific_force_x: {column: 1, scale: 9.80665}   # g",
-            "  specific_force_y: {column: 2, scale: 9.80665}",
-            "  specific_force_z: {column: 3, scale: 9.80665}",
-            "  angular_velocity_x: {column: 4, scale: 0.0174533}   # degrees per second",
-            "  angular_velocity_y: {column: 5, scale: 0.0174533}",
-            "  angular_velocity_z: {column: 6, scale: 0.0174533}",
-        ),
+        example=_TEXT_IMU_EXAMPLE,
     ),
-    DeviceKind(
-        "wheels",
-        "wheels on a CAN bus, by a DBC file",
-        WheelsSample,
-        (CanSettings,),
-        _load("wheels", "Wheels", True),
-        _emulate(
-            "vehicle",
-            lambda emulators, inputs: emulators.WheelsEmulator(
-                inputs.settings.wheels, _load_dbc(inputs.settings, inputs.folder), inputs.samples
-            ),
-        ),
-        faults=_CAN_FAULTS,
-    ),
-    DeviceKind(
+    _make_kind("wheels", "wheels on a CAN bus, by a DBC file", WheelsSample, _CAN, "wheels.Wheels", faults=_CAN_FAULTS),
+    _make_kind(
         "vehicle",
         "vehicle controller on a CAN bus, by a DBC file",
         VehicleStatusSample,
-        (CanSettings,),
-        _load("vehicle", "Vehicle", True),
-        _emulate(
-            "vehicle",
-            lambda emulators, inputs: emulators.VehicleEmulator(
-                _load_dbc(inputs.settings, inputs.folder),
-                inputs.settings.status,
-                inputs.settings.command,
-                samples=inputs.samples,
-            ),
-        ),
+        _CAN,
+        "vehicle.Vehicle",
         command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
     ),
-    DeviceKind(
+    _make_kind(
         "text_joints",
         "pan-tilt head or other joints that send lines of text",
         JointsSample,
-        _BYTE_LINES,
-        _load("text", "TextJoints"),
-        _emulate("vehicle", lambda emulators, inputs: emulators.TextJointsEmulator(inputs.settings)),
+        _BYTES,
+        "text.TextJoints",
         115200,
         follows_samples=False,
     ),
-    DeviceKind(
+    _make_kind(
         "axis",
         "nodding axis behind Modbus/TCP",
         JointsSample,
         (ModbusSettings,),
-        _load("axis", "Axis"),
-        _emulate(
-            "vehicle",
-            lambda emulators, inputs: emulators.AxisEmulator(inputs.settings.registers),
-        ),
+        "axis.Axis",
         follows_samples=False,
-        faults={
-            **FAULT_AMOUNTS,
-            "jump": "degrees by which its angle jumps",
-            "exception": "the code that a request gets",
-        },
+        faults=_AXIS_FAULTS,
     ),
 )
 

@@ -76,7 +76,8 @@ MAX_LOGGED_STATES = 100
 class HealthReporter:
     """Tracks the status of one driver and calls `send` when a report is due. Times in seconds."""
 
-    def __init__(self, source: str, silence: float, period: float, now: HostTime, send: Callable[[HostTime], object]):
+    def __init__(self, source: str, silence: float, period: float, time: TimeSource, send: Callable[[], object]):
+        now = time.now()
         self.samples = 0
         self.rate_hz = 0.0
         self.is_silent = False
@@ -86,8 +87,9 @@ class HealthReporter:
         self.next_report_ns = now.monotonic_ns
         """Deadline of the next report, monotonic nanoseconds."""
         self._source, self._silence, self._period_ns = source, silence, round(period * 1e9)
-        self._send = send
-        self._sample_ns: int | None = None
+        self._time_source, self._send = time, send
+        self.sample_ns: int | None = None
+        """When the last sample was published, monotonic nanoseconds."""
         self._counted_ns, self._counted = now.monotonic_ns, 0
         self._phase, self._text, self._is_warning = DriverPhase.CLOSED, "not opened yet", False
         self._last_warning = ""
@@ -106,15 +108,7 @@ class HealthReporter:
             text += f"; before that: {self._last_warning}"
         return phase, text
 
-    def sample_age(self, now: HostTime) -> float:
-        """Return the seconds since the last sample; nan before the first."""
-        return NAN if self._sample_ns is None else (now.monotonic_ns - self._sample_ns) * 1e-9
-
-    def count_sample(self, now: HostTime) -> None:
-        self.samples += 1
-        self._sample_ns = now.monotonic_ns
-
-    def set_status(self, phase: DriverPhase, text: str, now: HostTime, *, is_warning: bool = False) -> None:
+    def set_status(self, phase: DriverPhase, text: str, is_warning: bool = False) -> None:
         """Set phase and text and report a change.
 
         A warning is repeated with a silence that follows it, until data arrives or the line is reopened.
@@ -124,11 +118,10 @@ class HealthReporter:
         elif phase in (DriverPhase.WAITING, DriverPhase.STREAMING):
             self._last_warning = ""
         self._phase, self._text, self._is_warning = phase, text, is_warning
-        self.report_change(now)
+        self.report_change()
 
-    def report_change(self, now: HostTime) -> None:
-        """Log and report a change, if there is one."""
-        state = self.state
+    def report_change(self) -> None:
+        now, state = self._time_source.now(), self.state
         if state == self._reported:
             return
         self._reported, self._changed_ns = state, now.monotonic_ns
@@ -136,14 +129,14 @@ class HealthReporter:
         if self._changes > MAX_CHANGES_PER_PERIOD and not self.is_ending:
             return
         # at a start the device may appear after its driver: what is wrong then is logged once it lasts (`on_timer`)
-        is_starting = self._sample_ns is None and now.monotonic_ns - self._started_ns < STABLE_NS
+        is_starting = self.sample_ns is None and now.monotonic_ns - self._started_ns < STABLE_NS
         is_new = now.monotonic_ns - self._logged_ns.get(state, -LOG_INTERVAL_NS) >= LOG_INTERVAL_NS
         if self.is_ending or (is_new and not (is_starting and self._is_bad)):
             self._log(now)
-        self._send(now)
+        self._send()
 
-    def on_timer(self, now: HostTime) -> None:
-        """Send the regular report if it is due."""
+    def on_timer(self) -> None:
+        now = self._time_source.now()
         if now.monotonic_ns < self.next_report_ns:
             return
         if self.state != self._logged and now.monotonic_ns - self._changed_ns >= STABLE_NS:
@@ -153,7 +146,7 @@ class HealthReporter:
         since = (now.monotonic_ns - self._counted_ns) * 1e-9
         self.rate_hz = (self.samples - self._counted) / since if since > 0 else 0.0
         self._counted_ns, self._counted = now.monotonic_ns, self.samples
-        self._send(now)
+        self._send()
 
     @property
     def _is_bad(self) -> bool:
@@ -176,48 +169,6 @@ STABLE_NS = 5_000_000_000
 
 MIN_FAILURES_REPORTED = 3
 """Consecutive failed attempts from which on the status text mentions them."""
-
-
-class ReconnectBackoff:
-    """Exponential backoff with jitter for opening a line. Waits in seconds, instants in monotonic nanoseconds."""
-
-    def __init__(self, min_wait: float, max_wait: float, rng: random.Random):
-        self._min_wait, self._max_wait, self._rng = min_wait, max_wait, rng
-        self._wait = min_wait
-        self._opened_ns: int | None = None
-        self._failures = 0
-
-    def on_open(self, at_ns: int) -> None:
-        self._opened_ns = at_ns
-
-    def is_stable(self, at_ns: int) -> bool:
-        """Return whether the line is stable; if so, reset the backoff."""
-        if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
-            return False
-        self._wait, self._failures = self._min_wait, 0
-        return True
-
-    def on_lost(self, at_ns: int, *, is_orderly: bool = False) -> float:
-        """Return how long to wait before the next attempt; 0 only for an orderly close of a stable line.
-
-        A lost line always waits: a program that competes for it must not cause a busy loop.
-        """
-        was_stable = self.is_stable(at_ns)
-        if self._opened_ns is not None and not was_stable:
-            self._failures += 1
-        self._opened_ns = None
-        if is_orderly and was_stable:
-            return 0.0
-        wait, self._wait = self._wait, min(self._wait * 2.0, self._max_wait)
-        return wait * self._rng.uniform(0.8, 1.2)
-
-    def on_rate_change(self) -> None:
-        """Record that the line was closed to change the baud rate: neither failure nor success."""
-        self._opened_ns = None
-
-    @property
-    def is_failing(self) -> bool:
-        return self._failures >= MIN_FAILURES_REPORTED
 
 
 MAX_COUNTERS = 200
@@ -284,7 +235,9 @@ class Runner(Generic[U]):
         self._endpoint, self._settings, self._time_source = endpoint, settings, time_source
         self._link = link
         self._publish, self._publish_health = publish, publish_health
-        self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
+        self._rng = rng or random.Random()
+        self._wait_s, self._failures = settings.min_backoff, 0
+        self._opened_ns: int | None = None
         max_silence = getattr(endpoint, "max_silence", 0.0)
         self._silence = max(settings.silence, max_silence)
         self._reopen_timeout = max(settings.reopen_timeout, 2.0 * max_silence)
@@ -292,9 +245,9 @@ class Runner(Generic[U]):
         self._is_stopping, self._close_reason = False, "ended"
         self._is_open = self._was_open = False
         self._baud: int | None = None
-        now = time_source.now()
-        self._open_ns = self._received_ns = now.monotonic_ns
-        self._reporter = HealthReporter(settings.source, self._silence, settings.report_period, now, self._send_report)
+        self._open_ns = self._received_ns = time_source.now().monotonic_ns
+        period, send = settings.report_period, self._send_report
+        self._reporter = HealthReporter(settings.source, self._silence, period, time_source, send)
 
     @property
     def samples(self) -> int:
@@ -330,7 +283,7 @@ class Runner(Generic[U]):
         if not self._is_open:
             self.counts["units_dropped"] += 1
             return
-        self._execute_guarded("send", lambda: [Send(unit)])
+        self._call_guarded("send", lambda: [Send(unit)])
 
     def _dispatch_command(self, call: Callable[[CommandableEndpoint[U], HostTime], Sequence[Output[U]]]) -> None:
         endpoint = self._endpoint
@@ -338,7 +291,7 @@ class Runner(Generic[U]):
             self.counts["commands_dropped"] += 1
             return
         now = self._time_source.now()
-        self._execute_guarded("on_command", lambda: call(endpoint, now))
+        self._call_guarded("on_command", lambda: call(endpoint, now))
 
     def run_once(self) -> None:
         """Make one pass: open the line or process its input, fire the endpoint's timer, report health."""
@@ -353,7 +306,7 @@ class Runner(Generic[U]):
                 self.stop()
             except LinkError as error:
                 self._close(str(error))
-        self._reporter.on_timer(self._time_source.now())
+        self._reporter.on_timer()
 
     def _open_when_due(self) -> None:
         now = self._time_source.now()
@@ -373,13 +326,14 @@ class Runner(Generic[U]):
         self._is_open = self._was_open = True
         now = self._time_source.now()
         self._received_ns = now.monotonic_ns
-        self._backoff.on_open(now.monotonic_ns)
-        self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
-        self._execute_guarded("on_open", lambda: self._endpoint.on_open(now))
+        self._opened_ns = now.monotonic_ns
+        self._reporter.set_status(DriverPhase.WAITING, f"{self._link.description} is open")
+        self._call_guarded("on_open", lambda: self._endpoint.on_open(now))
 
-    def _execute_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+    def _call_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+        """Call the endpoint; an error of the link closes the line."""
         try:
-            self._execute(self._call_endpoint(what, call))
+            self._call(what, call)
         except LinkError as error:
             self._close(str(error))
 
@@ -392,13 +346,26 @@ class Runner(Generic[U]):
         """Close the line and schedule its reopening: at once to change the baud rate, else when the backoff allows."""
         self._close_line()
         at_ns = self._time_source.now().monotonic_ns
-        if changes_baud:
-            self._backoff.on_rate_change()
-        wait = 0.0 if changes_baud else self._backoff.on_lost(at_ns, is_orderly=is_orderly)
+        is_stable = self._check_stability(at_ns)
+        # a change of the baud rate is neither failure nor success
+        self._failures += self._opened_ns is not None and not is_stable and not changes_baud
+        self._opened_ns = None
+        wait = 0.0
+        # a lost line always waits: a program that competes for it must not cause a busy loop
+        if not changes_baud and not (is_orderly and is_stable):
+            wait = self._wait_s * self._rng.uniform(0.8, 1.2)
+            self._wait_s = min(self._wait_s * 2.0, self._settings.max_backoff)
         self._open_ns = at_ns + round(wait * 1e9)
-        if self._backoff.is_failing:
+        if self._failures >= MIN_FAILURES_REPORTED:
             reason += "; it is opened and closed again and again: does another program use it?"
-        self._set_status(DriverPhase.CLOSED, reason)
+        self._reporter.set_status(DriverPhase.CLOSED, reason)
+
+    def _check_stability(self, at_ns: int) -> bool:
+        """Return whether the line is stable; if so, reset the backoff."""
+        if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
+            return False
+        self._wait_s, self._failures = self._settings.min_backoff, 0
+        return True
 
     def _close_line(self) -> None:
         with contextlib.suppress(LinkError), self._guard_link("close"):
@@ -415,21 +382,21 @@ class Runner(Generic[U]):
         if units:
             self._received_ns, self._reporter.is_silent = now.monotonic_ns, False
         for unit in units:
-            self._execute(self._call_endpoint("on_receive", lambda unit=unit: self._endpoint.on_receive(unit, now)))  # type: ignore[misc]
+            self._call("on_receive", lambda unit=unit: self._endpoint.on_receive(unit, now))  # type: ignore[misc]
             if not self._is_open:
                 return
         due = self._endpoint.get_deadline()
         if due is not None and now.monotonic_ns >= due:
-            self._execute(self._call_endpoint("on_timer", lambda: self._endpoint.on_timer(now)))
+            self._call("on_timer", lambda: self._endpoint.on_timer(now))
         self._check_silence(now)
 
-    def _call_endpoint(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> Sequence[Output[U]]:
-        """Call the endpoint; an exception is counted and logged, and the driver continues."""
+    @contextlib.contextmanager
+    def _continue_on_error(self, what: str) -> Iterator[None]:
+        """Count and log an exception; the driver continues."""
         try:
-            return call()
+            yield
         except Exception:
             self._count_error(what)
-            return ()
 
     @contextlib.contextmanager
     def _guard_link(self, what: str) -> Iterator[None]:
@@ -451,7 +418,11 @@ class Runner(Generic[U]):
         if str(count).strip("0") == "1":
             log.exception("%s: internal error number %d in %s", self._settings.source, count, what)
 
-    def _execute(self, outputs: Sequence[Output[U]]) -> None:
+    def _call(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
+        """Call the endpoint and execute its outputs. Raises LinkError."""
+        outputs: Sequence[Output[U]] = ()
+        with self._continue_on_error(what):
+            outputs = call()
         for output in outputs:
             if isinstance(output, Send):
                 with self._guard_link("send"):
@@ -459,37 +430,30 @@ class Runner(Generic[U]):
             elif isinstance(output, MeasuredSample):
                 self._publish_sample(output)
             elif isinstance(output, EndpointStatus):
-                self._set_status(DriverPhase[output.phase.name], output.text, output.is_warning)
+                self._reporter.set_status(output.phase, output.text, output.is_warning)
             else:
                 self._reopen(output)
                 return
 
     def _publish_sample(self, measured: MeasuredSample) -> None:
         now = self._time_source.now()
-        try:
+        with self._continue_on_error("publish"):
             self._publish(self._stamper.stamp(measured, now))
-        except Exception:
-            self._count_error("publish")
-            return
-        self._reporter.count_sample(now)
+            self._reporter.samples += 1
+            self._reporter.sample_ns = now.monotonic_ns
 
     def _check_silence(self, now: HostTime) -> None:
-        self._backoff.is_stable(now.monotonic_ns)
+        self._check_stability(now.monotonic_ns)
         quiet = (now.monotonic_ns - self._received_ns) * 1e-9
         if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True
-            self._reporter.report_change(now)
+            self._reporter.report_change()
         if quiet >= self._reopen_timeout:
             self._reopen(Reopen(f"nothing received for {quiet:.0f} s"))
 
-    def _set_status(self, phase: DriverPhase, text: str, is_warning: bool = False) -> None:
-        self._reporter.set_status(phase, text, self._time_source.now(), is_warning=is_warning)
-
-    def _send_report(self, now: HostTime) -> None:
-        try:
-            self._publish_health(self.make_health(now))
-        except Exception:
-            self._count_error("report")
+    def _send_report(self) -> None:
+        with self._continue_on_error("report"):
+            self._publish_health(self.make_health(self._time_source.now()))
 
     def make_health(self, now: HostTime) -> DriverHealth:
         phase, text = self._reporter.state
@@ -505,7 +469,7 @@ class Runner(Generic[U]):
             reconnects=self.reconnects,
             samples=self.samples,
             rate_hz=self._reporter.rate_hz,
-            age=self._reporter.sample_age(now),
+            age=NAN if self._reporter.sample_ns is None else (now.monotonic_ns - self._reporter.sample_ns) * 1e-9,
             clock_offset=self._stamper.offset,
             clock_drift=clock.drift,
             clock_sigma=self._stamper.sigma,
@@ -517,11 +481,11 @@ class Runner(Generic[U]):
         if self._is_open:
             now = self._time_source.now()
             try:
-                self._execute(self._call_endpoint("on_close", lambda: self._endpoint.on_close(now)))
+                self._call("on_close", lambda: self._endpoint.on_close(now))
             except LinkError as error:
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._close_line()
-        self._set_status(DriverPhase.CLOSED, self._close_reason)
+        self._reporter.set_status(DriverPhase.CLOSED, self._close_reason)
 
 
 COMMAND_TYPE = "vehicle_command_t"

@@ -20,33 +20,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 from modelserver.config.reader import Path_, SettingsReader, get_value, list_known_keys
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    Problem,
-    Severity,
-    Suggestion,
-    find_suggestion,
-    quote,
-    suggest_key,
-    suggest_name,
-)
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
+from msdrivers import registry
 from msdrivers.emulate import InjectedFault
 from msdrivers.endpoint import Endpoint
 from msdrivers.links import Link
-from msdrivers.registry import (
-    KINDS,
-    CanSettings,
-    DeviceKind,
-    EmulatorInputs,
-    LineSettings,
-    ModbusSettings,
-    NtripSettings,
-    SerialSettings,
-    TcpSettings,
-    get_line_key,
-    split_address,
-)
+from msdrivers.registry import KINDS, DeviceKind, LineSettings, NtripSettings, get_line_key
 
 
 def list_keys(*kinds: type) -> list[str]:
@@ -74,12 +53,11 @@ class SectionReader(SettingsReader):
         known = f"kinds: {', '.join(kinds)}"
         if given is None:
             self.report("device", "device is missing", f"add a line: device: ... ({known})")
+        elif given in KINDS.problems:
+            why = f"device {quote(str(given))} of an installed package cannot be used: {KINDS.problems[given]}"
+            self.report("device", why, "repair or reinstall that package")
         else:
             near = suggest_name(str(given), kinds)
-            if given in KINDS.problems:
-                why = f"device {quote(str(given))} of an installed package cannot be used: {KINDS.problems[given]}"
-                self.report("device", why, "repair or reinstall that package")
-                raise ConfigError(self.problems)
             self.report("device", f"unknown device {quote(str(given))}", f"write {near[0]}" if near else known, near)
         raise ConfigError(self.problems)
 
@@ -154,13 +132,6 @@ class SectionReader(SettingsReader):
         """Turn one of pydantic's errors into problems; a missing line is reported otherwise."""
         is_of_line = detail["loc"] and detail["loc"][-1] in list_keys(*get_args(LineSettings))
         return [] if detail["type"] == "missing" and is_of_line and not self._has_line else super().explain(detail)
-
-
-SOURCE_FIELD = "source"
-"""The field of a kind's settings that takes the driver's name."""
-
-BAUDS_FIELD = "bauds"
-"""The field of a kind's settings that has the rates to try; `baud` in the section gives it one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,20 +220,20 @@ def read_driver(
     reader = SectionReader(name, section, source_map.locate)
     kind = reader.read_kind(kinds)
     settings = kind.load().settings
-    station_keys = [key for key in list_keys(settings) if key != SOURCE_FIELD and key not in kind.presets]
-    more = [*COMMON_KEYS, *([NTRIP_FIELD] if kind.takes_corrections else []), *station_keys]
+    station_keys = [key for key in list_keys(settings) if key != "source" and key not in kind.presets]
+    more = [*COMMON_KEYS, *(["ntrip"] if kind.takes_corrections else []), *station_keys]
     line = reader.read_line_type(kind, more)
     reader.report_unknown_keys(kind, line, more)
     line_values = reader.read_values(line)
-    given: dict[str, Any] = {SOURCE_FIELD: name, **kind.presets}
+    given: dict[str, Any] = {"source": name, **kind.presets}
     baud = getattr(line_values, "baud", 0)
     if "bauds" in section and "baud" in section:
         reader.report("baud", "both baud and bauds are given", "keep one of baud or bauds")
-    elif baud and BAUDS_FIELD in station_keys:
-        given[BAUDS_FIELD] = [baud]
-    if line is TcpSettings and BAUDS_FIELD in station_keys:
+    elif baud and "bauds" in station_keys:
+        given["bauds"] = [baud]
+    if line is registry.TcpSettings and "bauds" in station_keys:
         # the device server owns the rate; it cannot be changed from here
-        given[BAUDS_FIELD] = []
+        given["bauds"] = []
     values = reader.read_values(settings, given)
     common = reader.read_values(_CommonKeys)
     if reader.problems:
@@ -279,29 +250,26 @@ class _CommonKeys:
     ntrip: NtripSettings | None = None
 
 
-NTRIP_FIELD = "ntrip"
-"""Key of the corrections, for receivers that take them."""
-
-COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != NTRIP_FIELD)
-"""Keys that every driver has."""
+COMMON_KEYS = tuple(key for key in list_keys(_CommonKeys) if key != "ntrip")
+"""Keys that every driver has; `ntrip` is of receivers that take corrections."""
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:
     """Return a driver's line, not opened yet."""
     line = settings.line
     # each kind of line needs another library, and some of them are slow to load
-    if isinstance(line, SerialSettings):
+    if isinstance(line, registry.SerialSettings):
         from msdrivers.links.serial_port import SerialLink
 
         return SerialLink(line.port, choose_first_baud(settings))
-    if isinstance(line, CanSettings):
+    if isinstance(line, registry.CanSettings):
         from msdrivers.links.can_bus import CanLink
 
         return CanLink(line.can, line.interface, line.bitrate)
     from msdrivers.links import TcpLink
 
-    link = TcpLink(*split_address(line.address))
-    if isinstance(line, TcpSettings):
+    link = TcpLink(*registry.split_address(line.address))
+    if isinstance(line, registry.TcpSettings):
         return link
     from msdrivers.links.modbus import ModbusLink
 
@@ -310,8 +278,8 @@ def make_link(settings: DriverSettings) -> Link[Any]:
 
 def choose_first_baud(settings: DriverSettings) -> int:
     """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
-    bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
-    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
+    bauds = getattr(settings.device_settings, "bauds", ())
+    given = settings.line.baud if isinstance(settings.line, registry.SerialSettings) else 0
     return bauds[0] if bauds else given or settings.kind.baud
 
 
@@ -329,7 +297,7 @@ def make_emulator(
 ) -> Endpoint[Any]:
     """Return the endpoint of the emulated device; see `EmulatorInputs`. Raises ConfigError."""
     with _locate_errors(driver):
-        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults))
+        return driver.kind.make_emulator(registry.EmulatorInputs(driver.device_settings, folder, samples, faults))
 
 
 @contextmanager
@@ -353,21 +321,15 @@ def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
     """Yield lines that several drivers use exclusively; a CAN bus can be shared."""
     owners: dict[Hashable, str] = {}
     for driver in drivers:
-        owned = _exclusive_resource(driver.line)
-        owner = driver.name if owned is None else owners.setdefault(owned, driver.name)
+        if isinstance(driver.line, registry.CanSettings):
+            continue
+        # a port has several names, e.g. below /dev/serial/by-id/
+        port = driver.line.port if isinstance(driver.line, registry.SerialSettings) else ""
+        owner = owners.setdefault(os.path.realpath(port) if port else driver.line, driver.name)
         if owner != driver.name:
             message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"
             fix = "give each a line of its own, or start only one of them"
             yield driver.make_warning(message, fix, get_line_key(type(driver.line)))
-
-
-def _exclusive_resource(line: LineSettings) -> Hashable | None:
-    if isinstance(line, CanSettings):
-        return None
-    if isinstance(line, SerialSettings):
-        # a port has several names, e.g. below /dev/serial/by-id/
-        return os.path.realpath(line.port)
-    return (line.address, line.unit_id) if isinstance(line, ModbusSettings) else line.address
 
 
 def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:
@@ -379,9 +341,9 @@ def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iter
         what = f"sensors.wheels.frames has no {quote(name)}: what is measured of this wheel is not used"
         # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
         left = [frame for frame in frames if frame not in wheels]
-        near = find_suggestion(name, left)
-        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames {quote(near)}"
-        fix = both if near else f"known: {', '.join(list(frames)[:10])}"
+        near = suggest_name(name, left)
+        both = f"write one name in both places: here it is {quote(name)}, in sensors.wheels.frames"
+        fix = f"{both} {quote(near[0])}" if near else f"known: {', '.join(list(frames)[:10])}"
         yield driver.make_warning(what, fix, "wheels", name)
 
 

@@ -37,7 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, make_status_error
-from modelserver.geometry import names
+from modelserver.geometry import Sigma, names
 from modelserver.key_files import KEY_FILE_VARIABLE, read_keys
 from modelserver.messages import (
     CHANNEL_OF,
@@ -60,6 +60,7 @@ from modelserver.messages import (
     GetTransformation,
     GetTransformations,
     HistoryReply,
+    Lifetime,
     MotionAnswer,
     MotionReply,
     NameListReply,
@@ -72,6 +73,7 @@ from modelserver.messages import (
     ReloadReply,
     ReplyHeader,
     RequestHeader,
+    SetFrame,
     SetHTransform,
     SetStateVector,
     StateVectorReply,
@@ -79,6 +81,7 @@ from modelserver.messages import (
     TransformReply,
 )
 from modelserver.signing import Key, sign
+from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, SIGNED, to_subscription_pattern
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
@@ -482,7 +485,7 @@ _REQUEST_ID: Final = slice(8, 16)
 """Bytes of the request's id in every request and reply: the first field after the fingerprint."""
 
 
-COMMANDS = (ReloadModel, SetStateVector, SetHTransform)
+COMMANDS = (ReloadModel, SetFrame, SetStateVector, SetHTransform)
 """Requests that are not retried: a lost reply does not mean that the command was not executed."""
 
 
@@ -633,6 +636,30 @@ class Platform(PlatformClient):
         # without a server this ends at once
         self.get_body_list()
         return self._query(ReloadModel(self._header(), dry_run), ReloadReply, timeout=RELOAD_TIMEOUT_S)
+
+    def add_frame(
+        self, frame: str, pose: Pose, sigma: Sigma | None = None, *, is_permanent: bool = False
+    ) -> ReloadReply:
+        """Add a frame to a body while the service runs, or move one added before; the geometry file is unchanged.
+
+        `frame` is its full name, Body:Frame, `pose` its pose in the body's coordinates, exact without `sigma`. It is
+        there until the service ends, with `is_permanent` also after a restart, and after a reload of the file. For a
+        pose in another frame F of the body: `get_transformation(F, "Body:Origin").pose @ pose`. For what moves use a
+        joint: each change sends the whole geometry. Raises as `reload_model`; RejectedError for an unknown body, or a
+        frame that the file has.
+        """
+        sigma = sigma or Sigma()
+        lifetime = Lifetime.PERMANENT if is_permanent else Lifetime.TEMPORARY
+        return self._set_frame(SetFrame(self._header(), frame, pose, sigma.position, sigma.rotation, lifetime))
+
+    def remove_frame(self, frame: str) -> ReloadReply:
+        """Remove a frame that `add_frame` added. Raises as `add_frame`; RejectedError with those there are."""
+        return self._set_frame(SetFrame(self._header(), frame, lifetime=Lifetime.REMOVED))
+
+    def _set_frame(self, request: SetFrame) -> ReloadReply:
+        # without a server this ends at once
+        self.get_body_list()
+        return self._query(request, ReloadReply, timeout=RELOAD_TIMEOUT_S)
 
     def set_state_vector(self, pose: Transformation) -> Acknowledgement:
         """Set the pose of the vehicle, the base frame in World:UTM, through a 7-vector.

@@ -340,6 +340,8 @@ class CommandsConfig(_Section):
     RANGES = (("window_s", 0.1, 300.0),)
     reload: bool = False
     """Whether the geometry file may be reloaded."""
+    frames: bool = False
+    """Whether programs may add frames to the bodies while the service runs."""
     set_pose: bool = False
     """Whether the pose of the vehicle may be set."""
     drive: Literal["auto", "signed", "unsigned"] = "auto"
@@ -350,7 +352,7 @@ class CommandsConfig(_Section):
     """Greatest age of a signed message, seconds, by the vehicle's clock."""
 
     def __post_init__(self) -> None:
-        enabled = [name for name in ("reload", "set_pose") if getattr(self, name) and not self.key_file]
+        enabled = [name for name in ("reload", "frames", "set_pose") if getattr(self, name) and not self.key_file]
         enabled += ["drive: signed"] if self.drive == "signed" and not self.key_file else []
         self.check(*(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled))
 

@@ -7,10 +7,10 @@ Time enters only with an event, as an `Instant` of both host clocks. `_HANDLERS`
   their data arrive, or rejected with the reason;
 - samples update the localizer and the joints, and may publish a pose;
 - ticks do what is due by the clock: poses, filter state, waiting requests, health report, snapshot, state to persist;
-- commands reload the geometry, set the pose or switch the mode, only if signed. A reload has two steps, since the core
-  does no input or output: it outputs `LoadModel`, the file is read beside the loop, and the result comes back as the
-  event `ModelLoaded` (`apply_model`). A pose that is set becomes an absolute-pose sample of the source `OPERATOR`, and
-  passes the gates of localization as any other measurement.
+- commands reload the geometry, add frames, set the pose or switch the mode, only if signed. A reload and a frame have
+  two steps, since the core does no input or output: it outputs `LoadModel`, the geometry is made beside the loop, and
+  the result comes back as the event `ModelLoaded` (`apply_model`). A pose that is set becomes an absolute-pose sample
+  of the source `OPERATOR`, and passes the gates of localization as any other measurement.
 
 A message from the bus never raises out of `step`. What cannot be used is counted by channel and reason, and the health
 report publishes the counts.
@@ -567,19 +567,24 @@ def _make_channel_health(name: str, traffic: SourceTraffic, now: Instant) -> mes
 
 @dataclass(frozen=True, slots=True)
 class ModelLoaded:
-    """Event: the geometry was read. It has a model, the localizer for it and its changes, or the reason `why` not.
+    """Event: a geometry is there. It has a model, the localizer for it and its changes, or the reason `why` not.
 
     `request` is the client's request, None for a reload by signal.
     """
 
-    request: messages.ReloadModel | None
+    request: messages.ReloadModel | messages.SetFrame | None
     model: Model | None = None
     localizer: Localizer | None = None
     why: str = ""
     changes: tuple[str, ...] = ()
 
+    @property
+    def is_dry_run(self) -> bool:
+        """Whether the client only asked what would change."""
+        return isinstance(self.request, messages.ReloadModel) and self.request.dry_run
 
-Command: TypeAlias = messages.ReloadModel | messages.SetStateVector | messages.SetHTransform
+
+Command: TypeAlias = messages.ReloadModel | messages.SetFrame | messages.SetStateVector | messages.SetHTransform
 COMMANDS: Final = get_args(Command)
 """Requests that must be signed."""
 
@@ -614,7 +619,7 @@ def execute_command(state: CoreState, signed: messages.SignedCommand, now: Insta
         return forbidden
     return (
         (state, (messages.LoadModel(command),))
-        if isinstance(command, messages.ReloadModel)
+        if isinstance(command, messages.ReloadModel | messages.SetFrame)
         else _set_pose(state, command, now)
     )
 
@@ -627,6 +632,8 @@ def _forbid(state: CoreState, command: Command, now: Instant) -> StepResult | No
     name, is_permitted = "set_pose", settings.may_set_pose
     if isinstance(command, messages.ReloadModel):
         name, is_permitted = "reload", settings.may_reload
+    elif isinstance(command, messages.SetFrame):
+        name, is_permitted = "frames", settings.may_set_frames
     if is_permitted:
         return None
     state = count_rejection(state, channel, "forbidden")
@@ -640,13 +647,14 @@ def _forbid(state: CoreState, command: Command, now: Instant) -> StepResult | No
 def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResult:
     """Replace the geometry as a whole, or keep the old one if the new one could not be loaded."""
     request, model = loaded.request, loaded.model
+    kind = messages.ReloadModel if request is None else type(request)
     if model is None:
-        state = count_rejection(state, messages.CHANNEL_OF[messages.ReloadModel], "rejected")
+        state = count_rejection(state, messages.CHANNEL_OF[kind], "rejected")
         if request is None:
             return state, ()
-        return state, reply_error(state, messages.ReloadModel, request.header, Status.REJECTED, loaded.why, now)
+        return state, reply_error(state, kind, request.header, Status.REJECTED, loaded.why, now)
     outputs: list[messages.Output] = []
-    if request is None or not request.dry_run:
+    if not loaded.is_dry_run:
         view = state.view._replace(model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
         due = now.monotonic_ns + state.settings.snapshot_period_ns
         state = state._replace(view=view, snapshot_due_ns=due)

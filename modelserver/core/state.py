@@ -116,7 +116,7 @@ class CoreSettings:
     ticks_per_state: ticks per LOCALIZATION_STATE; 0 = not published.
     publish_decisions: whether the filter's decisions on measurements are published.
     persist_period_ns: how often the state for a warm start is output; 0 = never.
-    may_reload, may_set_pose: commands that signed clients may send.
+    may_reload, may_set_frames, may_set_pose: commands that signed clients may send.
     sensors: configured sensors, so that the health report can list those without any message.
     """
 
@@ -134,6 +134,7 @@ class CoreSettings:
     reply_prefix: str = "REPLY_"
     snapshot_period_ns: int = 5_000_000_000
     may_reload: bool = False
+    may_set_frames: bool = False
     may_set_pose: bool = False
     persist_period_ns: int = 0
     sensors: tuple[ExpectedSensor, ...] = ()

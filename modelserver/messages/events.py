@@ -40,6 +40,7 @@ Request: TypeAlias = (
     | GetExplanation
     | GetDynamics
     | ReloadModel
+    | SetFrame
     | SetStateVector
     | SetHTransform
 )
@@ -84,6 +85,7 @@ _REQUESTS: Final[tuple[tuple[type[Request], str, Callable[[ReplyHeader], Reply]]
     (GetExplanation, "PLATFORM_GET_EXPLANATION", ExplanationReply),
     (GetDynamics, "PLATFORM_GET_DYNAMICS", DynamicsReply),
     (ReloadModel, "PLATFORM_RELOAD_MODEL", ReloadReply),
+    (SetFrame, "PLATFORM_SET_FRAME", ReloadReply),
     (SetStateVector, "POSE_SET_STATE_VECTOR", Acknowledgement),
     (SetHTransform, "POSE_SET_H_TRANSFORM", Acknowledgement),
 )
@@ -181,7 +183,7 @@ class HealthWarning:
 class SignedCommand:
     """A command whose signature was verified with the vehicle's key."""
 
-    command: ReloadModel | SetStateVector | SetHTransform | SwitchMode
+    command: ReloadModel | SetFrame | SetStateVector | SetHTransform | SwitchMode
     sender: str = ""
 
 
@@ -242,9 +244,9 @@ class PublishNavigation:
 
 @dataclass(frozen=True, slots=True)
 class LoadModel:
-    """Reload the geometry file; `request` is None for a reload by signal."""
+    """Reload the geometry file, or change an added frame; `request` is None for a reload by signal."""
 
-    request: ReloadModel | None = None
+    request: ReloadModel | SetFrame | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -570,7 +570,8 @@ class PlatformView(NamedTuple):
         """Return the error that explains why there is no pose in the world."""
         if self.localizer is None:
             return errors.NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
-        invalid = self.localizer.estimate(0).invalid
+        # at time 0 every sample is of a later time, as after a step of the clock
+        invalid = self.localizer.estimate(0).invalid & ~Invalid.CLOCK_STEPPED
         return errors.NoPoseError(f"the vehicle's pose is not known yet: {invalid.explain() or 'no sensor sample yet'}")
 
 

@@ -21,6 +21,7 @@ from modelserver.server.clock import Clock
 from modelserver.server.diagnostics import DuplicateServerMonitor, probe_bus, read_gauges, report_findings
 from modelserver.server.journal import JournalQueue
 from modelserver.server.journal.writer import make_writer
+from modelserver.server.log import escape_text
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence import SUBJECT as RESTART
 from modelserver.server.persistence import PersistentStores, open_stores
@@ -97,7 +98,8 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     bus = LcmBus(resolve_url(url or config.lcm.url))
     notifier.notify_starting("probing the bus")
     findings = probe_bus(bus.url)
-    reader = GeometryReader(vehicle, file)
+    reader = GeometryReader(vehicle, file, frames=store.frames)
+    vehicle, frames_problem = reader.restore_frames()
     supervisor = ServiceSupervisor(notifier, clock, lambda channel: loop.is_sensor_channel(channel))
     journal = make_writer(config, clock, next(iter(vehicle.read_keys(file)), None))
     loop = Loop(
@@ -120,6 +122,9 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         ),
     )
     report_findings(findings, loop.set_warning)
+    if frames_problem:
+        log.warning("added frames: %s", escape_text(frames_problem))
+        loop.set_warning("frames", frames_problem)
     if store.warning:
         loop.set_warning(RESTART, store.warning)
     DuplicateServerMonitor(socket.gethostname(), os.getpid(), loop.set_warning, clock).subscribe(

@@ -457,11 +457,11 @@ class Loop:
         self.step(loaded, self._clock.now())
         if loaded.model is None:
             log.error(
-                "the geometry could not be reloaded, revision %s stays in use: %s", before, escape_lines(loaded.why)
+                "the geometry could not be changed, revision %s stays in use: %s", before, escape_lines(loaded.why)
             )
-        elif command.request is None or not command.request.dry_run:
+        elif not loaded.is_dry_run:
             self._subscribe(self._hooks.channels(self.state))
-            log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
+            log.info("the geometry was changed: revision %s, before %s", loaded.model.revision, before)
 
     def _send_snapshot(self, output: messages.PublishSnapshot) -> None:
         model = self.state.model

@@ -21,7 +21,7 @@ import os
 import shlex
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 from uuid import UUID
@@ -32,8 +32,10 @@ from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
 from modelserver.files import check_links, read_start
-from modelserver.messages import Origin, PersistedState, RestoredState
+from modelserver.geometry import Sigma
+from modelserver.messages import Lifetime, Origin, PersistedState, RequestHeader, RestoredState, SetFrame
 from modelserver.server.log import escape_text, start_in_background
+from modelserver.transforms.pose import Pose
 
 log = logging.getLogger(__name__)
 
@@ -276,6 +278,65 @@ def _parse_origin(content: dict[str, Any]) -> Origin:
     return dataclasses.replace(origin, origin_id=origin_id)
 
 
+FRAMES_VERSION: Final = 1
+"""Version of the file of added frames."""
+
+MAX_FRAMES_BYTES: Final = 1 << 20
+"""Some 1,000 bytes for each of `added_frames.MAX_FRAMES`."""
+
+
+class AddedFramesStore:
+    """Persists the permanent frames of one vehicle in a file. Only the holder of the directory's `lock` writes."""
+
+    def __init__(self, directory: Path, vehicle: str, lock: FileLock | None = None):
+        self._lock = lock
+        self.path = directory / f"frames-{to_file_name(vehicle)}.json"
+
+    def load(self) -> tuple[tuple[SetFrame, ...], str]:
+        """Return the stored frames; none where the file cannot be read, and why."""
+        try:
+            content = json.loads(read_start(self.path, MAX_FRAMES_BYTES).decode())
+            if content["version"] != FRAMES_VERSION:
+                raise ValueError(f"version {content['version']}; expected {FRAMES_VERSION}")
+            return tuple(map(_parse_frame, content["frames"])), ""
+        except FileNotFoundError:
+            return (), ""
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            return (), f"the added frames in {self.path} cannot be read ({error!r}); none was added"
+
+    def save(self, frames: Iterable[SetFrame]) -> str:
+        """Store the permanent ones of the added frames; return why it cannot be done, "" if it was."""
+        stored = [_describe_frame(each) for each in frames if each.lifetime is Lifetime.PERMANENT]
+        if not stored and not self.path.exists():
+            return ""
+        try:
+            if self._lock is not None:
+                self._lock.claim()
+            content = json.dumps({"version": FRAMES_VERSION, "frames": stored}, indent=1)
+            write_atomically(self.path, (content + "\n").encode())
+        except OSError as error:
+            why = describe_error(error, self.path.parent, "state_directory")
+            return f"the permanent frames cannot be stored in {self.path}: {why}"
+        return ""
+
+
+def _describe_frame(frame: SetFrame) -> dict[str, Any]:
+    """Return the entry of a frame in the file; quaternions are w x y z."""
+    return {
+        "frame": frame.frame,
+        "position": frame.pose.xyz,
+        "orientation": frame.pose.wxyz,
+        "position_sigma": frame.position_sigma,
+        "rotation_sigma": frame.rotation_sigma,
+    }
+
+
+def _parse_frame(entry: dict[str, Any]) -> SetFrame:
+    sigma = Sigma(entry["position_sigma"], entry["rotation_sigma"])
+    pose = Pose(tuple(entry["position"]), tuple(entry["orientation"]))
+    return SetFrame(RequestHeader(0, ""), str(entry["frame"]), pose, sigma.position, sigma.rotation, Lifetime.PERMANENT)
+
+
 MAX_BYTES: Final = 1 << 18
 """Ten times the size of a filter with 30 error states."""
 
@@ -465,6 +526,7 @@ class PersistentStores:
 
     origin: OriginStore | None = None
     state: StateStore | None = None
+    frames: AddedFramesStore | None = None
     lock: FileLock | None = None
     warning: str = ""
 
@@ -486,9 +548,10 @@ def open_stores(config: VehicleConfig, localizes: bool) -> PersistentStores:
         return PersistentStores()
     persists_origin = config.origin.persist and config.origin.initial_utm is None
     persists_state = config.warm_start.persist and localizes
+    persists_frames = config.commands.frames
     lock = FileLock(directory / f"lock-{to_file_name(config.vehicle)}")
     warning = ""
-    if persists_origin or persists_state:
+    if persists_origin or persists_state or persists_frames:
         try:
             lock.claim()
         except LockHeldError as error:
@@ -497,6 +560,7 @@ def open_stores(config: VehicleConfig, localizes: bool) -> PersistentStores:
     return PersistentStores(
         OriginStore(directory, config.vehicle, lock) if persists_origin else None,
         StateStore(directory, config.vehicle, lock=lock, warning=warning) if persists_state else None,
+        AddedFramesStore(directory, config.vehicle, lock) if persists_frames else None,
         lock,
         warning,
     )

@@ -1,8 +1,9 @@
-"""Reload of the geometry beside the loop, so that no tick waits for it.
+"""Change of the geometry beside the loop, so that no tick waits for it: a reload of its file, or an added frame.
 
 A process of its own reads and checks the file: parsing holds Python's lock for a second with 10,000 frames. A thread
-takes the result over, compares it with the old geometry and encodes its snapshot. The loop polls, and uses the old
-geometry until the new one is whole. The localizer is that of the moment at which the loop takes the new geometry.
+takes the result over, adds the frames of programs, compares it with the old geometry and encodes its snapshot. The loop
+polls, and uses the old geometry until the new one is whole. The localizer is that of the moment at which the loop takes
+the new geometry.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver import errors
@@ -23,7 +25,9 @@ from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import CoreState, ModelLoaded
 from modelserver.geometry import Model
 from modelserver.geometry.model import describe_changes
-from modelserver.messages import LoadModel
+from modelserver.messages import Lifetime, LoadModel, ReloadModel, SetFrame
+from modelserver.server.added_frames import add_frames, change_frames
+from modelserver.server.persistence import AddedFramesStore
 from modelserver.server.vehicle import Vehicle, find_disconnected, load_vehicle
 
 log = logging.getLogger(__name__)
@@ -44,8 +48,10 @@ _MAIN: Final = "from modelserver.server.reloading import main; main()"
 
 
 class NewGeometry(NamedTuple):
-    """A geometry that was read, as part of its vehicle, or `why` not; what has changed, and its snapshot."""
+    """The next geometry or `why` there is none: the vehicle as its file has it, and the one with added frames."""
 
+    of_file: Vehicle
+    frames: tuple[SetFrame, ...] = ()
     vehicle: Vehicle | None = None
     why: str = ""
     changes: tuple[str, ...] = ()
@@ -53,21 +59,40 @@ class NewGeometry(NamedTuple):
 
 
 class GeometryReader:
-    """Reads the geometry of a vehicle again, one reload at a time. `read` is `read_geometry`, or does the same."""
+    """Changes the geometry of a vehicle, one change at a time. `read` is `read_geometry`, or does the same.
+
+    `frames`: the store of permanent added frames; None: none can be permanent.
+    """
 
     def __init__(
-        self, vehicle: Vehicle, file: str = "", read: Callable[[VehicleConfig, str], Vehicle | str] | None = None
+        self,
+        vehicle: Vehicle,
+        file: str = "",
+        read: Callable[[VehicleConfig, str], Vehicle | str] | None = None,
+        frames: AddedFramesStore | None = None,
     ):
-        self._vehicle = vehicle
+        self._of_file = vehicle
         self._file = file
         self._read = read or self._read_in_process
+        self._store = frames
+        self._frames: tuple[SetFrame, ...] = ()
         self._process: subprocess.Popen[bytes] | None = None
         self._snapshot: tuple[Model | None, bytes] = (None, b"")
 
+    def restore_frames(self) -> tuple[Vehicle, str]:
+        """Return the vehicle with the permanent frames of earlier runs, and which could not be added, and why."""
+        self._frames, why = ((), "") if self._store is None else self._store.load()
+        model, left_out = add_frames(self._of_file.model, self._frames)
+        self._frames = tuple(each for each in self._frames if each.frame not in left_out)
+        return self._of_file.with_model(model), "; ".join(filter(None, (why, *left_out.values())))
+
     def begin(self, command: LoadModel, state: CoreState) -> PollReload:
-        """Begin to read the file; return the function that ends it."""
+        """Begin to make the next geometry; return the function that ends it."""
         found: list[NewGeometry] = []
-        thread = threading.Thread(target=lambda: found.append(self._prepare(state.model)), name="reload", daemon=True)
+        request, before = command.request, state.model
+        thread = threading.Thread(
+            target=lambda: found.append(self._prepare(request, before)), name="reload", daemon=True
+        )
         thread.start()
 
         return lambda state: self._finish(command, found[0], state) if found else None
@@ -75,7 +100,7 @@ class GeometryReader:
     def encode_snapshot(self, model: Model) -> bytes:
         """Return the snapshot of a geometry, which is encoded already if it was read again."""
         known, data = self._snapshot
-        return data if known is model else self._vehicle.encode_snapshot(model)
+        return data if known is model else self._of_file.encode_snapshot(model)
 
     def close(self) -> None:
         if self._process is not None:
@@ -84,28 +109,50 @@ class GeometryReader:
     def _finish(self, command: LoadModel, found: NewGeometry, state: CoreState) -> ModelLoaded:
         if found.vehicle is None:
             return ModelLoaded(command.request, why=found.why)
+        loaded = ModelLoaded(command.request, found.vehicle.model, state.localizer, changes=found.changes)
+        if loaded.is_dry_run:
+            return loaded
+        if why := self._store_frames(found.frames):
+            return ModelLoaded(command.request, why=why)
+        self._of_file, self._frames = found.of_file, found.frames
         self._snapshot = (found.vehicle.model, found.snapshot)
-        localizer, setup = state.localizer, found.vehicle.make_localizer_setup()
+        setup = found.vehicle.make_localizer_setup()
         if setup is not None:
             from modelserver.estimation.modes import ModeLocalizer
 
-            if isinstance(localizer, ModeLocalizer):
-                localizer = localizer.reconfigure(setup)
-        return ModelLoaded(command.request, found.vehicle.model, localizer, changes=found.changes)
+            if isinstance(state.localizer, ModeLocalizer):
+                return replace(loaded, localizer=state.localizer.reconfigure(setup))
+        return loaded
+
+    def _store_frames(self, frames: tuple[SetFrame, ...]) -> str:
+        """Store the permanent frames where they have changed; return why it cannot be done, "" if it was."""
+        before, after = (
+            [each for each in some if each.lifetime is Lifetime.PERMANENT] for some in (self._frames, frames)
+        )
+        if before == after:
+            return ""
+        return "there is no state directory for permanent frames" if self._store is None else self._store.save(after)
 
     # --- in the thread ---
 
-    def _prepare(self, before: Model) -> NewGeometry:
+    def _prepare(self, request: ReloadModel | SetFrame | None, before: Model) -> NewGeometry:
         usual = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        of_file, frames = self._of_file, self._frames
         try:
-            vehicle = self._read(self._vehicle.config, self._file)
-            if isinstance(vehicle, str):
-                return NewGeometry(why=vehicle)
-            return compare_geometry(vehicle, before)
+            if isinstance(request, SetFrame):
+                frames = change_frames(frames, request, of_file.model)
+            else:
+                read = self._read(of_file.config, self._file)
+                if isinstance(read, str):
+                    return NewGeometry(of_file, why=read)
+                of_file = read
+            return compare_geometry(of_file, frames, before)
+        except ValueError as error:
+            return NewGeometry(of_file, why=str(error))
         except Exception as error:
-            log.exception("reloading the geometry failed")
-            return NewGeometry(why=f"internal error while reading it: {error}")
+            log.exception("changing the geometry failed")
+            return NewGeometry(of_file, why=f"internal error while reading it: {error}")
         finally:
             sys.setswitchinterval(usual)
 
@@ -129,14 +176,20 @@ class GeometryReader:
         return found
 
 
-def compare_geometry(vehicle: Vehicle, before: Model) -> NewGeometry:
-    """Return a vehicle with its new geometry, unless that lost bodies that the one before has."""
-    if lost := find_disconnected(vehicle.model) - find_disconnected(before):
-        return NewGeometry(
-            why=f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
+def compare_geometry(of_file: Vehicle, frames: tuple[SetFrame, ...], before: Model) -> NewGeometry:
+    """Return the geometry of a file with the frames that fit, unless it lost bodies that the one before has."""
+    lost = find_disconnected(of_file.model) - find_disconnected(before)
+    if lost:
+        why = (
+            f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
             "write a temporary file and rename it; to use the geometry as it is, restart the server"
         )
-    return NewGeometry(vehicle, "", describe_changes(before, vehicle.model), vehicle.encode_snapshot(vehicle.model))
+        return NewGeometry(of_file, why=why)
+    model, left_out = add_frames(of_file.model, frames)
+    vehicle = of_file if model is of_file.model else of_file.with_model(model)
+    changes = (*describe_changes(before, model), *(f"no longer added: {why}" for why in left_out.values()))
+    fitting = tuple(each for each in frames if each.frame not in left_out)
+    return NewGeometry(of_file, fitting, vehicle, "", changes, vehicle.encode_snapshot(model))
 
 
 def read_geometry(config: VehicleConfig, file: str) -> Vehicle | str:

@@ -25,6 +25,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import quote
+from modelserver.messages import SetFrame
 from modelserver.server.log import escape_text
 
 if TYPE_CHECKING:
@@ -225,7 +226,7 @@ class ServiceSupervisor:
             self._notifier.notify_reloading()
             return
         self._notifier.notify_reloaded()
-        if loaded.request is None or not loaded.request.dry_run:
+        if not loaded.is_dry_run and not isinstance(loaded.request, SetFrame):
             self._reload_error = "" if loaded.model is not None else loaded.why
 
 

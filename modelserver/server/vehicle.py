@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -106,6 +106,7 @@ class Vehicle:
             reply_prefix=config.lcm.reply_prefix,
             snapshot_period_ns=round(config.publish.snapshot_s * 1e9),
             may_reload=config.commands.reload,
+            may_set_frames=config.commands.frames,
             may_set_pose=config.commands.set_pose,
             persist_period_ns=round(config.warm_start.period_s * 1e9) if config.warm_start.persist else 0,
             sensors=self.expected_sensors(),
@@ -113,6 +114,10 @@ class Vehicle:
         )
         state = core.start(settings, self.model, localizer, now)
         return state._replace(warnings={START: start_report}) if start_report else state
+
+    def with_model(self, model: Model) -> Vehicle:
+        """Return the vehicle with another geometry that has all frames of this one, at the same places."""
+        return replace(self, model=model, rig=None if self.rig is None else replace(self.rig, model=model))
 
     def make_localizer_setup(self) -> LocalizerConfig | None:
         """Make the configuration of the localizers; None without a localization sensor."""

@@ -62,6 +62,7 @@ REQUESTS = _channels(
     _request("PLATFORM_GET_EXPLANATION", "get_explanation", "get_explanation_reply_t"),
     _request("PLATFORM_GET_DYNAMICS", "get_dynamics", "get_dynamics_reply_t"),
     _request("PLATFORM_RELOAD_MODEL", "reload_model", "reload_model_reply_t; where allowed"),
+    _request("PLATFORM_SET_FRAME", "set_frame", "reload_model_reply_t; where allowed"),
     _request("POSE_SET_STATE_VECTOR", "set_state_vector", "acknowledgement_t; where allowed"),
     _request("POSE_SET_H_TRANSFORM", "set_h_transform", "acknowledgement_t; where allowed"),
 )

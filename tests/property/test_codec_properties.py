@@ -311,6 +311,15 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         ),
     ),
     "reload_model_request_t": st.builds(messages.ReloadModel, request_headers, st.booleans()),
+    "set_frame_request_t": st.builds(
+        messages.SetFrame,
+        request_headers,
+        frames,
+        st.builds(Pose, places, turns),
+        places,
+        places,
+        st.sampled_from(messages.Lifetime),
+    ),
     "reload_model_reply_t": st.builds(
         messages.ReloadReply, fine | failed, texts, st.lists(texts, max_size=3).map(tuple)
     ),

@@ -19,6 +19,7 @@ from support_samples import GEOMETRY, write_vehicle
 
 import modelserver as ms
 from modelserver.formats.yaml_geometry import decode_snapshot
+from modelserver.geometry import Sigma
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import SnapshotAssembler, decode, encode
@@ -82,7 +83,7 @@ def test_given_hangup_then_a_good_file_counts_at_once_and_a_bad_one_changes_noth
     assert platform.get_transformation("Camera:Origin", "Cart:Base").model_revision == new
     model = receive_model(daemon, new)
     assert model.get_transformation("Camera:Origin", "Cart:Base").position[2] == pytest.approx(1.2)
-    wait_for_log(daemon, f"the geometry was reloaded: revision {new}, before {old}")
+    wait_for_log(daemon, f"the geometry was changed: revision {new}, before {old}")
 
     # mistyped; half written; without the base frame; with a frame less that a sensor stands at; gone
     for number, (text, why) in enumerate(
@@ -102,7 +103,7 @@ def test_given_hangup_then_a_good_file_counts_at_once_and_a_bad_one_changes_noth
         assert daemon.health().model_revision == new
         assert platform.get_body_list() == ["Cart", "Camera"]
         assert why in wait_for_log(daemon, why).rpartition(f"revision {new} stays in use")[2]
-    assert daemon.log.count(f"could not be reloaded, revision {new} stays in use: ") == 5
+    assert daemon.log.count(f"could not be changed, revision {new} stays in use: ") == 5
     assert daemon.health().handler_errors == 0
 
 
@@ -130,6 +131,8 @@ def test_given_no_permission_then_neither_reload_nor_a_pose_is_taken_and_the_set
     revision = daemon.health().model_revision
     with pytest.raises(ms.ForbiddenError, match=r"commands: \{reload: true\}"):
         platform.reload_model()
+    with pytest.raises(ms.ForbiddenError, match=r"commands: \{frames: true\}"):
+        platform.add_frame("Camera:Marker", Pose())
     here = Transformation("Cart:Base", "World:UTM", Pose())
     for setting in (platform.set_state_vector, platform.set_h_transform):
         with pytest.raises(ms.ForbiddenError, match=r"commands: \{set_pose: true\}"):
@@ -168,6 +171,40 @@ def test_given_permission_then_reload_is_tried_dry_done_and_refused(start_signed
     assert "Camrea" in err
     assert "the geometry in force stays" in err
     assert platform.get_transformation("Camera:Origin", "Cart:Base").model_revision == dry.revision
+
+
+def test_given_permission_then_a_program_adds_frames_which_a_restart_and_a_reload_keep_as_asked(
+    start_signed: StartDaemon, tmp_path: Path
+) -> None:
+    daemon = start_signed()
+    daemon.feed()
+    platform = daemon.platform()
+    with ms.PlatformMirror(daemon.url) as mirror:
+        mirror.wait(10.0)
+        platform.add_frame("Camera:Gone", Pose((0.0, 0.0, 0.1)))
+        added = platform.add_frame("Camera:Marker", Pose((0.0, 0.0, 0.5)), Sigma((0.1, 0.1, 0.1)), is_permanent=True)
+        assert added.changes == ("frame Camera:Marker is new",)
+        found = platform.get_transformation("Camera:Marker", "Cart:Base")
+        assert (found.position[2], found.model_revision) == (pytest.approx(1.6), added.revision)
+        assert platform.get_body_frame_list("Camera") == ["Origin", "Gone", "Marker"]
+        receive_model(daemon, added.revision)
+        assert mirror.wait_for(lambda: "Marker" in mirror.get_body_frame_list("Camera"), 10.0)
+        assert mirror.get_transformation("Camera:Marker", "Camera:Origin").covariance is not None
+    with pytest.raises(ms.RejectedError, match="the geometry file has a frame 'Cart:Base'"):
+        platform.add_frame("Cart:Base", Pose())
+    write_vehicle(tmp_path, (tmp_path / "vehicle.yaml").read_text(), HIGHER_CAMERA)
+    platform.reload_model()
+    assert platform.get_transformation("Camera:Marker", "Cart:Base").position[2] == pytest.approx(1.7)
+    daemon.process.terminate()
+    assert daemon.process.wait(20) == 0
+    daemon = start_signed(geometry=HIGHER_CAMERA)
+    platform = daemon.platform()
+    assert platform.get_transformation("Camera:Marker", "Cart:Base").position[2] == pytest.approx(1.7)
+    with pytest.raises(ms.UnknownFrameError, match="Gone"):
+        platform.get_transformation("Camera:Gone", "Cart:Base")
+    platform.remove_frame("Camera:Marker")
+    assert platform.get_body_frame_list("Camera") == ["Origin"]
+    assert daemon.health().handler_errors == 0
 
 
 # --- setting the pose -----------------------------------------------------------------------------------------------
@@ -272,7 +309,7 @@ def test_the_examples_in_the_documentation_do_what_they_report(start_signed: Sta
     daemon.health(lambda health: any(each.channel == "sensor:axis" and each.count == 121 for each in health.channels))
     known = {"ms": ms, "platform": daemon.platform(), "utime": utime}
     blocks = [block.split("```")[0] for block in text.split("```python\n")[1:]]
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     for block in blocks:
         exec(block, known)
     assert known["T"].rpy[1] == pytest.approx(0.27)

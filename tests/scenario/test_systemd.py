@@ -219,7 +219,7 @@ def test_given_another_geometry_and_a_reload_then_it_is_used_and_one_that_is_wro
     site.wait_until(lambda: "reload failed, the old model stays" in site.status(), "the status does not report it")
     assert f"model {fresh}" in site.status()
     errors = site.machine.journal(SERVICE, "--priority=err")
-    assert f"could not be reloaded, revision {fresh} stays in use" in errors
+    assert f"could not be changed, revision {fresh} stays in use" in errors
     assert site.measure_answer() > 0
 
     site.machine.run("mv", f"{GEOMETRY}.good", GEOMETRY)
@@ -348,6 +348,28 @@ def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, 
     assert site.list_files() == before
     nothing = site.machine.run(site.program, "install", "--remove", check=False)
     assert (nothing.returncode, "nothing to remove" in nothing.stderr) == (1, True)
+
+
+def test_given_the_five_commands_of_a_deployer_then_an_own_rover_is_served_by_enabled_units(
+    site: Site, before: list[str]
+) -> None:
+    """Of them `make deb` and `apt install` were those of the fixtures."""
+    vehicle = "/root/rover/vehicle.yaml"
+    devices = ("--gps", "ublox@/dev/ttyUSB0", "--imu", "gx1@/dev/ttyUSB1", "--wheels", "can0")
+    site.machine.run(site.program, "new", "/root/rover", "--yes", "--vehicle", "skid", *devices)
+    site.machine.run(site.program, "install", "--vehicle", vehicle)
+    status = site.machine.run("systemctl", "status", "modelserver*", "--no-pager").stdout
+    units = (SERVICE, *(f"modelserver-driver@{each}.service" for each in ("gps", "imu", "wheels")))
+    for unit in units:
+        assert unit in status
+        assert site.machine.get_property(unit, "ActiveState") == "active"
+        assert site.machine.get_property(unit, "UnitFileState") == "enabled"
+    assert site.status().startswith("serving model ")
+    found = site.machine.run(site.program, "query", "Rover:Antenna", "Rover:Base", check=False)
+    assert "position" in found.stdout, found
+    site.machine.run(site.program, "install", "--remove", "--purge")
+    site.machine.run("rm", "-r", "/root/rover")
+    assert site.list_files() == before
 
 
 def test_given_the_package_removed_then_the_service_ends_and_nothing_of_it_stays(site: Site, before: list[str]) -> None:

@@ -3,7 +3,7 @@
 Polling: one request at a time, at `poll_hz`. The angle is stamped in the middle between request and reply; delay and
 delay_sigma are half the round trip and the deviation of a uniform distribution over it.
 
-Validation (`ReadingValidator`): an angle is plausible if an axis of at most `fastest_deg` could have reached it from
+Validation (`_validate`): an angle is plausible if an axis of at most `fastest_deg` could have reached it from
 the last plausible one. An implausible one becomes the suspect; if the next is plausible from it, it was the earlier
 one that was wrong.
 
@@ -20,25 +20,23 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from modelserver.errors import quote
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices import Strict, check_ranges
+from msdrivers.devices import Strict, check_choice, check_factor, check_ranges
 from msdrivers.devices.stream import BoundedCounter
 from msdrivers.endpoint import (
     LAST_ADDRESS,
     MAX_READ,
     EndpointPhase,
     EndpointStatus,
-    FailureKind,
     HostTime,
     MeasuredSample,
     ModbusFailure,
+    ModbusRequest,
     ModbusUnit,
     Output,
     ReadRegisters,
     Registers,
     RegistersWritten,
-    RegisterTable,
     Reopen,
     Send,
     WriteRegisters,
@@ -47,19 +45,19 @@ from msdrivers.endpoint import (
     is_reply_to,
 )
 
-_TYPES: Final = {
-    "int16": (1, True),
-    "uint16": (1, False),
-    "int32": (2, True),
-    "uint32": (2, False),
-    "float32": (2, True),
-}
-"""Registers and sign of each type."""
-
-_ORDERS: Final = ("ABCD", "CDAB", "BADC", "DCBA")
-
 _MAX_FLOAT32: Final = (2**24 - 1) << 104
 """IEEE 754, binary32: 24 bits of 1 at the highest exponent, which is a whole number."""
+
+_TYPES: Final = {
+    "int16": ("h", -0x8000, 0x7FFF),
+    "uint16": ("H", 0, 0xFFFF),
+    "int32": ("i", -0x8000_0000, 0x7FFF_FFFF),
+    "uint32": ("I", 0, 0xFFFF_FFFF),
+    "float32": ("f", -_MAX_FLOAT32, _MAX_FLOAT32),
+}
+"""Each type's code of `struct`, its lowest and its highest number."""
+
+_ORDERS: Final = ("ABCD", "CDAB", "BADC", "DCBA")
 
 _FLOAT32_TOLERANCE: Final = 4 * 2.0**-23
 """Relative: a device that stores another unit rounds twice on writing and twice on reading."""
@@ -88,35 +86,30 @@ class RegisterMap(Strict):
     `high_word_first: false`. Of 16 bits, BADC and DCBA swap the bytes."""
 
     def __post_init__(self) -> None:
-        if self.registers not in (1, 2):
-            raise ValueError(f"registers is 1 (16 bits) or 2 (32 bits), got {self.registers}")
+        check_choice(self, registers=(1, 2), type=(None, *_TYPES), order=(None, *_ORDERS))
         if self.type is not None:
-            if self.type not in _TYPES:
-                raise ValueError(f"type is {', '.join(_TYPES)}, got {quote(self.type)}")
-            count, is_signed = _TYPES[self.type]
             # a default that is written cannot be distinguished from nothing written, and contradicts nothing
-            if self.registers not in (1, count):
+            if self.registers not in (1, self.word_count):
+                count = self.word_count
                 raise ValueError(f"registers is left out with type: {self.type} has {count}, got {self.registers}")
-            if not self.is_signed and is_signed:
+            if not self.is_signed and self.lowest < 0:
                 raise ValueError(f"is_signed is left out with type: {self.type} is signed, got false")
-        if self.order is not None:
-            if self.order not in _ORDERS:
-                raise ValueError(f"order is {', '.join(_ORDERS)}, got {quote(self.order)}")
-            if not self.high_word_first and self.order not in ("CDAB", "DCBA"):
-                raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
+        if self.order in ("ABCD", "BADC") and not self.high_word_first:
+            raise ValueError(f"high_word_first is left out with order: {self.order} has the high word first")
         if not 0 <= self.address <= LAST_ADDRESS + 1 - self.word_count:
-            raise ValueError(
-                f"address is 0 to {LAST_ADDRESS + 1 - self.word_count}, got {self.address}; a manual's 40001 is 0"
-            )
-        if not math.isfinite(self.scale_deg) or self.scale_deg == 0.0:
-            raise ValueError(f"scale_deg is a number and not 0, got {self.scale_deg:g}")
+            last = LAST_ADDRESS + 1 - self.word_count
+            raise ValueError(f"address is 0 to {last}, got {self.address}; a manual's 40001 is 0")
+        check_factor(self.scale_deg, "scale_deg")
         if not math.isfinite(self.offset_deg):
             raise ValueError(f"offset_deg is a number, got {self.offset_deg:g}")
 
     @property
+    def _type(self) -> tuple[str, int, int]:
+        return _TYPES[self.type or f"{'' if self.is_signed else 'u'}int{16 * self.registers}"]
+
+    @property
     def word_count(self) -> int:
-        """The number of registers."""
-        return self.registers if self.type is None else _TYPES[self.type][0]
+        return struct.calcsize(f">{self._type[0]}") // 2
 
     @property
     def is_float(self) -> bool:
@@ -124,32 +117,23 @@ class RegisterMap(Strict):
 
     @property
     def lowest(self) -> int:
-        """The lowest number that the registers hold."""
-        if self.is_float:
-            return -_MAX_FLOAT32
-        is_signed = self.is_signed if self.type is None else _TYPES[self.type][1]
-        return -(1 << (16 * self.word_count - 1)) if is_signed else 0
+        return self._type[1]
 
     @property
     def highest(self) -> int:
-        """The highest number that the registers hold."""
-        return _MAX_FLOAT32 if self.is_float else self.lowest + (1 << (16 * self.word_count)) - 1
+        return self._type[2]
 
     def to_number(self, values: Sequence[int]) -> float:
         """Return the number of the registers: a whole one except of float32, which may be non-finite."""
         data = struct.pack(f">{len(values)}H", *self._reorder(values))
-        if self.is_float:
-            (real,) = struct.unpack(">f", data)
-            return float(real)
-        number = int.from_bytes(data, "big")
-        return number - (1 << 16 * self.word_count) if number > self.highest else number
+        number: float = struct.unpack(f">{self._type[0]}", data)[0]
+        return number
 
     def to_words(self, number: float) -> tuple[int, ...]:
         """Return the registers of a number. Raises ValueError for one that they do not hold."""
         if not self.lowest <= number <= self.highest:
             raise ValueError(f"{number} is not within {self.lowest} to {self.highest}")
-        bits = 16 * self.word_count
-        data = struct.pack(">f", number) if self.is_float else (int(number) % (1 << bits)).to_bytes(bits // 8, "big")
+        data = struct.pack(f">{self._type[0]}", number if self.is_float else int(number))
         return self._reorder(struct.unpack(f">{self.word_count}H", data))
 
     def to_degrees(self, values: Sequence[int]) -> float:
@@ -200,8 +184,7 @@ class AxisRegisters(Strict):
     """Rate of the nodding motion, written; 0: stationary."""
 
     def __post_init__(self) -> None:
-        if self.table not in ("holding", "input"):
-            raise ValueError(f"table is holding or input, got {self.table!r}")
+        check_choice(self, table=("holding", "input"))
         if len(self.commanded) not in (0, 3):
             raise ValueError(
                 "lower_limit, upper_limit and nod_rate are given together or not at all: nodding needs all"
@@ -294,7 +277,6 @@ class AxisSettings(Strict):
                 raise ValueError(f"nod cannot be done: {why}")
 
     def _find_nod_problem(self, nod: NodSettings) -> str:
-        """Describe why the axis cannot do a nodding motion; empty if it can."""
         if not self.registers.commanded:
             return "registers names no lower_limit, upper_limit and nod_rate"
         if nod.rate_deg != 0.0 and not self.slowest_deg <= nod.rate_deg <= self.fastest_deg:
@@ -309,7 +291,7 @@ class AxisSettings(Strict):
         return ""
 
 
-_Step: TypeAlias = tuple[str, ReadRegisters | WriteRegisters]
+_Step: TypeAlias = tuple[str, ModbusRequest]
 """What is done, and its request."""
 _Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
 
@@ -331,58 +313,6 @@ class _TimedAngle(NamedTuple):
     half_interval_ns: int
 
 
-class ReadingValidator:
-    """Validates consecutive readings; see the module."""
-
-    def __init__(self, settings: AxisSettings):
-        self._settings = settings
-        self.clear()
-
-    def clear(self) -> None:
-        self._last: _TimedAngle | None = None
-        self._suspect: _TimedAngle | None = None
-        self._number: float | None = None
-
-    def validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
-        """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
-
-        `at_ns` is when they were read, give or take `half_interval_ns`. Words: `repeated`, `range`, `jump`, `rate`.
-        """
-        settings, registers = self._settings, self._settings.registers
-
-        def get_words(name: str) -> Sequence[int]:
-            mapped = registers.measured[name]
-            begin = mapped.address - registers.begin
-            return values[begin : begin + mapped.word_count]
-
-        if registers.sequence is not None:
-            number = registers.sequence.to_number(get_words("sequence"))
-            if number == self._number:
-                return None, "repeated"
-            self._number = number
-        degrees = registers.angle.to_degrees(get_words("angle"))
-        if not settings.lowest_deg - settings.step_deg <= degrees <= settings.highest_deg + settings.step_deg:
-            return None, "range"
-        place = _TimedAngle(degrees, at_ns, half_interval_ns)
-        believed = self._last is None or self._can_reach(self._last, place)
-        if not believed and not (self._suspect is not None and self._can_reach(self._suspect, place)):
-            self._suspect = place
-            return None, "jump"
-        self._last, self._suspect = place, None
-        rate, word = NAN, ""
-        if registers.rate is not None:
-            rate = registers.rate.to_degrees(get_words("rate"))
-            if abs(rate) > RATE_MARGIN * settings.fastest_deg:
-                rate, word = NAN, "rate"
-        sigma = settings.step_deg / math.sqrt(12.0)
-        return JointSample(settings.joint, math.radians(degrees), math.radians(sigma), math.radians(rate)), word
-
-    def _can_reach(self, before: _TimedAngle, after: _TimedAngle) -> bool:
-        seconds = (after.at_ns - before.at_ns + before.half_interval_ns + after.half_interval_ns) * 1e-9
-        reach = RATE_MARGIN * self._settings.fastest_deg * seconds + 2.0 * self._settings.step_deg
-        return abs(after.degrees - before.degrees) <= reach
-
-
 REPLY_TIMEOUT_NS = 100_000_000
 """A controller on the vehicle's network answers within milliseconds; a lost request must not cost many readings."""
 
@@ -396,7 +326,7 @@ BUSY_EXCEPTIONS = (5, 6)
 class _PendingRequest(NamedTuple):
     """The request that awaits its reply."""
 
-    request: ReadRegisters | WriteRegisters
+    request: ModbusRequest
     sent_ns: int
     is_poll: bool
 
@@ -413,9 +343,10 @@ class AxisDriver:
         self.max_silence = settings.silence
         self.counts = BoundedCounter()
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
-        self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.word_count for each in registers.measured.values()) - registers.begin
-        self._readings = ReadingValidator(settings)
+        self._last: _TimedAngle | None = None
+        self._suspect: _TimedAngle | None = None
+        self._number: float | None = None
         self._commanded: Mapping[str, RegisterMap] = registers.commanded
         self._steps: _Steps | None = None
         self._step: _Step | None = None
@@ -437,7 +368,7 @@ class AxisDriver:
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self._is_open, self._pending = True, None
-        self._readings.clear()
+        self._last = self._suspect = self._number = None
         self._reported.clear()
         self._phase = EndpointPhase.WAITING
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = now.monotonic_ns
@@ -448,15 +379,13 @@ class AxisDriver:
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
+        if isinstance(unit, ModbusFailure) and not unit.code:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
         if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
             self.counts["rejected.stale"] += 1
             return []
         if isinstance(unit, ModbusFailure):
-            if unit.kind is FailureKind.TIMEOUT:
-                return self._on_timeout(now)
             return self._on_exception(pending, unit, now)
         self._pending = None
         self._received_ns = now.monotonic_ns
@@ -548,11 +477,12 @@ class AxisDriver:
         if not is_poll and not (self._step is not None and at >= self._step_ns):
             return []
         transaction = self._new_transaction()
-        request: ReadRegisters | WriteRegisters
+        request: ModbusRequest
         if self._step is not None and not is_poll:
             request = replace(self._step[1], transaction=transaction)
         else:
-            request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
+            registers = self.settings.registers
+            request = ReadRegisters(registers.begin, self._length, registers.table, transaction)
             self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
             self.counts["skipped"] += late
@@ -566,7 +496,7 @@ class AxisDriver:
 
     def _publish_reading(self, unit: Registers, pending: _PendingRequest, now: HostTime) -> list[Output[ModbusUnit]]:
         round_trip_ns = now.monotonic_ns - pending.sent_ns
-        joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
+        joint, word = self._validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
             self.counts[word if word == "repeated" else f"rejected.{word}"] += 1
         outputs = self._warn_once(word, _WARNINGS[word]) if word else []
@@ -587,6 +517,45 @@ class AxisDriver:
             *outputs,
             MeasuredSample(JointsSample(header, (joint,)), round_trip / 2.0, round_trip / math.sqrt(12.0)),
         ]
+
+    def _validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
+        """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
+
+        `at_ns` is when they were read, give or take `half_interval_ns`. Words: `repeated`, `range`, `jump`, `rate`.
+        """
+        settings, registers = self.settings, self.settings.registers
+
+        def get_words(name: str) -> Sequence[int]:
+            mapped = registers.measured[name]
+            begin = mapped.address - registers.begin
+            return values[begin : begin + mapped.word_count]
+
+        if registers.sequence is not None:
+            number = registers.sequence.to_number(get_words("sequence"))
+            if number == self._number:
+                return None, "repeated"
+            self._number = number
+        degrees = registers.angle.to_degrees(get_words("angle"))
+        if not settings.lowest_deg - settings.step_deg <= degrees <= settings.highest_deg + settings.step_deg:
+            return None, "range"
+        place = _TimedAngle(degrees, at_ns, half_interval_ns)
+        believed = self._last is None or self._can_reach(self._last, place)
+        if not believed and not (self._suspect is not None and self._can_reach(self._suspect, place)):
+            self._suspect = place
+            return None, "jump"
+        self._last, self._suspect = place, None
+        rate, word = NAN, ""
+        if registers.rate is not None:
+            rate = registers.rate.to_degrees(get_words("rate"))
+            if abs(rate) > RATE_MARGIN * settings.fastest_deg:
+                rate, word = NAN, "rate"
+        sigma = settings.step_deg / math.sqrt(12.0)
+        return JointSample(settings.joint, math.radians(degrees), math.radians(sigma), math.radians(rate)), word
+
+    def _can_reach(self, before: _TimedAngle, after: _TimedAngle) -> bool:
+        seconds = (after.at_ns - before.at_ns + before.half_interval_ns + after.half_interval_ns) * 1e-9
+        reach = RATE_MARGIN * self.settings.fastest_deg * seconds + 2.0 * self.settings.step_deg
+        return abs(after.degrees - before.degrees) <= reach
 
     def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self.counts["unanswered"] += 1

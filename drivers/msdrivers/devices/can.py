@@ -30,18 +30,19 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    ModelServerError,
-    Problem,
-    Severity,
-    Suggestion,
-    quote,
-    suggest_name,
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
+from modelserver.messages import Sample, SensorHeader
+from msdrivers.devices import Strict, check_factor, check_ranges, check_signal
+from msdrivers.endpoint import (
+    CanFrame,
+    EndpointPhase,
+    EndpointStatus,
+    FrameKey,
+    HostTime,
+    MeasuredSample,
+    Output,
+    Reopen,
 )
-from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, FrameKey, HostTime, Output, Reopen
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
@@ -57,7 +58,6 @@ _PDU1_FORMATS: Final = 240
 
 
 def find_pgn(arbitration_id: int) -> int:
-    """Return the PGN of a 29-bit identifier."""
     pgn = arbitration_id >> 8 & 0x3FFFF
     return pgn if pgn >> 8 & 0xFF >= _PDU1_FORMATS else pgn & 0x3FF00
 
@@ -68,13 +68,6 @@ def parse_pgn(name: str) -> int | None:
         return int(name, 16) if name[:2].lower() == "0x" else int(name) if name.isdecimal() else None
     except ValueError:
         return None
-
-
-def check_signal(signal: str, key: str = "signal") -> None:
-    """Raise ValueError unless the text is a signal path."""
-    message, dot, name = signal.partition(".")
-    if not (message and dot and name) or "." in name:
-        raise ValueError(f"{key} is written Message.Signal as the DBC file names them, got {signal!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +134,7 @@ _J1939_NAMES = {0xFF: "not available", 0xFE: "error"}
 """By the highest byte of a number of a byte and more: SAE J1939-71, 5.1.4."""
 
 
-class FrameError(ModelServerError, ValueError):
+class FrameError(ValueError):
     """A frame that does not match the DBC; `reason` is the counter's name, `summary` what is wrong in a few words."""
 
     def __init__(self, reason: str, message: str, summary: str = ""):
@@ -180,7 +173,6 @@ class BoundSignal:
         return value if isfinite(value) and not self.find_reserved(raw) else None
 
     def is_outside(self, raw: float) -> bool:
-        """Return whether the physical value of raw bits is outside the file's range."""
         value, slack = raw * self.scale + self.offset, 1e-6 * abs(self.scale)
         return not self.minimum - slack <= value <= self.maximum + slack
 
@@ -239,14 +231,11 @@ class CanDatabase:
         message = self.by_key.get(frame.key)
         if message is None:
             raise FrameError("unknown", f"{self.name} has no message {frame.key}")
-        if len(frame.data) != message.length:
-            raise FrameError(
-                "length",
-                f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
-                f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
-                f"identifier",
-                f"with {len(frame.data)} bytes instead of {message.length}",
-            )
+        what, size = f"frame {frame.key} ({message.name})", len(frame.data)
+        if size != message.length:
+            why = "the DBC is of another version of the controller, or another device uses the same identifier"
+            text = f"{what} has {size} bytes, {self.name} expects {message.length}: {why}"
+            raise FrameError("length", text, f"with {size} bytes instead of {message.length}")
         from cantools.database.errors import Error
 
         try:
@@ -254,13 +243,9 @@ class CanDatabase:
                 frame.data, decode_choices=False, scaling=False, allow_truncated=False, allow_excess=False
             )
         except Error as error:
-            raise FrameError(
-                "multiplexer", f"frame {frame.key} ({message.name}): {error}", "with an unknown multiplexer"
-            ) from None
+            raise FrameError("multiplexer", f"{what}: {error}", "with an unknown multiplexer") from None
         except (ValueError, KeyError, OverflowError) as error:
-            raise FrameError(
-                "bits", f"frame {frame.key} ({message.name}): {error}", "with bits that are no number"
-            ) from None
+            raise FrameError("bits", f"{what}: {error}", "with bits that are no number") from None
         return {name: value for name, value in values.items() if isinstance(value, int | float)}
 
     def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:
@@ -275,7 +260,6 @@ class CanDatabase:
         return {signal.name: _bind_signal(found, signal, self.is_j1939) for signal in found.signals}
 
     def find_by_pgn(self, pgn: int) -> list[str]:
-        """Return the names of the messages of a PGN."""
         return [
             name for name, each in self.messages.items() if each.is_extended_frame and find_pgn(each.frame_id) == pgn
         ]
@@ -290,10 +274,16 @@ class SignalBinder:
         self._place = place
         self.problems: list[Problem] = []
 
-    def bind_signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
+    def bind_mapped(self, settings: object, prefix: str = "", /, **bits: int) -> dict[str, BoundSignal]:
+        """Return the signals of those attributes that are mapped, by name; `bits`: of each, see `bind_signal`."""
+        paths = {name: getattr(mapped, "signal", mapped) for name in bits if (mapped := getattr(settings, name))}
+        found = {name: self.bind_signal(path, f"{prefix}{name}", bits[name]) for name, path in paths.items()}
+        return {name: signal for name, signal in found.items() if signal is not None}
+
+    def bind_signal(self, path: str, key: str, bits: int = 0) -> BoundSignal | None:
         """Return the signal `Message.Signal` of the setting `key`; add a problem and return None if it is unknown.
 
-        The message may be named by its PGN. `whole`: it must be an integer of at most `bits` bits.
+        The message may be named by its PGN. bits: it must be an integer of at most so many; 0: any number.
         """
         message_name, _, name = path.partition(".")
         pgn = parse_pgn(message_name)
@@ -320,7 +310,7 @@ class SignalBinder:
             form = "{}" if key.endswith(f".{name}") else f"{message_name}.{{}}"
             self._add_missing(key, f"message {message_name} has no signal", name, known, form)
             return None
-        if whole and (signal.is_float or signal.length > bits):
+        if bits and (signal.is_float or signal.length > bits):
             kind = "a floating-point number" if signal.is_float else f"{signal.length} bits long"
             self.add_problem(
                 key, f"{path} is {kind}; a whole number of at most {bits} bits is needed", "map another signal"
@@ -334,7 +324,7 @@ class SignalBinder:
         return bound
 
     def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
+        """Add a problem that is fixed at the setting `key`, not in the DBC file."""
         source = Location(element=f"{self._place}.{key}")
         self.problems.append(Problem(Severity.ERROR, f"{self._database.name}: {message}", source, fix, nearest))
 
@@ -448,8 +438,7 @@ _PLACE = re.compile(r"at line (\d+)")
 _HEAD: Final = 'VERSION ""\nNS_ :\nBS_:\nBU_:\n'
 
 
-@dataclass(frozen=True, slots=True)
-class _Statement:
+class _Statement(NamedTuple):
     """A statement of the file and the number of its first line."""
 
     line: int
@@ -585,13 +574,6 @@ MAX_SEEN = 8
 """Identifiers, and kinds of what is wrong with frames, that are remembered for the status text."""
 
 
-def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
-    """Return the receive time of a frame that is read `now`: its own stamp if it has one."""
-    if not 0 < frame.utime <= now.utime:
-        return now
-    return HostTime(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
-
-
 class CanDriver(ABC):
     """Base of an `Endpoint` of CAN frames: decodes the needed frames and assembles those of one instant.
 
@@ -601,6 +583,8 @@ class CanDriver(ABC):
     def __init__(self, database: CanDatabase, signals: Iterable[BoundSignal], settings: BusSettings):
         """The frames of `signals` are needed; the others see `WheelsSettings`. Raises ConfigError."""
         signals = list(signals)
+        self.settings = settings
+        self.max_silence = settings.silence if signals else inf
         self.phase = EndpointPhase.WAITING
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
@@ -625,7 +609,7 @@ class CanDriver(ABC):
         self._seq = 0
         self._silence_deadline_ns: int | None = None
         self._received = 0
-        self._others: Counter[FrameKey] = Counter()
+        self._others: dict[FrameKey, None] = {}
         self._useless: Counter[str] = Counter()
         """Since the last usable data: frames, those that are not needed, and what is wrong with the others."""
         self._reasons: dict[str, None] = {}
@@ -649,8 +633,8 @@ class CanDriver(ABC):
         key, outputs = self._match(unit, now)
         if key is None:
             self.counts["other_frames"] += 1
-            if unit.key in self._others or len(self._others) < MAX_SEEN:
-                self._others[unit.key] += 1
+            if len(self._others) < MAX_SEEN:
+                self._others.setdefault(unit.key)
             return outputs
         if key in self._by_pgn.get(find_pgn(key.arbitration_id), ()):
             # J1939 pads frames to 8 bytes
@@ -659,10 +643,14 @@ class CanDriver(ABC):
         try:
             values = self._database.decode(unit)
         except FrameError as error:
-            return self._on_malformed_frame(unit, error)
+            self.counts[f"rejected.{error.reason}"] += 1
+            self._note_useless(f"{self._needed[unit.key]} ({unit.key}) {error.summary}")
+            return self._report_once(unit.key, f"{error}; such frames are counted and not used")
         self.counts["frames"] += 1
-        arrival = get_arrival_time(unit, now)
-        return outputs + self._publish(self._assembler.add(key, values, arrival.monotonic_ns, arrival.utime), now)
+        # its own receive time, if the interface stamped it
+        utime = unit.utime if 0 < unit.utime <= now.utime else now.utime
+        arrival_ns = now.monotonic_ns - (now.utime - utime) * 1000
+        return outputs + self._publish(self._assembler.add(key, values, arrival_ns, utime), now)
 
     def _match(self, frame: CanFrame, now: HostTime) -> tuple[FrameKey | None, list[Output[CanFrame]]]:
         """Return the kind of a frame, None if it is not needed; and a warning about a second source of a PGN."""
@@ -676,21 +664,18 @@ class CanDriver(ABC):
             return next((key for key in stated if self._stated[key] == source), None), []
         (key,) = keys
         used, last_ns = self._sources.get(key, (source, now.monotonic_ns))
+        is_own = source == key.arbitration_id & 0xFF
+        outputs: list[Output[CanFrame]] = []
         if source != used and now.monotonic_ns - last_ns < self._silence_s * 1e9:
-            outputs: list[Output[CanFrame]] = []
-            if ("sources", key) not in self._reported:
-                self._reported.add(("sources", key))
-                name, first = self._needed[key], min(source, used)
-                chosen = source if source == key.arbitration_id & 0xFF else used
-                what = f"source addresses 0x{first:02X} and 0x{max(source, used):02X} send PGN {pgn} ({name})"
-                fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
-                outputs.append(EndpointStatus(self.phase, f"{what}; {fix}", is_warning=True))
-            if source != key.arbitration_id & 0xFF:
+            name, chosen = self._needed[key], source if is_own else used
+            first, second = sorted((source, used))
+            what = f"source addresses 0x{first:02X} and 0x{second:02X} send PGN {pgn} ({name})"
+            fix = f"that of 0x{chosen:02X} is used; state it: source_address: {{{name}: 0x{chosen:02X}}}"
+            outputs = self._report_once(("sources", key), f"{what}; {fix}")
+            if not is_own:
                 return None, outputs
-            self._sources[key] = (source, now.monotonic_ns)
-            return key, outputs
         self._sources[key] = (source, now.monotonic_ns)
-        return key, []
+        return key, outputs
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
         """Publish instants whose window has passed; report silence after its timeout."""
@@ -709,25 +694,34 @@ class CanDriver(ABC):
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
         return []
 
-    @abstractmethod
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
-        """Make the samples of complete and expired instants."""
+        self.counts["incomplete"] += sum(not each.is_complete for each in instants)
+        return [output for each in instants for output in self._publish_instant(each, now)]
 
-    def _on_usable(self, now: HostTime, text: str) -> list[Output[CanFrame]]:
+    @abstractmethod
+    def _publish_instant(self, instant: CanFrameSet, now: HostTime) -> list[Output[CanFrame]]:
+        """Make the sample of a complete or expired instant."""
+
+    def _make_header(self, instant: CanFrameSet) -> SensorHeader:
+        self._seq += 1
+        return SensorHeader(instant.utime, self.settings.source, self._seq - 1, instant.utime)
+
+    def _publish_sample(self, sample: Sample, text: str, now: HostTime) -> list[Output[CanFrame]]:
+        """Publish a sample; `text`: the status of a driver that was not streaming."""
+        self.counts["samples"] += 1
         self._restart_silence_timer(now)
+        measured = MeasuredSample(sample, self.settings.delay, self.settings.delay_sigma)
         if self.phase is EndpointPhase.STREAMING:
-            return []
+            return [measured]
         self.phase = EndpointPhase.STREAMING
-        return [EndpointStatus(EndpointPhase.STREAMING, text)]
+        return [EndpointStatus(EndpointPhase.STREAMING, text), measured]
 
-    def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
-        """Count a malformed frame; reported once per kind."""
-        self.counts[f"rejected.{error.reason}"] += 1
-        self._note_useless(f"{self._needed[frame.key]} ({frame.key}) {error.summary}")
-        if frame.key in self._reported:
+    def _report_once(self, what: object, text: str, is_warning: bool = True) -> list[Output[CanFrame]]:
+        """Return a status, once for what it is about since the line was opened."""
+        if what in self._reported:
             return []
-        self._reported.add(frame.key)
-        return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
+        self._reported.add(what)
+        return [EndpointStatus(self.phase, text, is_warning)]
 
     def _note_useless(self, what: str) -> None:
         """Note what is wrong with a frame, or with the frames of an instant."""
@@ -735,7 +729,6 @@ class CanDriver(ABC):
             self._useless[what] += 1
 
     def _note_empty(self) -> None:
-        """Count an instant without any value."""
         self.counts["rejected.empty"] += 1
         self._note_useless(f"no value that can be used ({', '.join(self._reasons) or 'no number'})")
 
@@ -761,13 +754,11 @@ class CanDriver(ABC):
                 )
             else:
                 continue
-            if (signal.path, name) not in self._reported:
-                self._reported.add((signal.path, name))
-                outputs.append(EndpointStatus(self.phase, text, is_warning=True))
+            outputs += self._report_once((signal.path, name), text)
         return outputs
 
     def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
-        """Process an error frame of the interface; bus-off requests a reopening, once."""
+        """Request the reopening of a bus that is off, once."""
         self.counts["error_frames"] += 1
         if not frame.is_bus_off or self.is_bus_off:
             return []

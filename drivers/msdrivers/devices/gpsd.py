@@ -25,15 +25,7 @@ from typing import Any, Final
 from modelserver.errors import quote
 from modelserver.messages import NAN, FixType, GpsSample
 from msdrivers.devices.gps import course_from_track, to_covariance
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    StreamDriver,
-)
+from msdrivers.devices.stream import NO_FRAME, SECOND_NS, ByteSettings, ParsedFrame, RejectedFrame, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output
 
 MAX_LINE: Final = 16_384
@@ -72,16 +64,12 @@ class GpsdReport:
     @property
     def utime(self) -> int:
         """The instant of the report, microseconds of UTC; 0 if it has none."""
-        text = self.fields.get("time")
-        if not isinstance(text, str):
-            return 0
         try:
-            when = datetime.fromisoformat(text)
-        except ValueError:
+            since = datetime.fromisoformat(str(self.fields.get("time"))) - datetime(1970, 1, 1, tzinfo=UTC)
+        # TypeError: without a time zone
+        except (ValueError, TypeError):
             return 0
-        if when.tzinfo is None:
-            return 0
-        return max(0, (when - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1))
+        return max(0, since // timedelta(microseconds=1))
 
     @property
     def fix_type(self) -> FixType:
@@ -126,12 +114,6 @@ class GpsdFormat:
         return ParsedFrame(end + 1, f"gpsd.{name[:16]}", report)
 
 
-class GpsdStream(FrameScanner[GpsdReport]):
-    """Parses bytes to reports. Never raises; memory is bounded."""
-
-    formats = (GpsdFormat(),)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsdSettings(ByteSettings):
     """Settings of gpsd. Raises ValueError with the key for an invalid value."""
@@ -155,27 +137,26 @@ class GpsdDriver(StreamDriver[GpsdReport]):
     device = "gpsd"
     description = "gpsd"
     awaited = "TPV"
+    formats = (GpsdFormat(),)
+    identification = WATCH
     answer_timeout = 2.0
     attempts = 2
 
     def __init__(self, settings: GpsdSettings) -> None:
-        super().__init__(settings, GpsdStream())
+        super().__init__(settings)
         self._receiver = settings.receiver
         self._pending: tuple[GpsdReport, int, int] | None = None
         self._gst: GpsdReport | None = None
-        self._sky: GpsdReport | None = None
+        self._dilution: dict[str, Any] = {}
         self._satellites = -1
         self._last_utime = 0
         self._receivers: dict[str, bool] | None = None
         """Paths of gpsd's receivers, and whether it reads them; None while unknown."""
         self._error = ""
 
-    def _make_identification(self) -> bytes:
-        return WATCH
-
     def _on_start(self) -> None:
-        self._pending = self._gst = self._sky = self._receivers = None
-        self._satellites, self._error = -1, ""
+        self._pending = self._gst = self._receivers = None
+        self._dilution, self._satellites, self._error = {}, -1, ""
 
     def _get_extra_deadline(self) -> int | None:
         return None if self._pending is None else self._pending[2]
@@ -201,7 +182,7 @@ class GpsdDriver(StreamDriver[GpsdReport]):
             self._satellites = count_satellites(message, self._satellites)
             # reports of some receivers have the satellites only
             if math.isfinite(message.get_number("hdop")):
-                self._sky = message
+                self._dilution = {name: message.get_number(name) for name in ("hdop", "vdop", "pdop")}
         elif message.name == "GST":
             self._gst = message
             if self._pending is not None and self._pending[0].utime == message.utime:
@@ -262,31 +243,25 @@ class GpsdDriver(StreamDriver[GpsdReport]):
         if self._pending is None:
             return []
         (tpv, host_utime, _), self._pending = self._pending, None
-        fix_type, get = tpv.fix_type, tpv.get_number
+        get, gst = tpv.get_number, self._gst
         latitude, longitude = get("lat"), get("lon")
-        has_place = math.isfinite(latitude) and math.isfinite(longitude)
         east, north, down = get("velE"), get("velN"), get("velD")
-        has_velocity = math.isfinite(east + north + down)
-        speed, track = get("speed"), get("track")
-        sky, gst = self._sky, self._gst
         covariance = None
         if gst is not None and gst.utime == tpv.utime:
             covariance = to_covariance(gst.get_number("lon"), gst.get_number("lat"), gst.get_number("alt"))
         sample = GpsSample(
             self._make_header(host_utime, tpv.utime),
-            fix_type if has_place else FixType.NONE,
+            tpv.fix_type if math.isfinite(latitude + longitude) else FixType.NONE,
             latitude,
             longitude,
             height_ellipsoidal=get("altHAE"),
             height_msl=get("altMSL" if {"altMSL", "altHAE"} & tpv.fields.keys() else "alt"),
             undulation=get("geoidSep"),
             satellites=self._satellites,
-            hdop=NAN if sky is None else sky.get_number("hdop"),
-            vdop=NAN if sky is None else sky.get_number("vdop"),
-            pdop=NAN if sky is None else sky.get_number("pdop"),
+            **self._dilution,
             position_covariance=covariance,
-            velocity=(east, north, -down) if has_velocity else None,
-            speed=speed,
-            course=course_from_track(track),
+            velocity=(east, north, -down) if math.isfinite(east + north + down) else None,
+            speed=get("speed"),
+            course=course_from_track(get("track")),
         )
         return self._publish(sample, now)

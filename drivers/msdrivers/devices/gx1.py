@@ -32,21 +32,8 @@ from typing import NamedTuple
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
-from msdrivers.devices import check_ranges
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    NoReplyError,
-    ParsedFrame,
-    PauseStep,
-    RejectedFrame,
-    RequestStep,
-    Script,
-    ScriptPart,
-    StreamDriver,
-)
+from msdrivers.devices import check_choice, check_ranges, stream
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, FrameScanner, ParsedFrame, RejectedFrame, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
 
@@ -76,11 +63,6 @@ class ReplyLayout(NamedTuple):
     def words(self) -> int:
         return sum(count for _, count in self.fields)
 
-    @property
-    def length(self) -> int:
-        """Length of the reply in bytes."""
-        return 1 + 2 * self.words + 2 * self.has_ticks + 2
-
 
 _VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
 
@@ -99,19 +81,13 @@ LAYOUTS: dict[int, ReplyLayout] = {
     CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
 }
 
-LENGTHS: dict[int, int] = {command: layout.length for command, layout in LAYOUTS.items()}
+_STRUCTS = {command: struct.Struct(f">B{each.words}h{'H' * each.has_ticks}H") for command, each in LAYOUTS.items()}
+"""Command, words as signed numbers, ticks, checksum."""
+LENGTHS: dict[int, int] = {command: each.size for command, each in _STRUCTS.items()}
+"""Bytes of the replies."""
 
-MEASUREMENTS = frozenset(
-    {
-        CommandByte.STABILIZED_VECTORS,
-        CommandByte.INSTANTANEOUS_VECTORS,
-        CommandByte.QUATERNION_VECTORS,
-        CommandByte.INSTANTANEOUS_EULER,
-        CommandByte.STABILIZED_EULER,
-        CommandByte.EULER_VECTORS,
-    }
-)
-"""Measurements: what may be streamed."""
+MEASUREMENTS = frozenset(command for command, layout in LAYOUTS.items() if layout.words >= 3)
+"""Replies with vectors or angles: what may be streamed."""
 
 _SLICES = {
     command: {
@@ -120,8 +96,6 @@ _SLICES = {
     }
     for command, layout in LAYOUTS.items()
 }
-_STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in LAYOUTS.items()}
-_UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
 
 
 class Gx1Packet(NamedTuple):
@@ -136,7 +110,6 @@ class Gx1Packet(NamedTuple):
         return self.words[_SLICES[self.command][name]]
 
     def has(self, name: str) -> bool:
-        """Return whether its layout has the field."""
         return name in _SLICES[self.command]
 
     @property
@@ -156,11 +129,12 @@ def decode_packet(data: bytes | bytearray, at: int, command: int) -> Gx1Packet |
 
     The whole reply must be there: `LENGTHS[command]` bytes.
     """
-    unsigned = _UNSIGNED[command].unpack_from(data, at)
-    if (sum(unsigned) - 2 * unsigned[-1]) & 0xFFFF:
+    _, *words, checksum = _STRUCTS[command].unpack_from(data, at)
+    # modulo 65536 signed and unsigned words are the same
+    if (command + sum(words) - checksum) & 0xFFFF:
         return None
-    words = _STRUCTS[command].unpack_from(data, at + 1)
-    return Gx1Packet(command, words, unsigned[-2] if LAYOUTS[command].has_ticks else None)
+    ticks = words.pop() if LAYOUTS[command].has_ticks else None
+    return Gx1Packet(command, tuple(words), ticks)
 
 
 class EepromAddress:
@@ -181,35 +155,27 @@ class Gains(NamedTuple):
     magnetometer: int
 
 
-class Gx1Format:
-    """A `FrameFormat` of replies; those to other `commands` are noise."""
+class Gx1Stream(FrameScanner[Gx1Packet]):
+    """Parses bytes to the replies to some commands, at first all; others are noise. At most 30 bytes are buffered."""
 
     start_bytes = bytes(LAYOUTS)
 
     def __init__(self) -> None:
-        self.commands: frozenset[int] = frozenset(LAYOUTS)
+        super().__init__((self,))
+        self._commands = frozenset(LAYOUTS)
+
+    def set_commands(self, *commands: int) -> None:
+        self._commands = frozenset(commands)
 
     def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[Gx1Packet] | RejectedFrame | None:
         command = buffer[at]
-        if command not in self.commands:
+        if command not in self._commands:
             return NO_FRAME
         if at + LENGTHS[command] > len(buffer):
             return None
         packet = decode_packet(buffer, at, command)
         kind = f"message.{CommandByte(command).name.lower()}"
         return ParsedFrame(at + LENGTHS[command], kind, packet) if packet else RejectedFrame("checksum")
-
-
-class Gx1Stream(FrameScanner[Gx1Packet]):
-    """Parses bytes to the replies to some commands, at first all. At most 30 bytes are buffered."""
-
-    def __init__(self) -> None:
-        self._format = Gx1Format()
-        super().__init__((self._format,))
-
-    def set_commands(self, *commands: int) -> None:
-        """Set the commands whose replies are read."""
-        self._format.commands = frozenset(commands)
 
 
 COUNTER_RANGE = 65536
@@ -252,11 +218,6 @@ class TickUnwrapper:
         self._count += ahead
         self._last, self._at_ns = ticks, at_ns
         return self._count
-
-
-def make_poll(command: int) -> bytes:
-    """Return the request for one reply of a command that takes no data."""
-    return bytes((command,))
 
 
 def make_stream(command: int) -> bytes:
@@ -306,7 +267,6 @@ def saturate(value: float) -> int:
 
 
 def is_saturated(words: Iterable[int]) -> bool:
-    """Return whether a word is at an end of its range."""
     return any(word in (MIN_WORD, MAX_WORD) for word in words)
 
 
@@ -317,31 +277,13 @@ def orientation_from_euler(words: Iterable[int]) -> Quaternion:
 
 def euler_to_words(orientation: Quaternion) -> tuple[int, int, int]:
     """Return roll, pitch, yaw as words, each turn within -32768..32767."""
-    roll, pitch, yaw = (round(angle / _ANGLE_SCALE) for angle in so3.to_rpy(orientation))
-    return (_wrap(roll), pitch, _wrap(yaw))
-
-
-def _wrap(word: int) -> int:
-    return (word + 32768) % 65536 - 32768
-
-
-def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
-    """Return the orientation of the sensor's axes in north, east, down from four words, scalar first.
-
-    Raises ValueError for four zeros.
-    """
-    w, x, y, z = (word * _QUATERNION_SCALE for word in words)
-    return so3.normalize((w, x, y, z))
+    roll, pitch, yaw = ((round(angle / _ANGLE_SCALE) + 32768) % 65536 - 32768 for angle in so3.to_rpy(orientation))
+    return (roll, pitch, yaw)
 
 
 def quaternion_to_words(orientation: Quaternion) -> tuple[int, int, int, int]:
     w, x, y, z = (round(element / _QUATERNION_SCALE) for element in orientation)
     return (w, x, y, z)
-
-
-def is_unit(words: Iterable[int]) -> bool:
-    """Return whether four words are a unit quaternion within 1 %."""
-    return abs(math.hypot(*words) * _QUATERNION_SCALE - 1.0) < 0.01
 
 
 def temperature_from_word(word: int) -> float:
@@ -385,15 +327,9 @@ class Gx1Settings(ByteSettings):
 
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
-        if self.message not in MEASUREMENTS:
-            known = ", ".join(str(int(command)) for command in sorted(MEASUREMENTS))
-            raise ValueError(f"message is one of {known}, got {self.message}")
-        if self.heading not in _YAW_SOURCES:
-            raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
+        check_choice(self, message=sorted(MEASUREMENTS), heading=_YAW_SOURCES, specific_force_sign=(1, -1))
         if self.message == CommandByte.INSTANTANEOUS_EULER and self.heading == "vertical_gyro":
             raise ValueError("heading is magnetic with message 13, whose yaw is from the magnetometers")
-        if self.specific_force_sign not in (1, -1):
-            raise ValueError(f"specific_force_sign is 1 or -1, got {self.specific_force_sign}")
         check_ranges(self, tick=(0.0, 1.0))
 
 
@@ -401,7 +337,7 @@ _YAW_SOURCES = {"vertical_gyro": YawSource.NONE, "magnetic": YawSource.MAGNETIC}
 
 
 @dataclass(frozen=True, slots=True)
-class CommandStep(RequestStep):
+class CommandStep(stream.RequestStep):
     """A request and the first word of its reply, None for any."""
 
     value: int | None = None
@@ -433,7 +369,7 @@ class UnusableDeviceError(Exception):
     """The device answers, but its data cannot be used."""
 
 
-def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
+def read_words(addresses: Iterable[int]) -> stream.ScriptPart[tuple[int, ...]]:
     """Read words of the EEPROM, unsigned."""
     words: tuple[int, ...] = ()
     for address in addresses:
@@ -442,7 +378,7 @@ def read_words(addresses: Iterable[int]) -> ScriptPart[tuple[int, ...]]:
     return words
 
 
-def read_gains() -> ScriptPart[Gains]:
+def read_gains() -> stream.ScriptPart[Gains]:
     """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have.
 
     They are read twice: a reply does not contain its address, and a delayed one would pass for the next.
@@ -470,8 +406,7 @@ def read_gains() -> ScriptPart[Gains]:
     return gains
 
 
-def _read_tick() -> ScriptPart[float]:
-    """Return the seconds of a tick. Raises UnusableDeviceError for timer words that cannot be."""
+def _read_tick() -> stream.ScriptPart[float]:
     words = yield from read_words(EepromAddress.TIMER)
     tick_s = tick_from_timer_words(words)
     if not 1e-3 <= tick_s <= 0.1:
@@ -482,12 +417,7 @@ def _read_tick() -> ScriptPart[float]:
     return tick_s
 
 
-_UP_NED: Vector3 = (0.0, 0.0, -1.0)
-"""In north, east, down."""
-
-
 def find_saturated_fields(packet: Gx1Packet) -> tuple[str, ...]:
-    """Return the names of the saturated vectors."""
     return tuple(
         name for name in ("field", "acceleration", "rate") if packet.has(name) and is_saturated(packet.field(name))
     )
@@ -510,7 +440,8 @@ def sample_from_packet(
     if packet.has("euler"):
         orientation = orientation_from_euler(packet.field("euler"))
     elif packet.has("quaternion"):
-        orientation = orientation_from_quaternion(packet.field("quaternion"))
+        w, x, y, z = (word * _QUATERNION_SCALE for word in packet.field("quaternion"))
+        orientation = so3.normalize((w, x, y, z))
     return ImuSample(
         header,
         angular_velocity=convert("rate", gains.gyro),
@@ -543,7 +474,7 @@ class GravityCheck:
         force, rate, orientation = sample.specific_force, sample.angular_velocity, sample.orientation
         if self._count >= self.MIN_SAMPLES or force is None or rate is None or orientation is None:
             return False
-        up = so3.rotate(so3.conjugate(orientation), _UP_NED)
+        up = so3.rotate(so3.conjugate(orientation), (0.0, 0.0, -1.0))
         along = sum(a * b for a, b in zip(force, up, strict=True))
         is_quiet = math.hypot(*rate) <= self.MAX_RATE and abs(math.hypot(*force) - G0) <= self.MAX_FORCE_ERROR
         # neither up nor down: not stationary
@@ -556,10 +487,10 @@ class GravityCheck:
         return self._count >= self.MIN_SAMPLES
 
 
-TEMPERATURE_PERIOD_NS = 10 * SECOND_NS
+TEMPERATURE_PERIOD_NS = 10 * stream.SECOND_NS
 """Period of the polls of the temperature, which changes within minutes."""
 
-TICK_CHECK_NS = 20 * SECOND_NS
+TICK_CHECK_NS = 20 * stream.SECOND_NS
 TICK_TOLERANCE = 0.05
 """Over 20 s a host that is late by a second seems to change a tick by this much; the device's own two settings of the
 timer differ by 35 %, and `device_clock` follows a drift of 1 %."""
@@ -600,20 +531,20 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         self._poll_ns = now.monotonic_ns + TEMPERATURE_PERIOD_NS
-        return [Send(make_poll(CommandByte.TEMPERATURE))]
+        return [Send(bytes((CommandByte.TEMPERATURE,)))]
 
     def on_close(self, now: HostTime) -> list[Output[bytes]]:
         """Stop the stream of a device that was found."""
         self._setup.stop()
         return [Send(STOP)] if self._is_found else []
 
-    def _run_setup(self) -> Script:
+    def _run_setup(self) -> stream.Script:
         while True:
             self._stream.set_commands(*LAYOUTS)
             self._first_bytes = b""
             try:
                 self._product = yield from self._find_device()
-            except NoReplyError:
+            except stream.NoReplyError:
                 yield from self._try_next_baud()
                 continue
             self._tried, self._is_found = [], True
@@ -625,13 +556,13 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
                 self._tick_s = self._settings.tick or (yield from _read_tick())
                 yield CommandStep(make_stream(self._settings.message), value=self._settings.message)
                 break
-            except NoReplyError as silence:
+            except stream.NoReplyError as silence:
                 why = f"{self._product} fell silent while it was set up: {silence}; check its cable and power"
             except UnusableDeviceError as unusable:
                 why = f"{self._product} cannot be used: {unusable}"
             text = f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
             yield from self._set_status(EndpointPhase.SILENT, text)
-            yield PauseStep(RETRY_DELAY_S)
+            yield stream.PauseStep(RETRY_DELAY_S)
         self._stream.set_commands(self._settings.message, CommandByte.TEMPERATURE)
         self._ticks.reset()
         self._ticks.set_tick(self._tick_s)
@@ -640,16 +571,16 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         self._celsius, self._poll_ns = NAN, self._now.monotonic_ns
         self._restart_silence_timer()
 
-    def _find_device(self) -> ScriptPart[str]:
+    def _find_device(self) -> stream.ScriptPart[str]:
         """Stop what the device streams; return its serial number and firmware."""
-        yield PauseStep(LISTEN_S)
+        yield stream.PauseStep(LISTEN_S)
         if self._first_bytes:
             # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
             yield Send(STOP)
-            yield PauseStep(FLUSH_S)
+            yield stream.PauseStep(FLUSH_S)
         yield CommandStep(STOP, value=0)
-        serial = yield CommandStep(make_poll(CommandByte.SERIAL))
-        firmware = yield CommandStep(make_poll(CommandByte.FIRMWARE))
+        serial = yield CommandStep(bytes((CommandByte.SERIAL,)))
+        firmware = yield CommandStep(bytes((CommandByte.FIRMWARE,)))
         return f"3DM-GX1 serial {serial.unsigned}, firmware {format_version(firmware.unsigned)}"
 
     def _on_message(self, message: Gx1Packet, now: HostTime) -> list[Output[bytes]]:
@@ -693,7 +624,6 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
         return [*self._publish(sample, now, self._tick_s, line), *warnings]
 
     def _check_tick(self, count: int, now: HostTime) -> list[Output[bytes]]:
-        """Compare the length of a tick with the host's clock."""
         begin, begin_ns = self._tick_origin = self._tick_origin or (count, now.monotonic_ns)
         if self._is_tick_wrong or now.monotonic_ns - begin_ns < TICK_CHECK_NS:
             return []
@@ -712,7 +642,9 @@ class Gx1Driver(StreamDriver[Gx1Packet]):
 
 
 def _is_plausible(packet: Gx1Packet) -> bool:
-    """Return whether the content is possible: pitch within 90 degrees, a unit quaternion."""
+    """Return whether the content is possible: pitch within 90 degrees, a unit quaternion within 1 %."""
     if packet.has("euler"):
         return abs(packet.field("euler")[1]) <= QUARTER_TURN
-    return is_unit(packet.field("quaternion")) if packet.has("quaternion") else True
+    if packet.has("quaternion"):
+        return abs(math.hypot(*packet.field("quaternion")) * _QUATERNION_SCALE - 1.0) < 0.01
+    return True

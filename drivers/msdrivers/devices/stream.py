@@ -21,6 +21,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial, reduce
+from itertools import accumulate
 from operator import xor
 from typing import Any, ClassVar, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
@@ -88,17 +89,13 @@ class FrameFormat(Protocol[M_co]):
 class FrameScanner(Generic[M]):
     """Finds the frames of several formats in a byte stream. `feed` never raises; memory is bounded."""
 
-    formats: ClassVar[Sequence[FrameFormat[Any]]] = ()
-    """Those of a subclass."""
-
-    def __init__(self, formats: Sequence[FrameFormat[M]] = ()) -> None:
-        self._formats = {lead: each for each in formats or self.formats for lead in each.start_bytes}
+    def __init__(self, formats: Sequence[FrameFormat[M]]) -> None:
+        self._formats = {lead: each for each in formats for lead in each.start_bytes}
         self._start_pattern = re.compile(b"[" + re.escape(bytes(self._formats)) + b"]")
         self._buffer = bytearray()
         self._offset = 0
         self._skipped = 0
-        self._frames = BoundedCounter()
-        self._rejected: Counter[str] = Counter()
+        self._counts = BoundedCounter()
 
     @property
     def offset(self) -> int:
@@ -113,12 +110,11 @@ class FrameScanner(Generic[M]):
     @property
     def counts(self) -> dict[str, int]:
         """Frames by kind, `rejected.<reason>`, and `skipped`: bytes in no frame, ends of lines not counted."""
-        rejected = {f"rejected.{reason}": number for reason, number in self._rejected.items()}
-        return {**self._frames, **rejected, "skipped": self._skipped}
+        return {**self._counts, "skipped": self._skipped}
 
     def reject(self, reason: str) -> None:
         """Count a message that was rejected for its content."""
-        self._rejected[reason] += 1
+        self._counts[f"rejected.{reason}"] += 1
 
     def clear(self) -> None:
         """Discard the incomplete frame after an interruption; counters and offsets continue."""
@@ -144,11 +140,11 @@ class FrameScanner(Generic[M]):
                 break
             if isinstance(verdict, RejectedFrame):
                 if verdict.reason:
-                    self._rejected[verdict.reason] += 1
+                    self.reject(verdict.reason)
                 self._skip(at, at + 1)
                 at += 1
                 continue
-            self._frames.add(verdict.kind)
+            self._counts.add(verdict.kind)
             if verdict.message is not None:
                 messages.append(verdict.message)
             at = verdict.end
@@ -176,21 +172,15 @@ class KnownProtocol(NamedTuple):
     count: Callable[[bytes], int]
 
 
-def compute_fletcher(data: bytes) -> bytes:
-    """Return Fletcher's checksum of 2 bytes, as UBX messages have it."""
-    a = b = 0
-    for byte in data:
-        a = (a + byte) & 0xFF
-        b = (b + a) & 0xFF
-    return bytes((a, b))
-
-
 def _count_ubx(data: bytes) -> int:
     number = 0
     for found in re.finditer(rb"\xb5\x62", data):
         begin = found.end()
         end = begin + 4 + int.from_bytes(data[begin + 2 : begin + 4], "little")
-        number += end + 2 <= len(data) and compute_fletcher(data[begin:end]) == data[end : end + 2]
+        body = data[begin:end]
+        # Fletcher's checksum
+        checksum = bytes((sum(body) & 0xFF, sum(accumulate(body)) & 0xFF))
+        number += end + 2 <= len(data) and checksum == data[end : end + 2]
     return number
 
 
@@ -206,33 +196,24 @@ def _count_xbus(data: bytes) -> int:
 
 
 _SENTENCE: Final = re.compile(rb"\$([A-Z]{2,6}[^*\r\n]{0,200})\*([0-9A-Fa-f]{2})")
-_VECTORNAV: Final = re.compile(rb"\$VN[A-Z]{3},[^*\r\n]{0,200}\*[0-9A-Fa-f]{2}")
-_NOVATEL_ASCII: Final = re.compile(rb"#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
+_NOVATEL: Final = re.compile(rb"\xaa\x44\x12\x1c|#[A-Z0-9]{4,20}A,[^;\r\n]{10,120};")
 
 
-def _count_nmea(data: bytes) -> int:
+def _count_sentences(data: bytes, is_vectornav: bool) -> int:
     return sum(
         reduce(xor, body, 0) == int(checksum, 16)
         for body, checksum in _SENTENCE.findall(data)
-        if not body.startswith(b"VN")
+        if body.startswith(b"VN") is is_vectornav
     )
-
-
-def _count_vectornav(data: bytes) -> int:
-    # of a unit as it comes from its maker: binary output is switched on by a driver
-    return len(_VECTORNAV.findall(data))
-
-
-def _count_novatel(data: bytes) -> int:
-    return data.count(b"\xaa\x44\x12\x1c") + len(_NOVATEL_ASCII.findall(data))
 
 
 PROTOCOLS: Final = (
     KnownProtocol("UBX messages of a u-blox receiver", "ublox", _count_ubx),
-    KnownProtocol("NovAtel logs", "novatel", _count_novatel),
+    KnownProtocol("NovAtel logs", "novatel", lambda data: len(_NOVATEL.findall(data))),
     KnownProtocol("Xbus messages of an Xsens unit", "xsens", _count_xbus),
-    KnownProtocol("messages of a VectorNav unit", "vectornav", _count_vectornav),
-    KnownProtocol("NMEA sentences", "nmea", _count_nmea),
+    # as it comes from its maker: binary output is switched on by a driver
+    KnownProtocol("messages of a VectorNav unit", "vectornav", partial(_count_sentences, is_vectornav=True)),
+    KnownProtocol("NMEA sentences", "nmea", partial(_count_sentences, is_vectornav=False)),
 )
 
 
@@ -298,16 +279,9 @@ class ScriptRunner:
         self._deadline_ns = self._attempt = 0
         self._reply: Any = None
 
-    def _prepare(self, step: RequestStep | PauseStep) -> None:
-        """Get ready for a step that waits: it begins, or its request is sent again."""
-
     @property
     def is_running(self) -> bool:
         return self._script is not None
-
-    @property
-    def is_requesting(self) -> bool:
-        return isinstance(self.step, RequestStep)
 
     @property
     def deadline_ns(self) -> int | None:
@@ -317,7 +291,7 @@ class ScriptRunner:
     def start(self, script: Script, now: HostTime) -> list[Output[bytes]]:
         self.stop()
         self._script = script
-        return self._advance(partial(next, script), now)
+        return self._advance(now)
 
     def stop(self) -> None:
         if self._script is not None:
@@ -326,7 +300,7 @@ class ScriptRunner:
 
     def reopen(self, now: HostTime) -> list[Output[bytes]] | None:
         """Continue a script that has requested the reopening of the line; None if none has."""
-        return self._resume(None, now) if isinstance(self.step, Reopen) else None
+        return self._advance(now) if isinstance(self.step, Reopen) else None
 
     def on_reply(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
         """Complete the request under way."""
@@ -334,7 +308,7 @@ class ScriptRunner:
         if not isinstance(step, RequestStep):
             return []
         if self._attempt == 1:
-            return self._resume(reply, now)
+            return self._advance(now, reply)
         self._wait(PauseStep(self._attempt * step.timeout), now, reply)
         return []
 
@@ -343,25 +317,19 @@ class ScriptRunner:
         if due is None or now.monotonic_ns < due:
             return []
         if not isinstance(step, RequestStep):
-            return self._resume(self._reply, now)
+            return self._advance(now, self._reply)
         if self._attempt < step.attempts:
             return [self._send_request(step, now)]
-        assert self._script is not None
-        error = NoReplyError(f"{step.what} was sent {step.attempts} times and not answered")
-        return self._advance(partial(self._script.throw, error), now)
+        return self._advance(now, error=NoReplyError(f"{step.what} was sent {step.attempts} times and not answered"))
 
-    def _resume(self, reply: Any, now: HostTime) -> list[Output[bytes]]:
-        assert self._script is not None
-        return self._advance(partial(self._script.send, reply), now)
-
-    def _advance(self, resume: Callable[[], Step], now: HostTime) -> list[Output[bytes]]:
-        """Continue to the next step that waits; return the outputs until there."""
+    def _advance(self, now: HostTime, reply: Any = None, error: NoReplyError | None = None) -> list[Output[bytes]]:
+        """Continue with a reply or an error to the next step that waits; return the outputs until there."""
         script, self.step = self._script, None
         assert script is not None
         outputs: list[Output[bytes]] = []
         while True:
             try:
-                step = resume()
+                step = script.send(reply) if error is None else script.throw(error)
             except StopIteration:
                 self._script = None
                 return outputs
@@ -375,17 +343,15 @@ class ScriptRunner:
             if isinstance(step, Reopen):
                 self.step = step
                 return outputs
-            resume = partial(next, script)
+            reply = error = None
 
     def _wait(self, step: PauseStep, now: HostTime, reply: Any = None) -> None:
         self.step, self._reply = step, reply
         self._deadline_ns = now.monotonic_ns + round(step.seconds * 1e9)
-        self._prepare(step)
 
     def _send_request(self, step: RequestStep, now: HostTime) -> Send[bytes]:
         self._attempt += 1
         self._deadline_ns = now.monotonic_ns + round(step.timeout * 1e9)
-        self._prepare(step)
         return Send(step.frame)
 
 
@@ -425,17 +391,14 @@ class ByteSettings:
         check_ranges(self, silence=(0.05, 3600.0), delay=(-5.0, 5.0), delay_sigma=(0.0, 5.0))
         if any(baud <= 0 for baud in self.bauds):
             raise ValueError(f"bauds are above 0, got {self.bauds}")
+        rate_hz = getattr(self, "rate_hz", 0.0)
+        if 0.0 < rate_hz * self.silence < 1.5:
+            raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {self.silence:g}")
 
     @property
     def bauds(self) -> tuple[int, ...]:
         """Baud rates to try; the line is opened at the first. Empty: the line has none."""
         return ()
-
-
-def check_silence(silence: float, rate_hz: float) -> None:
-    """Raise ValueError for a timeout that a device at this rate would exceed."""
-    if silence < 1.5 / rate_hz:
-        raise ValueError(f"silence is at least 1.5 periods, {1.5 / rate_hz:g} s, got {silence:g}")
 
 
 class StreamDriver(ABC, Generic[M]):
@@ -447,13 +410,17 @@ class StreamDriver(ABC, Generic[M]):
     """What is looked for, e.g. "u-blox receiver"."""
     awaited: str
     """What it streams, e.g. "NAV-PVT"."""
+    formats: ClassVar[Sequence[FrameFormat[Any]]] = ()
+    """Those of its frames, unless it has a scanner of its own."""
+    identification = b""
+    """Request for the device's identity; nothing for one that is only read."""
     answer_timeout = 0.5
     """Timeout for an answer, seconds."""
     attempts = 3
     """How often an unanswered message is sent."""
 
-    def __init__(self, settings: ByteSettings, stream: FrameScanner[M]) -> None:
-        self._settings, self._stream = settings, stream
+    def __init__(self, settings: ByteSettings, stream: FrameScanner[M] | None = None) -> None:
+        self._settings, self._stream = settings, stream or FrameScanner(self.formats)
         self.max_silence = settings.silence
         self._phase, self._reported = EndpointPhase.WAITING, ""
         self._setup = ScriptRunner()
@@ -469,12 +436,6 @@ class StreamDriver(ABC, Generic[M]):
         self._seq = 0
         self._counts: Counter[str] = Counter()
 
-    # --- what a device defines ---
-
-    def _make_identification(self) -> bytes:
-        """Return the request for the device's identity; nothing for one that is only read."""
-        return b""
-
     @abstractmethod
     def _on_message(self, message: M, now: HostTime) -> list[Output[bytes]]:
         """Process a message: call `_on_identity`, `_on_acknowledgement` or `_publish`."""
@@ -489,8 +450,6 @@ class StreamDriver(ABC, Generic[M]):
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         """Do what the device's own deadline is for."""
         return []
-
-    # --- endpoint ---
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -533,8 +492,6 @@ class StreamDriver(ABC, Generic[M]):
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
         return []
 
-    # --- for the device ---
-
     def _on_identity(self, product: str, steps: Sequence[SetupStep], now: HostTime) -> list[Output[bytes]]:
         """Begin the setup of a device that has answered."""
         return [] if self._setup_step else self._setup.on_reply((product, steps), now)
@@ -542,7 +499,7 @@ class StreamDriver(ABC, Generic[M]):
     @property
     def _step(self) -> SetupStep | None:
         """The step whose acknowledgement is awaited."""
-        return self._setup_step if self._setup.is_requesting else None
+        return self._setup_step if isinstance(self._setup.step, RequestStep) else None
 
     def _on_acknowledgement(self, now: HostTime, error: str = "") -> list[Output[bytes]]:
         """Go on to the next step; `error`: why the device rejected this one."""
@@ -583,14 +540,13 @@ class StreamDriver(ABC, Generic[M]):
         self._phase, self._reported = phase, text
         return [EndpointStatus(phase, text, is_warning)]
 
-    # --- setup ---
-
     def _run_setup(self) -> Script:
         """Find the device and configure it; then samples must come."""
+        limits = self.answer_timeout, self.attempts
         while True:
             self._setup_step, self._first_bytes, seq = None, b"", self._seq
             try:
-                self._product, steps = yield self._make_request(self._make_identification())
+                self._product, steps = yield RequestStep(self.identification, *limits)
                 break
             except NoReplyError:
                 if self._seq > seq:
@@ -605,7 +561,7 @@ class StreamDriver(ABC, Generic[M]):
         for step in steps:
             self._setup_step = step
             try:
-                error = yield self._make_request(step.frame)
+                error = yield RequestStep(step.frame, *limits)
             except NoReplyError:
                 self._counts["unanswered"] += 1
                 error = "" if step.is_optional else "no answer"
@@ -618,9 +574,6 @@ class StreamDriver(ABC, Generic[M]):
             text = f"{self._product} is set up, waiting for {self.awaited}"
             yield from self._set_status(EndpointPhase.CONFIGURING, text)
         self._restart_silence_timer()
-
-    def _make_request(self, frame: bytes) -> RequestStep:
-        return RequestStep(frame, self.answer_timeout, self.attempts)
 
     def _restart_silence_timer(self) -> None:
         self._silence_deadline_ns = self._now.monotonic_ns + round(self._settings.silence * SECOND_NS)

@@ -26,16 +26,8 @@ from typing import Final, NamedTuple
 from modelserver.errors import quote, suggest_name
 from modelserver.messages import NAN, ImuSample, JointSample, JointsSample, Sample, SensorHeader
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.devices.stream import (
-    NEVER_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    Script,
-    StreamDriver,
-    recognize_line,
-)
+from msdrivers.devices import Strict, check_choice, check_factor, check_ranges
+from msdrivers.devices.stream import NEVER_NS, ByteSettings, ParsedFrame, Script, StreamDriver, recognize_line
 from msdrivers.endpoint import EndpointPhase, HostTime, Output
 
 MAX_LINE: Final = 1024
@@ -81,8 +73,7 @@ class TextSettings(Strict, ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, columns=(1, 256))
-        if self.checksum not in ("none", "xor"):
-            raise ValueError(f"checksum is none or xor, got {quote(self.checksum)}")
+        check_choice(self, checksum=("none", "xor"))
         for name, column in self.mapped.items():
             if column.column >= self.columns:
                 raise ValueError(f"fields: {name} is in column {column.column}, but a line has {self.columns}, from 0")
@@ -134,10 +125,11 @@ class TextDriver(StreamDriver[TextLine]):
     """
 
     description = "device that sends lines of text"
+    formats = (LineFormat(),)
     _settings: TextSettings
 
     def __init__(self, settings: TextSettings) -> None:
-        super().__init__(settings, FrameScanner((LineFormat(),)))
+        super().__init__(settings)
         self.awaited = f"lines of {settings.columns} columns"
         self._is_partial = True
         """What comes next may be the end of a line."""
@@ -175,46 +167,44 @@ class TextDriver(StreamDriver[TextLine]):
 
     def _on_message(self, message: TextLine, now: HostTime) -> list[Output[bytes]]:
         is_partial, self._is_partial = self._is_partial, message.is_cut
-        values = None if is_partial else self._read(message.data)
-        if values is None:
+        if is_partial:
+            return []
+        self._last_line = message.data[:200]
+        values, reason = self._read(message.data)
+        if reason == "other_lines":
+            self._counts[reason] += 1
+        elif reason:
+            self._stream.reject(reason)
+        if reason:
             return []
         device_utime = max(1, round(1e6 * values["time"])) if "time" in values else 0
         header = self._make_header(self._find_arrival(message.start, now), device_utime)
         return self._publish(self._make_sample(values, header), now, 1e-3)
 
-    def _read(self, line: bytes) -> dict[str, float] | None:
-        """Return the numbers of a line in SI units; None, counted by reason, for one that is not used."""
+    def _read(self, line: bytes) -> tuple[dict[str, float], str]:
+        """Return the numbers of a line in SI units, or why it is not used."""
         settings = self._settings
-        self._last_line = line[:200]
         if len(line) > MAX_LINE:
-            self._stream.reject("length")
-            return None
+            return {}, "length"
         text = line.decode("latin-1").strip()
         if settings.checksum == "xor":
             text, star, checksum = text.rpartition("*")
             body = text.removeprefix("$").encode("latin-1")
             if not star or checksum.upper() != f"{reduce(xor, body, 0):02X}":
-                self._stream.reject("checksum")
-                return None
+                return {}, "checksum"
         if not text.startswith(settings.starts_with):
-            self._counts["other_lines"] += 1
-            return None
+            return {}, "other_lines"
         columns = text.split(settings.separator) if settings.separator else text.split()
         if len(columns) != settings.columns:
-            self._stream.reject("columns")
-            return None
+            return {}, "columns"
         try:
             values = {
                 name: float(columns[each.column]) * each.scale + each.offset for name, each in settings.mapped.items()
             }
         except ValueError:
-            self._stream.reject("number")
-            return None
-        for name, value in values.items():
-            if not abs(value) <= self._get_limit(name):
-                self._stream.reject("range")
-                return None
-        return values
+            return {}, "number"
+        is_possible = all(abs(value) <= self._get_limit(name) for name, value in values.items())
+        return (values, "") if is_possible else ({}, "range")
 
 
 VECTORS: Final = {"specific_force": 400.0, "angular_velocity": 60.0, "magnetic_field": 0.01}

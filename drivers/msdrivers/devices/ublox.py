@@ -12,38 +12,19 @@ at the end of the epoch (NAV-EOE), at the latest after `HOLD_NS`.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from pyubx2 import (
-    GET,
-    SET,
-    UBX_CLASSES,
-    UBX_MSGIDS,
-    UBXMessage,
-    UBXMessageError,
-    UBXParseError,
-    UBXReader,
-    UBXTypeError,
-)
+import pyubx2
 
 from modelserver.messages import NAN, FixType, GpsSample, SensorHeader
 from modelserver.transforms.so3 import Matrix3
 from msdrivers.devices import check_ranges
 from msdrivers.devices.gps import course_from_track
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-    check_silence,
-    compute_fletcher,
-)
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 SYNC: Final = b"\xb5\x62"
@@ -101,25 +82,17 @@ class UbxFormat:
         if len(buffer) < end:
             return None
         frame = bytes(buffer[at:end])
-        if compute_fletcher(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
+        if pyubx2.calc_checksum(frame[2:-CHECKSUM_BYTES]) != frame[-CHECKSUM_BYTES:]:
             return RejectedFrame("checksum")
-        name = UBX_MSGIDS.get(frame[2:4], "") or f"{UBX_CLASSES.get(frame[2:3], 'UBX')}-{frame[2]:02X}{frame[3]:02X}"
+        kind = pyubx2.UBX_CLASSES.get(frame[2:3], "UBX")
+        name = pyubx2.UBX_MSGIDS.get(frame[2:4], "") or f"{kind}-{frame[2]:02X}{frame[3]:02X}"
         if name not in USED:
             return ParsedFrame(end, f"ubx.{name}", None)
         try:
-            values = UBXReader.parse(frame, msgmode=GET)
-        except (UBXParseError, UBXMessageError, UBXTypeError, ValueError):
+            values = pyubx2.UBXReader.parse(frame, msgmode=pyubx2.GET)
+        except (pyubx2.UBXParseError, pyubx2.UBXMessageError, pyubx2.UBXTypeError, ValueError):
             return RejectedFrame("ubx_payload")
         return ParsedFrame(end, f"ubx.{name}", UbxMessage(name, values, start))
-
-
-class UbxStream(FrameScanner[UbxMessage]):
-    """Parses bytes to UBX messages. Never raises; memory is bounded."""
-
-    formats = (UbxFormat(),)
-
-
-# --- values of messages ---------------------------------------------------------------------------------------
 
 
 def get_fix_type(pvt: Any) -> FixType:
@@ -163,24 +136,9 @@ def get_protocol_version(version: Any) -> tuple[str, float]:
         for name, value in vars(version).items()
         if name.startswith(("extension", "swVersion", "hwVersion"))
     ]
-    protocol, product = 0.0, ""
-    for text in texts:
-        key, _, value = text.replace("=", " ").partition(" ")
-        if key == "PROTVER":
-            try:
-                protocol = float(value.split()[0])
-            except (ValueError, IndexError):
-                protocol = 0.0
-        elif key == "MOD":
-            product = value.strip()
-    return product or "u-blox receiver", protocol
-
-
-# --- configuration --------------------------------------------------------------------------------------------
-
-
-def make_version_poll() -> bytes:
-    return _encode(UBXMessage("MON", "MON-VER", 2))
+    stated = dict(text.replace("=", " ").partition(" ")[::2] for text in texts)
+    protocol = re.match(r"\s*(\d+(?:\.\d*)?)(?!\S)", stated.get("PROTVER", ""))
+    return stated.get("MOD", "").strip() or "u-blox receiver", float(protocol[1]) if protocol else 0.0
 
 
 def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
@@ -188,7 +146,7 @@ def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
     period_ms = round(1000.0 / rate_hz)
     if protocol >= VALSET_VERSION:
         return _make_valset(period_ms)
-    rate = UBXMessage("CFG", "CFG-RATE", SET, measRate=period_ms, navRate=1, timeRef=1)
+    rate = pyubx2.UBXMessage("CFG", "CFG-RATE", pyubx2.SET, measRate=period_ms, navRate=1, timeRef=1)
     return (
         SetupStep(_encode(rate), f"a rate of {rate_hz:g} Hz"),
         *(_make_message_rate(name, is_optional=False) for name in REQUIRED_OUTPUT),
@@ -198,7 +156,7 @@ def make_setup(protocol: float, rate_hz: float) -> tuple[SetupStep, ...]:
 
 def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
     def configure(values: list[tuple[str, int]], what: str, is_optional: bool = False) -> SetupStep:
-        return SetupStep(_encode(UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
+        return SetupStep(_encode(pyubx2.UBXMessage.config_set(_RAM, _NO_TRANSACTION, values)), what, is_optional)
 
     setups = [
         configure([("CFG_RATE_MEAS", period_ms), ("CFG_RATE_NAV", 1)], f"a rate of {1000.0 / period_ms:g} Hz"),
@@ -213,16 +171,16 @@ def _make_valset(period_ms: int) -> tuple[SetupStep, ...]:
     return tuple(setups)
 
 
-_CODES: Final = {name.replace("-", "_"): code for code, name in UBX_MSGIDS.items()}
+_CODES: Final = {name.replace("-", "_"): code for code, name in pyubx2.UBX_MSGIDS.items()}
 
 
 def _make_message_rate(name: str, *, is_optional: bool) -> SetupStep:
     """Return the CFG-MSG that switches a message on at this port."""
-    frame = UBXMessage("CFG", "CFG-MSG", SET, payload=_CODES[name] + b"\x01")
+    frame = pyubx2.UBXMessage("CFG", "CFG-MSG", pyubx2.SET, payload=_CODES[name] + b"\x01")
     return SetupStep(_encode(frame), name.replace("_", "-"), is_optional)
 
 
-def _encode(message: UBXMessage) -> bytes:
+def _encode(message: pyubx2.UBXMessage) -> bytes:
     data: bytes = message.serialize()
     return data
 
@@ -230,7 +188,7 @@ def _encode(message: UBXMessage) -> bytes:
 FIXED: Final = 2
 """carrSoln: ambiguities fixed."""
 
-HOLD_NS: Final = SECOND_NS // 10
+HOLD_NS: Final = 100_000_000
 """How long a position waits for the other messages of its epoch, where no NAV-EOE ends it: they are sent at once, 400
 bytes in 0.1 s at 38400 baud."""
 
@@ -256,78 +214,70 @@ class UbloxSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(0.1, 25.0))
-        check_silence(self.silence, self.rate_hz)
 
 
-class Epoch:
-    """The messages of one instant of the receiver, by name."""
+def to_sample(header: SensorHeader, parts: Mapping[str, Any]) -> GpsSample:
+    """Return the fix of the messages of one instant, which are in degrees, millimeters and millimeters per second."""
+    pvt = parts["NAV-PVT"]
+    fix_type = get_fix_type(pvt)
+    is_placed = has_place(pvt)
+    latitude, longitude, height, msl = pvt.lat, pvt.lon, pvt.height * 1e-3, pvt.hMSL * 1e-3
+    precise = parts.get("NAV-HPPOSLLH")
+    if precise is not None and not precise.invalidLlh:
+        latitude, longitude = precise.lat, precise.lon
+        height, msl = precise.height * 1e-3, precise.hMSL * 1e-3
+    dop = parts.get("NAV-DOP")
+    position, velocity = _find_covariances(pvt, parts.get("NAV-COV"))
+    yaw, yaw_sigma = _find_baseline(parts.get("NAV-RELPOSNED"))
+    return GpsSample(
+        header,
+        fix_type,
+        latitude if is_placed else NAN,
+        longitude if is_placed else NAN,
+        height_ellipsoidal=height if is_placed else NAN,
+        height_msl=msl if is_placed else NAN,
+        undulation=height - msl if is_placed else NAN,
+        satellites=pvt.numSV,
+        hdop=NAN if dop is None else dop.hDOP,
+        vdop=NAN if dop is None else dop.vDOP,
+        pdop=pvt.pDOP,
+        position_covariance=position if is_placed else None,
+        velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if is_placed else None,
+        velocity_covariance=velocity if is_placed else None,
+        velocity_latency=0.0 if is_placed else NAN,
+        speed=pvt.gSpeed * 1e-3 if is_placed else NAN,
+        course=course_from_track(pvt.headMot) if is_placed and pvt.gSpeed * 1e-3 > MOVING else NAN,
+        baseline_yaw=yaw,
+        baseline_yaw_sigma=yaw_sigma,
+    )
 
-    def __init__(self, itow: int, host_utime: int, deadline_ns: int):
-        self.itow, self.host_utime, self.deadline_ns = itow, host_utime, deadline_ns
-        self.parts: dict[str, Any] = {}
 
-    def to_sample(self, header: SensorHeader) -> GpsSample:
-        """Return the fix. The messages are in degrees, millimeters and millimeters per second."""
-        pvt = self.parts["NAV-PVT"]
-        fix_type = get_fix_type(pvt)
-        is_placed = has_place(pvt)
-        latitude, longitude, height, msl = pvt.lat, pvt.lon, pvt.height * 1e-3, pvt.hMSL * 1e-3
-        precise = self.parts.get("NAV-HPPOSLLH")
-        if precise is not None and not precise.invalidLlh:
-            latitude, longitude = precise.lat, precise.lon
-            height, msl = precise.height * 1e-3, precise.hMSL * 1e-3
-        dop = self.parts.get("NAV-DOP")
-        position, velocity = self._find_covariances(pvt)
-        yaw, yaw_sigma = self._find_baseline()
-        return GpsSample(
-            header,
-            fix_type,
-            latitude if is_placed else NAN,
-            longitude if is_placed else NAN,
-            height_ellipsoidal=height if is_placed else NAN,
-            height_msl=msl if is_placed else NAN,
-            undulation=height - msl if is_placed else NAN,
-            satellites=pvt.numSV,
-            hdop=NAN if dop is None else dop.hDOP,
-            vdop=NAN if dop is None else dop.vDOP,
-            pdop=pvt.pDOP,
-            position_covariance=position if is_placed else None,
-            velocity=(pvt.velE * 1e-3, pvt.velN * 1e-3, -pvt.velD * 1e-3) if is_placed else None,
-            velocity_covariance=velocity if is_placed else None,
-            velocity_latency=0.0 if is_placed else NAN,
-            speed=pvt.gSpeed * 1e-3 if is_placed else NAN,
-            course=course_from_track(pvt.headMot) if is_placed and pvt.gSpeed * 1e-3 > MOVING else NAN,
-            baseline_yaw=yaw,
-            baseline_yaw_sigma=yaw_sigma,
-        )
+def _find_covariances(pvt: Any, cov: Any) -> tuple[Matrix3 | None, Matrix3 | None]:
+    """Return those of position (m2) and velocity (m2/s2) along east, north, up.
 
-    def _find_covariances(self, pvt: Any) -> tuple[Matrix3 | None, Matrix3 | None]:
-        """Return those of position (m2) and velocity (m2/s2) along east, north, up.
+    Without NAV-COV the horizontal accuracy is shared by both axes, as the length of a circular error; that of the
+    speed is taken for each pair of axes in the same way.
+    """
+    a, b, c = pvt.hAcc * 1e-3, pvt.vAcc * 1e-3, pvt.sAcc * 1e-3
+    position: Matrix3 | None = (a * a / 2, 0.0, 0.0, 0.0, a * a / 2, 0.0, 0.0, 0.0, b * b)
+    velocity: Matrix3 | None = (c * c / 2, 0.0, 0.0, 0.0, c * c / 2, 0.0, 0.0, 0.0, c * c / 2)
+    if cov is not None and cov.posCovValid:
+        position = _to_enu(*(getattr(cov, f"posCov{axes}") for axes in _AXES))
+    if cov is not None and cov.velCovValid:
+        velocity = _to_enu(*(getattr(cov, f"velCov{axes}") for axes in _AXES))
+    return position if a > 0.0 else None, velocity if c > 0.0 else None
 
-        Without NAV-COV the horizontal accuracy is shared by both axes, as the length of a circular error; that of the
-        speed is taken for each pair of axes in the same way.
-        """
-        cov = self.parts.get("NAV-COV")
-        a, b, c = pvt.hAcc * 1e-3, pvt.vAcc * 1e-3, pvt.sAcc * 1e-3
-        position: Matrix3 | None = (a * a / 2, 0.0, 0.0, 0.0, a * a / 2, 0.0, 0.0, 0.0, b * b)
-        velocity: Matrix3 | None = (c * c / 2, 0.0, 0.0, 0.0, c * c / 2, 0.0, 0.0, 0.0, c * c / 2)
-        if cov is not None and cov.posCovValid:
-            position = _to_enu(*(getattr(cov, f"posCov{axes}") for axes in _AXES))
-        if cov is not None and cov.velCovValid:
-            velocity = _to_enu(*(getattr(cov, f"velCov{axes}") for axes in _AXES))
-        return position if a > 0.0 else None, velocity if c > 0.0 else None
 
-    def _find_baseline(self) -> tuple[float, float]:
-        """Return the direction to the moving base's antenna and its sigma, radians; nan if it is not known.
+def _find_baseline(relative: Any) -> tuple[float, float]:
+    """Return the direction to the moving base's antenna and its sigma, radians; nan if it is not known.
 
-        NAV-RELPOSNED has the vector from the base to this antenna, whose position NAV-PVT gives.
-        """
-        relative = self.parts.get("NAV-RELPOSNED")
-        if relative is None or not (relative.isMoving and relative.carrSoln == FIXED):
-            return NAN, NAN
-        if not (relative.relPosValid and getattr(relative, "relPosHeadingValid", 0)):
-            return NAN, NAN
-        return course_from_track(relative.relPosHeading + 180.0), math.radians(relative.accHeading)
+    NAV-RELPOSNED has the vector from the base to this antenna, whose position NAV-PVT gives.
+    """
+    if relative is None or not (relative.isMoving and relative.carrSoln == FIXED):
+        return NAN, NAN
+    if not (relative.relPosValid and getattr(relative, "relPosHeadingValid", 0)):
+        return NAN, NAN
+    return course_from_track(relative.relPosHeading + 180.0), math.radians(relative.accHeading)
 
 
 _AXES: Final = ("NN", "NE", "ND", "EE", "ED", "DD")
@@ -346,21 +296,22 @@ class UbloxDriver(StreamDriver[UbxMessage]):
     device = "ublox"
     description = "u-blox receiver"
     awaited = "NAV-PVT"
+    formats = (UbxFormat(),)
+    identification = _encode(pyubx2.UBXMessage("MON", "MON-VER", pyubx2.POLL))
 
     def __init__(self, settings: UbloxSettings) -> None:
-        super().__init__(settings, UbxStream())
+        super().__init__(settings)
         self._rate_hz = settings.rate_hz
-        self._epoch: Epoch | None = None
+        self._parts: dict[str, Any] = {}
+        """The messages of the epoch under way, by name."""
+        self._itow = self._host_utime = self._deadline_ns = 0
         self._last_itow: int | None = None
 
-    def _make_identification(self) -> bytes:
-        return make_version_poll()
-
     def _on_start(self) -> None:
-        self._epoch = None
+        self._parts.clear()
 
     def _get_extra_deadline(self) -> int | None:
-        return None if self._epoch is None else self._epoch.deadline_ns
+        return self._deadline_ns if self._parts else None
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         return self._publish_epoch(now)
@@ -389,24 +340,24 @@ class UbloxDriver(StreamDriver[UbxMessage]):
         """Add a message to the epoch of its time of week; a later one, or NAV-EOE, completes the one before."""
         itow = message.values.iTOW
         out: list[Output[bytes]] = []
-        if self._epoch is not None and self._epoch.itow != itow:
+        if self._parts and self._itow != itow:
             out += self._publish_epoch(now)
-        if self._epoch is None:
+        if not self._parts:
             if itow == self._last_itow:
                 if message.name == "NAV-PVT":
                     self._counts["repeated"] += 1
                 return out
-            self._epoch = Epoch(itow, self._find_arrival(message.start, now), now.monotonic_ns + HOLD_NS)
-        self._epoch.parts[message.name] = message.values
+            self._itow, self._host_utime = itow, self._find_arrival(message.start, now)
+            self._deadline_ns = now.monotonic_ns + HOLD_NS
+        self._parts[message.name] = message.values
         if message.name == "NAV-EOE":
             out += self._publish_epoch(now)
         return out
 
     def _publish_epoch(self, now: HostTime) -> list[Output[bytes]]:
-        epoch, self._epoch = self._epoch, None
-        assert epoch is not None
-        self._last_itow = epoch.itow
-        if "NAV-PVT" not in epoch.parts:
+        parts, self._parts = self._parts, {}
+        self._last_itow = self._itow
+        if "NAV-PVT" not in parts:
             return []
-        header = self._make_header(epoch.host_utime, get_utime(epoch.parts["NAV-PVT"]))
-        return self._publish(epoch.to_sample(header), now)
+        header = self._make_header(self._host_utime, get_utime(parts["NAV-PVT"]))
+        return self._publish(to_sample(header, parts), now)

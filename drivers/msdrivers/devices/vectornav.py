@@ -19,16 +19,8 @@ from operator import xor
 from typing import Final, TypeAlias
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_ranges, to_rotation
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-)
+from msdrivers.devices import check_choice, check_ranges, make_orientation
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 SYNC: Final = 0xFA
@@ -144,12 +136,6 @@ class VnTextFormat:
         return ParsedFrame(found.end(), f"text.{words[0][:3]}", VnText(words, start))
 
 
-class VnStream(FrameScanner[VnMessage]):
-    """Parses bytes to binary and ASCII messages. Never raises; memory is bounded."""
-
-    formats = (VnBinaryFormat(), VnTextFormat())
-
-
 def encode_text(text: str) -> bytes:
     """Return an ASCII message, e.g. of RRG,01."""
     body = f"VN{text}"
@@ -224,8 +210,7 @@ class VectornavSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1.0, 800.0), unit_port=(1, 2))
-        if self.heading not in ("magnetic", "none"):
-            raise ValueError(f"heading is magnetic or none, got '{self.heading}'")
+        check_choice(self, heading=("magnetic", "none"))
 
 
 class VectornavDriver(StreamDriver[VnMessage]):
@@ -237,16 +222,15 @@ class VectornavDriver(StreamDriver[VnMessage]):
     device = "vectornav"
     description = "VectorNav unit"
     awaited = "binary output"
+    formats = (VnBinaryFormat(), VnTextFormat())
+    identification = encode_text("RRG,01")
     answer_timeout = 0.3
 
     def __init__(self, settings: VectornavSettings) -> None:
-        super().__init__(settings, VnStream())
+        super().__init__(settings)
         self._rate_hz, self._port = settings.rate_hz, settings.unit_port
         self._yaw_source = YawSource.MAGNETIC if settings.heading == "magnetic" else YawSource.NONE
         self._last_ns: int | None = None
-
-    def _make_identification(self) -> bytes:
-        return encode_text("RRG,01")
 
     def _on_start(self) -> None:
         self._last_ns = None
@@ -279,8 +263,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             self._counts["lost"] += max(0, round(step) - 1) if step < 1000.0 else 0
         self._last_ns = time_ns
         magnetic, celsius = message.get_floats(MAGNETIC), message.get_floats(TEMPERATURE)
-        x, y, z, w = message.get_floats(QUATERNION) or (math.nan,) * 4
-        orientation = to_rotation(w, x, y, z)
+        quaternion = message.get_floats(QUATERNION)
+        scalar_first = quaternion and (quaternion[3], *quaternion[:3])
         sample = ImuSample(
             self._make_header(
                 self._find_arrival(message.start, now), 0 if time_ns is None else max(1, time_ns // 1000)
@@ -288,10 +272,8 @@ class VectornavDriver(StreamDriver[VnMessage]):
             angular_velocity=self._read_vector(rate, MAX_RATE),
             specific_force=self._read_vector(force, MAX_ACCELERATION),
             magnetic_field=self._read_vector(magnetic, MAX_ACCELERATION, GAUSS),
-            orientation=orientation,
-            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.NED,
-            yaw_source=YawSource.NONE if orientation is None else self._yaw_source,
             temperature_celsius=celsius[0] if celsius is not None and math.isfinite(celsius[0]) else NAN,
+            **make_orientation(scalar_first, OrientationReference.NED, self._yaw_source),
         )
         return self._publish(sample, now)
 

@@ -20,19 +20,10 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
-from modelserver.messages import NAN, SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices import Strict, check_ranges
-from msdrivers.devices.can import (
-    BoundSignal,
-    BusSettings,
-    CanDatabase,
-    CanDriver,
-    CanFrameSet,
-    SignalBinder,
-    SignalMap,
-    check_signal,
-)
-from msdrivers.endpoint import CanFrame, EndpointStatus, FrameKey, HostTime, MeasuredSample, Output, Send
+from modelserver.messages import NAN, VehicleCommand, VehicleMode, VehicleStatusSample
+from msdrivers.devices import Strict, check_choice, check_ranges, check_signal
+from msdrivers.devices.can import BoundSignal, BusSettings, CanDatabase, CanDriver, CanFrameSet, SignalBinder, SignalMap
+from msdrivers.endpoint import CanFrame, EndpointStatus, FrameKey, HostTime, Output, Send
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,40 +103,18 @@ class BoundStatus:
     map: StatusMap
     signals: dict[str, BoundSignal]
 
-    def get_mode(self, instant: CanFrameSet) -> VehicleMode:
-        """Return the driving mode; UNKNOWN if it is missing or its number is not mapped."""
-        raw = instant.raw(self.signals.get("mode"))
-        numbers = {number: VehicleMode[name.upper()] for name, number in self.map.modes.items()}
-        return VehicleMode.UNKNOWN if raw is None else numbers.get(int(raw), VehicleMode.UNKNOWN)
-
     def get_number(self, name: str, instant: CanFrameSet) -> float:
         """Return one of `NUMERIC_FIELDS` in SI units; nan if it is missing."""
         physical = instant.physical(self.signals.get(name))
         mapped: SignalMap | None = getattr(self.map, name)
         return NAN if physical is None or mapped is None else mapped.to_si(physical)
 
-    def get_word(self, name: str, instant: CanFrameSet) -> int | None:
-        """Return `fault_bits` or `commands_rejected`: 0 if not mapped, None if not received."""
-        if name not in self.signals:
-            return 0
-        raw = instant.raw(self.signals[name])
-        return None if raw is None else int(raw)
-
 
 def bind_status(status: StatusMap, database: CanDatabase, place: str) -> BoundStatus:
     """Bind the status mapping. Raises ConfigError with every unknown or unsuitable signal."""
     binder = SignalBinder(database, place)
-    signals: dict[str, BoundSignal] = {}
-    for name in ("mode", "fault_bits", "commands_rejected"):
-        path = getattr(status, name)
-        found = binder.bind_signal(path, name, whole=True, bits=32 if name == "fault_bits" else 63) if path else None
-        if found is not None:
-            signals[name] = found
-    for name in NUMERIC_FIELDS:
-        mapped: SignalMap | None = getattr(status, name)
-        found = binder.bind_signal(mapped.signal, name) if mapped is not None else None
-        if found is not None:
-            signals[name] = found
+    numbers = dict.fromkeys(NUMERIC_FIELDS, 0)
+    signals = binder.bind_mapped(status, mode=63, fault_bits=32, commands_rejected=63, **numbers)
     binder.finish()
     return BoundStatus(status, signals)
 
@@ -156,41 +125,46 @@ class BoundCommand:
 
     map: CommandMap
     database: CanDatabase
-    forward_speed: BoundSignal
-    steering_angle: BoundSignal
-    alive: BoundSignal | None
-    drive_bits: dict[str, float]
-    stop_bits: dict[str, float]
+    signals: Mapping[str, BoundSignal]
+    drive_bits: Mapping[str, float]
+    stop_bits: Mapping[str, float]
+
+    @property
+    def key(self) -> FrameKey:
+        return self.signals["forward_speed"].key
+
+    @property
+    def motion(self) -> tuple[tuple[BoundSignal, SignalMap], tuple[BoundSignal, SignalMap]]:
+        """Signal and mapping of the speed, m/s, and of the steering angle, radians."""
+        signals = self.signals["forward_speed"], self.signals["steering_angle"]
+        return (signals[0], self.map.forward_speed), (signals[1], self.map.steering_angle)
 
     def make_frame(
         self, forward_speed: float, steering_angle: float, number: int, *, is_stop: bool = False
     ) -> CanFrame:
         """Encode a command, m/s and radians; `number` is the frame count for the alive counter."""
         raw = dict(self.stop_bits if is_stop else self.drive_bits)
-        raw[self.forward_speed.name] = self.forward_speed.to_bits(self.map.forward_speed.from_si(forward_speed))
-        raw[self.steering_angle.name] = self.steering_angle.to_bits(self.map.steering_angle.from_si(steering_angle))
-        if self.alive is not None:
-            raw[self.alive.name] = number % (1 << self.alive.length)
-        return self.database.encode(self.forward_speed.message, raw)
+        for (signal, mapped), value in zip(self.motion, (forward_speed, steering_angle), strict=True):
+            raw[signal.name] = signal.to_bits(mapped.from_si(value))
+        if (alive := self.signals.get("alive")) is not None:
+            raw[alive.name] = number % (1 << alive.length)
+        return self.database.encode(self.signals["forward_speed"].message, raw)
 
     def find_range_problem(self, forward_speed: float, steering_angle: float) -> str:
         """Describe why the signals cannot represent a speed or an angle; empty if they can."""
-        for signal, mapped, value, unit in (
-            (self.forward_speed, self.map.forward_speed, forward_speed, "m/s"),
-            (self.steering_angle, self.map.steering_angle, steering_angle, "rad"),
-        ):
+        limits = ((forward_speed, "m/s"), (steering_angle, "rad"))
+        for (signal, mapped), (value, unit) in zip(self.motion, limits, strict=True):
             held = mapped.to_si(_round_trip(signal, mapped.from_si(value)))
             if abs(held - value) > 1e-9 + abs(mapped.scale * signal.scale):
-                return f"{signal.message}.{signal.name} holds {held:g} {unit} at most, {value:g} is allowed"
+                return f"{signal.path} holds {held:g} {unit} at most, {value:g} is allowed"
         return ""
 
 
 def bind_command(command: CommandMap, database: CanDatabase, place: str) -> BoundCommand:
     """Bind the command mapping. Raises ConfigError with every missing, unknown or unsuitable signal."""
     binder = SignalBinder(database, place)
-    speed = binder.bind_signal(command.forward_speed.signal, "forward_speed")
-    steering = binder.bind_signal(command.steering_angle.signal, "steering_angle")
-    alive = binder.bind_signal(command.alive, "alive", whole=True) if command.alive else None
+    signals = binder.bind_mapped(command, forward_speed=0, steering_angle=0, alive=64)
+    speed, alive = signals.get("forward_speed"), signals.get("alive")
     drive_bits = _bind_constants(binder, command, "drive_signals")
     stop_bits = drive_bits | _bind_constants(binder, command, "stop_signals")
     if speed is not None:
@@ -198,21 +172,19 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
         held = mapped.to_si(_round_trip(speed, mapped.from_si(0.0)))
         # a stop that would be a motion: 0 rounds to another value, and no other signal means stop
         if abs(held) > 1e-9 and drive_bits == stop_bits:
-            text = f"{speed.message}.{speed.name} cannot represent 0: stop would be sent as {held:g} m/s"
+            text = f"{speed.path} cannot represent 0: stop would be sent as {held:g} m/s"
             fix = "set a signal in `stop_signals` that differs from `drive_signals`, or correct scale and offset"
             binder.add_problem("forward_speed", text, fix)
     if alive is not None and alive.is_signed:
         binder.add_problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
     message = command.message if speed is None else speed.message
     if message in database.messages:
-        bound = {signal.name for signal in (speed, steering, alive) if signal is not None} | drive_bits.keys()
+        bound = {signal.name for signal in signals.values()} | drive_bits.keys()
         for name in database.bind_signals(message).keys() - bound:
             fix = f"add {name}: 0, or what the controller expects there"
             binder.add_problem("drive_signals", f"{message}.{name} is given no value, and the frame needs one", fix)
     binder.finish()
-    assert speed is not None
-    assert steering is not None
-    return BoundCommand(command, database, speed, steering, alive, drive_bits, stop_bits)
+    return BoundCommand(command, database, signals, drive_bits, stop_bits)
 
 
 def _bind_constants(binder: SignalBinder, command: CommandMap, key: str) -> dict[str, float]:
@@ -247,8 +219,7 @@ class CommandLimits(Strict):
 
     def __post_init__(self) -> None:
         check_ranges(self, forward_speed=(0.0, 100.0), reverse_speed=(0.0, 100.0), steering_angle=(0.0, 1.6))
-        if self.over_limit not in ("clamp", "reject"):
-            raise ValueError(f"over_limit is clamp or reject, got {self.over_limit!r}")
+        check_choice(self, over_limit=("clamp", "reject"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -311,16 +282,16 @@ class VehicleDriver(CanDriver):
     numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
     """
 
+    settings: VehicleSettings
+
     def __init__(self, settings: VehicleSettings, database: CanDatabase):
         """Bind the signals of status and command. Raises ConfigError for unknown or unsuitable ones."""
         place = f"drivers.{settings.source}"
         self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
         signals = self._status.signals if self._status is not None else {}
         super().__init__(database, signals.values(), settings)
-        self.max_silence = settings.silence if signals else math.inf
         self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
         self._mode: VehicleMode | None = None
-        self.settings = settings
         self._signals: BoundCommand | None = None
         self._command_key: FrameKey | None = None
         self._period_ns = round(settings.command_period * 1e9)
@@ -335,12 +306,10 @@ class VehicleDriver(CanDriver):
             return
         limits = settings.limits
         self._signals = bind_command(settings.command, database, f"{place}.command")
-        self._command_key = self._signals.forward_speed.key
-        forward, backward = (
-            (limits.forward_speed, limits.steering_angle),
-            (-limits.reverse_speed, -limits.steering_angle),
-        )
-        if problem := self._signals.find_range_problem(*forward) or self._signals.find_range_problem(*backward):
+        self._command_key = self._signals.key
+        problem = self._signals.find_range_problem(limits.forward_speed, limits.steering_angle)
+        problem = problem or self._signals.find_range_problem(-limits.reverse_speed, -limits.steering_angle)
+        if problem:
             location = Location(database.name, 0, f"{place}.limits")
             raise ConfigError([Problem(Severity.ERROR, problem, location, "lower the limit")])
 
@@ -497,38 +466,34 @@ class VehicleDriver(CanDriver):
         self._warned_until_ns[reason] = now.monotonic_ns + _WARNING_INTERVAL_NS
         return [EndpointStatus(self.phase, text, is_warning=True)]
 
-    def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
+    def _publish_instant(self, instant: CanFrameSet, now: HostTime) -> list[Output[CanFrame]]:
         status = self._status
-        outputs: list[Output[CanFrame]] = []
-        if status is None:
+        assert status is not None
+        outputs = self._check_values((status.signals.get(name) for name in NUMERIC_FIELDS), instant)
+        raw = {name: instant.raw(signal) for name, signal in status.signals.items()}
+        # 0 if not mapped, None if not received
+        faults, rejected = raw.get("fault_bits", 0), raw.get("commands_rejected", 0)
+        if faults is None or rejected is None:
+            # these have no number for "missing"
+            self.counts["rejected.incomplete"] += 1
+            self._note_useless("without fault_bits or commands_rejected")
             return outputs
-        for instant in instants:
-            self.counts["incomplete"] += not instant.is_complete
-            outputs += self._check_values((status.signals.get(name) for name in NUMERIC_FIELDS), instant)
-            faults, rejected = status.get_word("fault_bits", instant), status.get_word("commands_rejected", instant)
-            if faults is None or rejected is None:
-                # these have no number for "missing"
-                self.counts["rejected.incomplete"] += 1
-                self._note_useless("without fault_bits or commands_rejected")
-                continue
-            rejected += self._rejected
-            numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
-            mode = status.get_mode(instant)
-            is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
-            if not is_known and not self._has_status_words:
-                self._note_empty()
-                continue
-            header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
-            # the highest of the 32 bits is the sign on the wire
-            faults = (faults + (1 << 31)) % (1 << 32) - (1 << 31)
-            sample = VehicleStatusSample(header, mode, **numbers, fault_bits=faults, commands_rejected=max(0, rejected))
-            self._seq += 1
-            self.counts["samples"] += 1
-            outputs += self._on_usable(now, f"the vehicle controller sends its status; {_MODE_TEXTS[mode]}")
-            if self._mode not in (None, mode):
-                outputs.append(EndpointStatus(self.phase, _MODE_TEXTS[mode]))
-            self._mode = mode
-            outputs.append(MeasuredSample(sample, self.settings.delay, self.settings.delay_sigma))
+        numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
+        known = (VehicleMode[name.upper()] for name, number in status.map.modes.items() if number == raw.get("mode"))
+        mode = next(known, VehicleMode.UNKNOWN)
+        is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
+        if not is_known and not self._has_status_words:
+            self._note_empty()
+            return outputs
+        # the highest of the 32 bits is the sign on the wire
+        faults = (int(faults) + (1 << 31)) % (1 << 32) - (1 << 31)
+        rejected = max(0, int(rejected) + self._rejected)
+        header = self._make_header(instant)
+        sample = VehicleStatusSample(header, mode, **numbers, fault_bits=faults, commands_rejected=rejected)
+        outputs += self._publish_sample(sample, f"the vehicle controller sends its status; {_MODE_TEXTS[mode]}", now)
+        if self._mode not in (None, mode):
+            outputs.append(EndpointStatus(self.phase, _MODE_TEXTS[mode]))
+        self._mode = mode
         return outputs
 
 

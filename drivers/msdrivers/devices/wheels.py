@@ -18,19 +18,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from modelserver.errors import quote
-from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
-from msdrivers.devices import Strict, check_factor, check_ranges
-from msdrivers.devices.can import (
-    BoundSignal,
-    BusSettings,
-    CanDatabase,
-    CanDriver,
-    CanFrameSet,
-    SignalBinder,
-    SignalMap,
-    check_signal,
-)
-from msdrivers.endpoint import CanFrame, EndpointStatus, HostTime, MeasuredSample, Output
+from modelserver.messages import NAN, Direction, WheelSample, WheelsSample
+from msdrivers.devices import Strict, check_factor, check_ranges, check_signal
+from msdrivers.devices.can import BoundSignal, BusSettings, CanDatabase, CanDriver, CanFrameSet, SignalBinder, SignalMap
+from msdrivers.endpoint import CanFrame, HostTime, Output
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +79,13 @@ class DirectionMap(Strict):
     backward: int = 2
     """The same for a wheel that rolls backward."""
 
+    @property
+    def numbers(self) -> dict[Direction, int]:
+        return {Direction.STOPPED: self.stopped, Direction.FORWARD: self.forward, Direction.BACKWARD: self.backward}
+
     def __post_init__(self) -> None:
         check_signal(self.signal)
-        if len({self.stopped, self.forward, self.backward}) < 3:
+        if len(set(self.numbers.values())) < 3:
             raise ValueError("stopped, forward and backward have three different numbers")
 
 
@@ -208,43 +203,30 @@ class Odometer:
 
 @dataclass(frozen=True, slots=True)
 class BoundWheel:
-    """Mapping and signals of one wheel; None for a signal that is not mapped."""
+    """Mapping and signals of one wheel: those of count, speed, direction and steering that are mapped."""
 
     name: str
     map: WheelMap
-    count: BoundSignal | None
-    speed: BoundSignal | None
-    direction: BoundSignal | None
-    steering: BoundSignal | None
-
-    @property
-    def signals(self) -> list[BoundSignal]:
-        return [each for each in (self.count, self.speed, self.direction, self.steering) if each is not None]
+    signals: Mapping[str, BoundSignal]
 
     def make_odometer(self, max_speed: float, delay: float) -> Odometer | None:
         """Make the initial odometer of the counter, m/s and seconds; None for a wheel without a counter."""
-        if self.count is None or self.map.count is None:
+        if self.map.count is None or "count" not in self.signals:
             return None
-        wrap = self.map.count.wrap or 1 << self.count.length
+        wrap = self.map.count.wrap or 1 << self.signals["count"].length
         return Odometer(wrap, self.map.count.meters_per_count, max_speed, delay, self.map.count.counts_up_only)
 
     def get_direction(self, instant: CanFrameSet) -> Direction:
         """Return the direction of rotation that the encoder reports."""
         if self.map.is_unsigned:
             return Direction.UNSIGNED
-        raw = instant.raw(self.direction)
-        if raw is None or self.map.direction is None:
-            return Direction.UNKNOWN
-        numbers = {
-            self.map.direction.stopped: Direction.STOPPED,
-            self.map.direction.forward: Direction.FORWARD,
-            self.map.direction.backward: Direction.BACKWARD,
-        }
-        return numbers.get(int(raw), Direction.UNKNOWN) if raw == raw and abs(raw) < 1e18 else Direction.UNKNOWN
+        raw, known = instant.raw(self.signals.get("direction")), self.map.direction
+        found = known.numbers.items() if known is not None else ()
+        return next((direction for direction, number in found if number == raw), Direction.UNKNOWN)
 
     def speed_of(self, instant: CanFrameSet, direction: Direction) -> float:
         """Return the speed, m/s, forward positive (UNSIGNED: its magnitude); nan if it or its sign is missing."""
-        physical = instant.physical(self.speed)
+        physical = instant.physical(self.signals.get("speed"))
         if physical is None or self.map.speed is None:
             return NAN
         speed = physical * self.map.speed.scale
@@ -258,7 +240,7 @@ class BoundWheel:
         """Return the steering angle, radians; 0 for a wheel that does not steer, nan if not measured."""
         if self.map.steering is None:
             return NAN if self.map.is_steered else 0.0
-        physical = instant.physical(self.steering)
+        physical = instant.physical(self.signals.get("steering"))
         return NAN if physical is None else self.map.steering.to_si(physical)
 
 
@@ -273,21 +255,12 @@ def bind_wheels(
     binder = SignalBinder(database, place)
     bound = []
     for name, wheel in wheels.items():
-        parts = (
-            ("count", wheel.count),
-            ("speed", wheel.speed),
-            ("direction", wheel.direction),
-            ("steering", wheel.steering),
-        )
-        count, speed, direction, steering = (
-            binder.bind_signal(part.signal, f"{name}.{key}", whole=key in ("count", "direction")) if part else None
-            for key, part in parts
-        )
-        if count is not None and wheel.count is not None:
-            _check_count(binder, name, wheel.count.wrap, count)
-        if speed is not None and wheel.speed is not None:
-            _check_speed(binder, name, wheel.speed, speed)
-        bound.append(BoundWheel(name, wheel, count, speed, direction, steering))
+        signals = binder.bind_mapped(wheel, f"{name}.", count=64, speed=0, direction=64, steering=0)
+        if wheel.count is not None and "count" in signals:
+            _check_count(binder, name, wheel.count.wrap, signals["count"])
+        if wheel.speed is not None and "speed" in signals:
+            _check_speed(binder, name, wheel.speed, signals["speed"])
+        bound.append(BoundWheel(name, wheel, signals))
         odometer = bound[-1].make_odometer(max_speed, delay)
         if odometer is not None:
             _check_ambiguity(binder, name, odometer)
@@ -296,21 +269,18 @@ def bind_wheels(
 
 
 def _check_count(binder: SignalBinder, name: str, wrap: int, count: BoundSignal) -> None:
-    path = f"{count.message}.{count.name}"
     if count.length < 2:
-        binder.add_problem(
-            f"{name}.count", f"{path} has {count.length} bit; a counter has two or more", "map the counter"
-        )
+        what = f"{count.path} has {count.length} bit; a counter has two or more"
+        binder.add_problem(f"{name}.count", what, "map the counter")
     elif wrap > 1 << count.length:
-        fix = "leave wrap out, or write what the counter wraps at"
-        binder.add_problem(f"{name}.count.wrap", f"{wrap} does not fit into the {count.length} bits of {path}", fix)
+        what = f"{wrap} does not fit into the {count.length} bits of {count.path}"
+        binder.add_problem(f"{name}.count.wrap", what, "leave wrap out, or write what the counter wraps at")
 
 
 def _check_speed(binder: SignalBinder, name: str, speed: SpeedMap, signal: BoundSignal) -> None:
-    path = f"{signal.message}.{signal.name}"
     if speed.is_magnitude and -math.inf < signal.minimum < 0.0:
         fix = "leave is_magnitude out: the signal has a sign of its own"
-        binder.add_problem(f"{name}.speed.is_magnitude", f"{path} goes down to {signal.minimum:g}", fix)
+        binder.add_problem(f"{name}.speed.is_magnitude", f"{signal.path} goes down to {signal.minimum:g}", fix)
 
 
 def _check_ambiguity(binder: SignalBinder, name: str, odometer: Odometer) -> None:
@@ -359,55 +329,42 @@ class WheelsDriver(CanDriver):
 
     A sample holds the frames of one instant; missing and implausible values are nan, a missing direction UNKNOWN. After
     an implausible count or a counter reset one sample or more has no travel; then the travel continues from where it
-    was, without the distance travelled meanwhile (see `odometer`).
+    was, without the distance travelled meanwhile (see `odometer`). The odometers continue when the line was opened
+    again, since the counters may have.
     """
+
+    settings: WheelsSettings
 
     def __init__(self, settings: WheelsSettings, database: CanDatabase):
         """Bind the signals. Raises ConfigError for unknown or unsuitable ones."""
-        self.settings = settings
-        self.max_silence = settings.silence
         place = f"drivers.{settings.source}.wheels"
         self._wheels = bind_wheels(settings.wheels, database, place, settings.max_speed, settings.frame_delay)
-        super().__init__(database, (signal for wheel in self._wheels for signal in wheel.signals), settings)
+        super().__init__(database, (signal for wheel in self._wheels for signal in wheel.signals.values()), settings)
         odometers = {
             wheel.name: wheel.make_odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels
         }
         self._odometers = {name: odometer for name, odometer in odometers.items() if odometer is not None}
-        self._measured = [signal for wheel in self._wheels for signal in (wheel.count, wheel.speed, wheel.steering)]
-        self._warned: set[str] = set()
+        measured = ("count", "speed", "steering")
+        self._measured = [wheel.signals[key] for wheel in self._wheels for key in measured if key in wheel.signals]
 
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start; the odometers continue, since the counters may have."""
-        self._warned.clear()
-        return super().on_open(now)
-
-    def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
-        outputs: list[Output[CanFrame]] = []
-        for instant in instants:
-            warnings = self._check_values(self._measured, instant)
-            wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
-            self.counts["incomplete"] += not instant.is_complete
-            if all(_is_empty(wheel) for wheel in wheels):
-                self._note_empty()
-                outputs += warnings
-                continue
-            header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
-            self._seq += 1
-            self.counts["samples"] += 1
-            outputs += self._on_usable(now, f"{len(wheels)} wheels received")
-            outputs.append(MeasuredSample(WheelsSample(header, wheels), self.settings.delay, self.settings.delay_sigma))
-            outputs += warnings
-        return outputs
+    def _publish_instant(self, instant: CanFrameSet, now: HostTime) -> list[Output[CanFrame]]:
+        warnings = self._check_values(self._measured, instant)
+        wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
+        if all(w.travel != w.travel and w.speed != w.speed and w.direction >= Direction.UNKNOWN for w in wheels):
+            self._note_empty()
+            return warnings
+        sample = WheelsSample(self._make_header(instant), wheels)
+        return [*self._publish_sample(sample, f"{len(wheels)} wheels received", now), *warnings]
 
     def _make_wheel_sample(
         self, wheel: BoundWheel, instant: CanFrameSet, warnings: list[Output[CanFrame]]
     ) -> WheelSample:
         direction = wheel.get_direction(instant)
         travel = travel_sigma = speed_sigma = NAN
-        raw = instant.raw(wheel.count)
-        if raw is not None and wheel.count is not None and wheel.map.count and not wheel.count.find_reserved(raw):
-            sign = _SIGNS.get(direction)
-            odometer = self._odometers[wheel.name]
+        count = wheel.signals.get("count")
+        raw = instant.raw(count)
+        if raw is not None and count is not None and wheel.map.count and not count.find_reserved(raw):
+            odometer, sign = self._odometers[wheel.name], _SIGNS.get(direction)
             self._odometers[wheel.name], travel, reason = odometer.update(raw, instant.monotonic_ns, sign)
             if reason:
                 self._warn(wheel.name, reason, warnings)
@@ -427,11 +384,8 @@ class WheelsDriver(CanDriver):
         key = reason if reason == "resumed" else f"rejected.{reason}"
         self.counts[key] += 1
         self._reasons[reason] = None
-        if f"{name} {reason}" in self._warned:
-            return
-        self._warned.add(f"{name} {reason}")
         text = f"wheel {name}: {_WARNINGS[reason].format(self.settings.max_speed)}"
-        warnings.append(EndpointStatus(self.phase, text, is_warning=reason != "resumed"))
+        warnings += self._report_once(("wheel", name, reason), text, is_warning=reason != "resumed")
 
 
 _WARNINGS = {
@@ -446,11 +400,5 @@ _WARNINGS = {
 }
 
 
-def _is_empty(wheel: WheelSample) -> bool:
-    return wheel.travel != wheel.travel and wheel.speed != wheel.speed and wheel.direction not in _KNOWN_DIRECTIONS
-
-
-_KNOWN_DIRECTIONS = frozenset((Direction.BACKWARD, Direction.STOPPED, Direction.FORWARD))
-
-_SIGNS = {**{turn: int(turn) for turn in _KNOWN_DIRECTIONS}, Direction.UNSIGNED: 1}
+_SIGNS = {Direction.BACKWARD: -1, Direction.STOPPED: 0, Direction.FORWARD: 1, Direction.UNSIGNED: 1}
 """Sign of the step of a counter that only counts up."""

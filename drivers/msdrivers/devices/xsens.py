@@ -8,7 +8,6 @@ Axes: as on the label, z up when it is upright.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,16 +15,8 @@ from enum import IntEnum
 from typing import Final
 
 from modelserver.messages import NAN, ImuSample, OrientationReference, YawSource
-from msdrivers.devices import check_ranges, to_rotation
-from msdrivers.devices.stream import (
-    NO_FRAME,
-    ByteSettings,
-    FrameScanner,
-    ParsedFrame,
-    RejectedFrame,
-    SetupStep,
-    StreamDriver,
-)
+from msdrivers.devices import check_choice, check_ranges, make_orientation
+from msdrivers.devices.stream import NO_FRAME, ByteSettings, ParsedFrame, RejectedFrame, SetupStep, StreamDriver
 from msdrivers.endpoint import HostTime, Output
 
 PREAMBLE: Final = 0xFA
@@ -110,12 +101,6 @@ class XbusFormat:
         return ParsedFrame(
             end, f"xbus.{identifier:02X}", XbusMessage(identifier, bytes(buffer[begin : end - 1]), start)
         )
-
-
-class XbusStream(FrameScanner[XbusMessage]):
-    """Parses bytes to Xbus messages. Never raises; memory is bounded."""
-
-    formats = (XbusFormat(),)
 
 
 def encode(identifier: int, data: bytes = b"") -> bytes:
@@ -216,8 +201,7 @@ class XsensSettings(ByteSettings):
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
         check_ranges(self, rate_hz=(1, 400), field_strength=(0.0, 1e-3))
-        if self.heading not in _YAW_SOURCES:
-            raise ValueError(f"heading is one of {', '.join(_YAW_SOURCES)}, got '{self.heading}'")
+        check_choice(self, heading=_YAW_SOURCES)
 
 
 _YAW_SOURCES: Final = {"magnetic": YawSource.MAGNETIC, "none": YawSource.NONE, "true": YawSource.TRUE}
@@ -251,18 +235,17 @@ class XsensDriver(StreamDriver[XbusMessage]):
     device = "xsens"
     description = "Xsens MTi"
     awaited = "MTData2"
+    formats = (XbusFormat(),)
+    identification = encode(MessageId.GO_TO_CONFIG)
     attempts = 5
     """Some units do not answer after power-up."""
 
     def __init__(self, settings: XsensSettings) -> None:
-        super().__init__(settings, XbusStream())
+        super().__init__(settings)
         self._own = settings
         self._ticks = SampleTimeUnwrapper()
         self._last_counter: int | None = None
         self._celsius = NAN
-
-    def _make_identification(self) -> bytes:
-        return encode(MessageId.GO_TO_CONFIG)
 
     def _on_start(self) -> None:
         self._last_counter = None
@@ -304,7 +287,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
         ticks = data.get_integer(ItemId.SAMPLE_TIME_FINE)
         device_utime = 0 if ticks is None else max(1, round(self._ticks.unwrap(ticks) * TICK * 1e6))
         field = data.get_numbers(ItemId.MAGNETIC_FIELD, 3)
-        orientation = to_rotation(*(data.get_numbers(ItemId.QUATERNION, 4) or (math.nan,) * 4))
+        quaternion, yaw_source = data.get_numbers(ItemId.QUATERNION, 4), _YAW_SOURCES[self._own.heading]
         sample = ImuSample(
             self._make_header(self._find_arrival(message.start, now), device_utime),
             angular_velocity=self._read_vector(rate, MAX_RATE),
@@ -312,9 +295,7 @@ class XsensDriver(StreamDriver[XbusMessage]):
             magnetic_field=self._read_vector(field, 100.0, self._own.field_strength)
             if self._own.field_strength
             else None,
-            orientation=orientation,
-            orientation_reference=OrientationReference.NONE if orientation is None else OrientationReference.ENU,
-            yaw_source=YawSource.NONE if orientation is None else _YAW_SOURCES[self._own.heading],
             temperature_celsius=self._celsius,
+            **make_orientation(quaternion, OrientationReference.ENU, yaw_source),
         )
         return self._publish(sample, now, TICK)

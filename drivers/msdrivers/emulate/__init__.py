@@ -5,7 +5,6 @@ Faults of emulated devices have texts, instants at which they are due, and effec
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -13,18 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from modelserver.errors import find_nearest_names, quote
 from modelserver.messages import GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
-from msdrivers.endpoint import (
-    CanFrame,
-    Endpoint,
-    EndpointPhase,
-    EndpointStatus,
-    HostTime,
-    Output,
-    Registers,
-    Send,
-    U,
-    make_bus_off_frame,
-)
+from msdrivers.endpoint import BUS_OFF_FRAME, Endpoint, EndpointPhase, EndpointStatus, HostTime, Output, Send, U
 
 S = TypeVar("S", GpsSample, ImuSample, WheelsSample, VehicleStatusSample, JointsSample)
 
@@ -95,14 +83,12 @@ class FaultInjector(Generic[U]):
         return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
 
     def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
-        """Pass on a received unit unless the device is silent."""
         struck = self._apply_due_faults(now)
         if now.monotonic_ns < self._silent_until_ns:
             return struck
         return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
-        """Apply due faults; fire the device's timer."""
         outputs = self._apply_due_faults(now)
         if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
             self._is_restarting = False
@@ -114,7 +100,6 @@ class FaultInjector(Generic[U]):
         return outputs
 
     def get_deadline(self) -> int | None:
-        """Return when the device, or a fault, is due."""
         inner = self._inner.get_deadline()
         device = None if inner is None else inner - self._clock_jump_ns
         dues = (self._silent_until_ns if self._is_restarting else device, self._get_fault_ns())
@@ -142,7 +127,7 @@ class FaultInjector(Generic[U]):
             fault = self._faults.popleft()
             outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
             if fault.kind == "bus_off":
-                outputs.append(cast(Send[U], Send(make_bus_off_frame())))
+                outputs.append(cast(Send[U], Send(BUS_OFF_FRAME)))
             if fault.kind in ("stall", "restart", "bus_off"):
                 self._silent_until_ns = max(self._silent_until_ns, due + round(fault.amount * 1e9))
             self._pending[fault.kind] += round(fault.amount)
@@ -181,14 +166,11 @@ def corrupt_unit(unit: Any) -> Any:
     if isinstance(unit, bytes):
         middle = len(unit) // 2
         return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
-    if isinstance(unit, CanFrame):
-        return replace(unit, data=unit.data[:-1])
-    if isinstance(unit, Registers):
-        return replace(unit, values=unit.values[:-1])
-    return unit
+    field = next((each for each in ("data", "values") if hasattr(unit, each)), None)
+    return unit if field is None else replace(unit, **{field: getattr(unit, field)[:-1]})
 
 
-class SampleEmulator(ABC, Generic[S, U]):
+class SampleEmulator(Generic[S, U]):
     """An `Endpoint` at the device's end of a line. `samples` are in the order of their stamps.
 
     `latency` is the time from the instant of a sample to its first byte, seconds.
@@ -203,9 +185,9 @@ class SampleEmulator(ABC, Generic[S, U]):
         self.counts: Counter[str] = Counter()
         """What was sent and received, by kind."""
 
-    @abstractmethod
     def _encode(self, sample: S) -> Iterable[U]:
         """Return the units that the device sends for a sample; empty ones are not sent."""
+        return ()
 
     def _answer(self, unit: U) -> Iterable[U]:
         """Yield the answers to a received unit."""
@@ -221,7 +203,6 @@ class SampleEmulator(ABC, Generic[S, U]):
         return [Send(each) for each in self._answer(unit) if each]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
-        """Send the samples up to now."""
         self._now = now
         out: list[Output[U]] = []
         while self._next is not None and self._next.header.utime + self._latency_us <= now.utime:

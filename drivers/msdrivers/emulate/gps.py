@@ -14,41 +14,40 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pyubx2 import GET, SET, UBX_MSGIDS, UBXMessage, UBXMessageError, UBXParseError, UBXReader, UBXTypeError
 
 from modelserver.messages import FixType, GpsSample
-from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea
-from msdrivers.devices.gps.driver import WGS84_DATUM, GpsSettings
-from msdrivers.devices.gps.novatel import (
-    Body,
-    HeadingLog,
-    LogHeader,
-    NovatelLog,
-    Position,
-    PositionType,
-    SolutionStatus,
-    TimeStatus,
-    Velocity,
-    encode,
-)
+from msdrivers.devices.gps import DAY, SECOND, gps_of, nmea, novatel
+from msdrivers.devices.gps.driver import GpsSettings
+from msdrivers.devices.gps.novatel import HeadingLog, Position, PositionType, SolutionStatus, Velocity
 from msdrivers.devices.gpsd import WATCH
 from msdrivers.devices.stream import FrameScanner, ParsedFrame, RejectedFrame
 from msdrivers.devices.ublox import VALSET_VERSION, UbxFormat
 from msdrivers.emulate import SampleEmulator
 from msdrivers.endpoint import HostTime, Output, Send
 
+
+class _Codes(NamedTuple):
+    """A type of fix: in NovAtel's logs, in GGA, in RMC, in gpsd's status, and in UBX (fixType, diffSoln, carrSoln)."""
+
+    position: PositionType
+    quality: str
+    mode: str
+    status: int
+    ubx: tuple[int, int, int]
+
+
 _FIXES = {
-    FixType.NONE: (PositionType.NONE, "0", "N"),
-    FixType.FIX_2D: (PositionType.FIXEDHEIGHT, "1", "A"),
-    FixType.FIX_3D: (PositionType.SINGLE, "1", "A"),
-    FixType.DIFFERENTIAL: (PositionType.PSRDIFF, "2", "D"),
-    FixType.RTK_FLOAT: (PositionType.NARROW_FLOAT, "5", "F"),
-    FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
-    FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
+    FixType.NONE: _Codes(PositionType.NONE, "0", "N", 0, (0, 0, 0)),
+    FixType.FIX_2D: _Codes(PositionType.FIXEDHEIGHT, "1", "A", 0, (2, 0, 0)),
+    FixType.FIX_3D: _Codes(PositionType.SINGLE, "1", "A", 0, (3, 0, 0)),
+    FixType.DIFFERENTIAL: _Codes(PositionType.PSRDIFF, "2", "D", 2, (3, 1, 0)),
+    FixType.RTK_FLOAT: _Codes(PositionType.NARROW_FLOAT, "5", "F", 4, (3, 1, 1)),
+    FixType.RTK_FIXED: _Codes(PositionType.NARROW_INT, "4", "R", 3, (3, 1, 2)),
+    FixType.DEAD_RECKONING: _Codes(PositionType.PROPAGATED, "6", "E", 5, (1, 0, 0)),
 }
-"""Position type, quality in GGA, mode in RMC."""
 
 
 def is_known(name: str) -> bool:
@@ -61,8 +60,9 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_of(utime)
-    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, TimeStatus.FINESTEERING, port, 0, 0, True)
-    return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
+    time = week, microseconds // 1000, novatel.TimeStatus.FINESTEERING
+    header = novatel.LogHeader(name[:-1].upper(), *time, port, 0, 0, True)
+    return novatel.encode(novatel.NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
 def _nan_to_zero(value: float) -> float:
@@ -100,12 +100,12 @@ def _get_motion(sample: GpsSample) -> tuple[float, float, float]:
 def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
-        return Position(status, PositionType.NONE, *zeros, WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
-    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type][0]
+        return Position(status, PositionType.NONE, *zeros, novatel.WGS84_DATUM, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
+    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type].position
     heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
     place = (sample.latitude_deg, sample.longitude_deg, *heights)
     return Position(
-        SolutionStatus.SOL_COMPUTED, kind, *place, WGS84_DATUM, *_get_sigmas(sample), "", 0.0, 0.0, used, used
+        SolutionStatus.SOL_COMPUTED, kind, *place, novatel.WGS84_DATUM, *_get_sigmas(sample), "", 0.0, 0.0, used, used
     )
 
 
@@ -126,7 +126,7 @@ def _make_heading(sample: GpsSample) -> HeadingLog:
     return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
 
 
-NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
+NOVATEL: dict[str, Callable[[GpsSample], novatel.Body]] = {
     "bestpos": _make_position,
     "bestvel": _make_velocity,
     "heading": _make_heading,
@@ -146,13 +146,13 @@ def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
 def _format_gga(sample: GpsSample, utime: int) -> bytes:
     count = str(sample.satellites) if sample.satellites >= 0 else ""
     heights = (nmea.format_number(_get_height_msl(sample), 4), "M", nmea.format_number(sample.undulation, 4), "M")
-    quality = (_FIXES[sample.fix_type][1], count, nmea.format_number(sample.hdop, 2))
+    quality = (_FIXES[sample.fix_type].quality, count, nmea.format_number(sample.hdop, 2))
     return nmea.encode("GP", "GGA", (_format_clock(utime), *_format_position(sample), *quality, *heights, "", ""))
 
 
 def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
-    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
+    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type].mode
     motion = (nmea.format_number(speed / nmea.KNOT, 4), nmea.format_number(_track_from_course(course), 4))
     date = datetime.fromtimestamp(utime // SECOND, UTC).strftime("%d%m%y")
     fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
@@ -220,18 +220,13 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
         super().__init__(samples, self._unit.latency)
-        self._logs: dict[str, int] = {}
-        """Periods of the logs that are on, microseconds."""
+        self.logs: dict[str, int] = {}
+        """Periods of the logs that are on, e.g. of "bestposb", microseconds."""
         self._written: dict[str, int] = {}
         """When each log was written last."""
         self._line = bytearray()
         for line in self._unit.saved:
             self._execute(line)
-
-    @property
-    def logs(self) -> tuple[str, ...]:
-        """The logs that are on, e.g. "bestposb"."""
-        return tuple(self._logs)
 
     def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """The host's end of the line is open. A receiver does not notice, but greets when it was just switched on."""
@@ -260,7 +255,7 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
     def _encode(self, sample: GpsSample) -> Iterable[bytes]:
         utime = sample.header.utime
         logs = b""
-        for name, period in self._logs.items():
+        for name, period in self.logs.items():
             # half a millisecond of grace: stamps are rounded
             if utime - self._written.get(name, 0) < period - 500:
                 continue
@@ -274,12 +269,12 @@ class GpsEmulator(SampleEmulator[GpsSample, bytes]):
         command, *fields = line.lower().split()
         try:
             if command == "unlogall":
-                self._logs.clear()
+                self.logs.clear()
             elif command == "unlog":
-                self._logs.pop(fields[1], None)
+                self.logs.pop(fields[1], None)
             elif command == "log" and is_known(fields[1]):
                 # log PORT NAME ontime SECONDS
-                self._logs[fields[1]] = round(float(fields[3]) * 1e6)
+                self.logs[fields[1]] = round(float(fields[3]) * 1e6)
             elif command not in _NO_EFFECT_COMMANDS:
                 return f"Invalid Message. Field = {command}"
         except (IndexError, ValueError):
@@ -291,8 +286,6 @@ RECEIVER = "/dev/ttyACM0"
 
 LATENCY = 0.03
 """From the instant of a sample to what gpsd or the u-blox receiver sends, seconds."""
-
-_STATUS = {FixType.DIFFERENTIAL: 2, FixType.RTK_FIXED: 3, FixType.RTK_FLOAT: 4, FixType.DEAD_RECKONING: 5}
 
 
 class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
@@ -334,7 +327,7 @@ class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
             return (out + self._report(**{"class": "TPV"}, **head, mode=1),)
         east, north, up = sample.velocity or (math.nan,) * 3
         mode = 2 if sample.fix_type is FixType.FIX_2D else 3
-        status = {"status": _STATUS[sample.fix_type]} if sample.fix_type in _STATUS else {}
+        status = {"status": code} if (code := _FIXES[sample.fix_type].status) else {}
         motion = {"velN": north, "velE": east, "velD": -up, "speed": math.hypot(east, north)}
         track = {"track": math.degrees(math.atan2(east, north)) % 360.0 if east == east else math.nan}
         heights = {"altHAE": sample.height_ellipsoidal, "altMSL": sample.height_msl, "geoidSep": sample.undulation}
@@ -347,17 +340,6 @@ class GpsdEmulator(SampleEmulator[GpsSample, bytes]):
 
 
 UBX_PORT: Final = "UART1"
-
-_UBX_FIXES: Final = {
-    FixType.NONE: (0, 0, 0),
-    FixType.DEAD_RECKONING: (1, 0, 0),
-    FixType.FIX_2D: (2, 0, 0),
-    FixType.FIX_3D: (3, 0, 0),
-    FixType.DIFFERENTIAL: (3, 1, 0),
-    FixType.RTK_FLOAT: (3, 1, 1),
-    FixType.RTK_FIXED: (3, 1, 2),
-}
-"""fixType, diffSoln, carrSoln."""
 
 _FACTORY_PERIOD_MS: Final = 1000
 
@@ -393,12 +375,8 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
         self._scanner: FrameScanner[bytes] = FrameScanner((_CommandFormat(),))
         self._period_ms = _FACTORY_PERIOD_MS
         self._last_ms: int | None = None
-        self._messages: set[str] = set()
-
-    @property
-    def messages(self) -> frozenset[str]:
+        self.messages: set[str] = set()
         """The messages that are on, e.g. "NAV-PVT"."""
-        return frozenset(self._messages)
 
     def _answer(self, unit: bytes) -> list[bytes]:
         return [self._execute(frame) for frame in self._scanner.feed(unit)]
@@ -443,7 +421,7 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
     def _switch(self, message: str, is_on: bool) -> bool:
         if message in self._unit.missing or message not in (*ORDER, "RXM-RTCM"):
             return False
-        (self._messages.add if is_on else self._messages.discard)(message)
+        (self.messages.add if is_on else self.messages.discard)(message)
         return True
 
     def _make_version(self) -> bytes:
@@ -457,7 +435,7 @@ class UbloxEmulator(SampleEmulator[GpsSample, bytes]):
         if self._last_ms is not None and milliseconds - self._last_ms < self._period_ms - 1:
             return ()
         self._last_ms = milliseconds
-        names = [name for name in ORDER if name in self._messages]
+        names = [name for name in ORDER if name in self.messages]
         self.counts.update(names)
         return (b"".join(encode_ubx(name, sample) for name in names),)
 
@@ -479,7 +457,7 @@ def _fill_pvt(sample: GpsSample) -> dict[str, Any]:
     # the second is the nearest one, nano what is missing to it
     second = (sample.header.utime + 500_000) // 1_000_000
     when = datetime.fromtimestamp(second, UTC)
-    fix, is_differential, carrier = _UBX_FIXES[sample.fix_type]
+    fix, is_differential, carrier = _FIXES[sample.fix_type].ubx
     east, north, up = sample.velocity or (0.0, 0.0, 0.0)
     P, V = sample.position_covariance, sample.velocity_covariance
     height, msl = _nan_to_zero(sample.height_ellipsoidal), _nan_to_zero(_get_height_msl(sample))
@@ -569,3 +547,11 @@ _FIELDS: Final[Mapping[str, Callable[[GpsSample], dict[str, Any]]]] = {
     "NAV-EOE": lambda sample: {"iTOW": _get_itow(sample)},
 }
 """Fields of each message of a sample, as pyubx2 names and scales them."""
+
+EMULATORS: Final[Mapping[str, Callable[[Any, Iterable[GpsSample]], SampleEmulator[GpsSample, bytes]]]] = {
+    "ublox": lambda settings, samples: UbloxEmulator(samples),
+    "novatel": make_gps_emulator,
+    "nmea": make_gps_emulator,
+    "gpsd": lambda settings, samples: GpsdEmulator(samples),
+}
+"""By kind of device."""

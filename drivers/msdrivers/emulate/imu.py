@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from modelserver.messages import ImuSample, OrientationReference
 from modelserver.transforms import so3
@@ -18,9 +19,10 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 from msdrivers.devices import gx1, xsens
 from msdrivers.devices import vectornav as vn
 from msdrivers.devices.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet
+from msdrivers.devices.stream import FrameScanner
 from msdrivers.devices.text import TextSettings, encode_line
-from msdrivers.devices.vectornav import FIELD_BYTES, VnStream, VnText
-from msdrivers.devices.xsens import ItemId, MessageId, XbusMessage, XbusStream
+from msdrivers.devices.vectornav import FIELD_BYTES, VnBinaryFormat, VnText, VnTextFormat
+from msdrivers.devices.xsens import ItemId, MessageId, XbusFormat, XbusMessage
 from msdrivers.emulate import InjectedFault, SampleEmulator
 from msdrivers.endpoint import HostTime
 
@@ -36,7 +38,7 @@ class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
         """`error` is the code by which it rejects binary output; 0: it takes it."""
         super().__init__(samples)
         self._error = error
-        self._stream = VnStream()
+        self._stream = FrameScanner((VnBinaryFormat(), VnTextFormat()))
         self._keys: tuple[tuple[int, int], ...] = ()
         self._divisor = 0
         self._sent_us: int | None = None
@@ -79,31 +81,23 @@ class VectornavEmulator(SampleEmulator[ImuSample, bytes]):
         self._sent_us = utime
         self.counts["messages"] += 1
         time_ns = self.START_NS + (utime - self._first_utime) * 1000
-        return (vn.encode_binary({key: self._encode_field(key, sample, time_ns) for key in self._keys}),)
-
-    def _encode_field(self, key: tuple[int, int], sample: ImuSample, time_ns: int) -> bytes:
-        if key == vn.TIME:
-            return time_ns.to_bytes(8, "little")
-        numbers: Sequence[float] | None = None
-        if key == vn.QUATERNION and sample.orientation is not None:
-            w, x, y, z = sample.orientation
-            numbers = (x, y, z, w)
-        elif key == vn.RATE:
-            numbers = sample.angular_velocity
-        elif key == vn.ACCELERATION:
-            numbers = sample.specific_force
-        elif key == vn.MAGNETIC and sample.magnetic_field is not None:
-            numbers = [each / vn.GAUSS for each in sample.magnetic_field]
-        elif key == vn.TEMPERATURE:
-            numbers = (self.CELSIUS,)
-        size = FIELD_BYTES[key[0]][key[1]]
-        return (
-            bytes(size) if numbers is None else struct.pack(f"<{size // 4}f", *(_to_finite(each) for each in numbers))
-        )
-
-
-def _to_finite(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
+        orientation, field = sample.orientation, sample.magnetic_field
+        numbers: dict[tuple[int, int], Sequence[float] | None] = {
+            vn.QUATERNION: orientation and (*orientation[1:], orientation[0]),
+            vn.RATE: sample.angular_velocity,
+            vn.ACCELERATION: sample.specific_force,
+            vn.MAGNETIC: field and [each / vn.GAUSS for each in field],
+            vn.TEMPERATURE: (self.CELSIUS,),
+        }
+        # what the sample does not have is zero
+        fields = {(group, bit): bytes(FIELD_BYTES[group][bit]) for group, bit in self._keys}
+        for key, values in numbers.items():
+            if key in fields and values is not None:
+                finite = (each if math.isfinite(each) else 0.0 for each in values)
+                fields[key] = struct.pack(f"<{len(values)}f", *finite)
+        if vn.TIME in fields:
+            fields[vn.TIME] = time_ns.to_bytes(8, "little")
+        return (vn.encode_binary(fields),)
 
 
 class XsensEmulator(SampleEmulator[ImuSample, bytes]):
@@ -126,7 +120,7 @@ class XsensEmulator(SampleEmulator[ImuSample, bytes]):
         """
         super().__init__(samples)
         self._error, self._has_orientation, self._field_strength = error, has_orientation, field_strength
-        self._stream = XbusStream()
+        self._stream = FrameScanner((XbusFormat(),))
         self._outputs = {int(ItemId.PACKET_COUNTER): xsens.AS_SENT, int(ItemId.QUATERNION): 100}
         self._is_measuring = True
         self._counter = 0
@@ -165,28 +159,21 @@ class XsensEmulator(SampleEmulator[ImuSample, bytes]):
         self._counter = (self._counter + 1) & 0xFFFF
         self.counts["packets"] += 1
         ticks = (self.FIRST_TICKS + round((utime - self._first_utime) * 1e-6 / xsens.TICK)) % (1 << 32)
-        items = ((item, self._encode_item(item, sample, ticks)) for item in self._outputs)
-        return (xsens.encode_items([(item, data) for item, data in items if data is not None]),)
-
-    def _encode_item(self, item: int, sample: ImuSample, ticks: int) -> bytes | None:
-        numbers: Sequence[float] | None = None
-        if item == ItemId.PACKET_COUNTER:
-            return self._counter.to_bytes(2, "big")
-        if item == ItemId.SAMPLE_TIME_FINE:
-            return ticks.to_bytes(4, "big")
-        if item == ItemId.STATUS_WORD:
-            return (0x3).to_bytes(4, "big")
-        if item == ItemId.TEMPERATURE:
-            numbers = (self.CELSIUS,)
-        elif item == ItemId.ACCELERATION:
-            numbers = sample.specific_force
-        elif item == ItemId.RATE_OF_TURN:
-            numbers = sample.angular_velocity
-        elif item == ItemId.MAGNETIC_FIELD and sample.magnetic_field is not None:
-            numbers = [each / self._field_strength for each in sample.magnetic_field]
-        elif item == ItemId.QUATERNION:
-            numbers = sample.orientation
-        return None if numbers is None else struct.pack(f">{len(numbers)}f", *numbers)
+        field = sample.magnetic_field
+        numbers: dict[int, Sequence[float] | None] = {
+            ItemId.TEMPERATURE: (self.CELSIUS,),
+            ItemId.ACCELERATION: sample.specific_force,
+            ItemId.RATE_OF_TURN: sample.angular_velocity,
+            ItemId.MAGNETIC_FIELD: field and [each / self._field_strength for each in field],
+            ItemId.QUATERNION: sample.orientation,
+        }
+        items = {
+            ItemId.PACKET_COUNTER: self._counter.to_bytes(2, "big"),
+            ItemId.SAMPLE_TIME_FINE: ticks.to_bytes(4, "big"),
+            ItemId.STATUS_WORD: (0x3).to_bytes(4, "big"),
+            **{item: struct.pack(f">{len(each)}f", *each) for item, each in numbers.items() if each is not None},
+        }
+        return (xsens.encode_items((item, items[item]) for item in self._outputs if item in items),)
 
 
 CELSIUS = 25.0
@@ -337,3 +324,12 @@ class Gx1Emulator(SampleEmulator[ImuSample, bytes]):
         word = words.get(CommandByte(command))
         has_ticks = gx1.LAYOUTS[command].has_ticks
         return b"" if word is None else Gx1Packet(command, (word,), ticks if has_ticks else None).to_bytes()
+
+
+EMULATORS: Mapping[str, Callable[[Any, Iterable[ImuSample]], SampleEmulator[ImuSample, bytes]]] = {
+    "gx1": lambda settings, samples: Gx1Emulator(samples),
+    "vectornav": lambda settings, samples: VectornavEmulator(samples),
+    "xsens": lambda settings, samples: XsensEmulator(samples, field_strength=settings.field_strength or 5e-5),
+    "text_imu": lambda settings, samples: TextImuEmulator(samples, settings),
+}
+"""By kind of device."""

@@ -8,46 +8,21 @@ steps. The joints of a pan-tilt head that sends lines of text sweep to and fro.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Final
+from typing import Any, Final
 
-from modelserver.messages import (
-    Direction,
-    JointsSample,
-    SensorHeader,
-    VehicleMode,
-    VehicleStatusSample,
-    WheelSample,
-    WheelsSample,
-)
+from modelserver.messages import JointsSample, SensorHeader, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from msdrivers import endpoint
 from msdrivers.devices.axis import AxisRegisters
 from msdrivers.devices.can import BoundSignal, CanDatabase, FrameError
 from msdrivers.devices.text import TextSettings, encode_line
 from msdrivers.devices.vehicle import NUMERIC_FIELDS, BoundCommand, CommandMap, StatusMap, bind_command, bind_status
 from msdrivers.devices.wheels import BoundWheel, WheelMap, bind_wheels
 from msdrivers.emulate import InjectedFault, SampleEmulator
-from msdrivers.endpoint import (
-    MAX_READ,
-    MAX_WRITE,
-    CanFrame,
-    EndpointPhase,
-    EndpointStatus,
-    FailureKind,
-    HostTime,
-    ModbusFailure,
-    ModbusUnit,
-    Output,
-    ReadRegisters,
-    Registers,
-    RegistersWritten,
-    RegisterTable,
-    Send,
-    WriteRegisters,
-    explain_exception,
-)
+from msdrivers.endpoint import CanFrame, Endpoint, HostTime, ModbusRequest, ModbusUnit, Output, Send
 
 
 class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
@@ -60,13 +35,12 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
         samples: Iterable[WheelsSample],
         first_count: int = 0,
     ):
-        """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
         super().__init__(samples)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
         for wheel in self._wheels:
-            for signal in wheel.signals:
+            for signal in wheel.signals.values():
                 self._raw.setdefault(signal.message, dict.fromkeys(database.bind_signals(signal.message), 0))
         self._offset = dict.fromkeys((wheel.name for wheel in self._wheels), first_count)
         self._counted = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
@@ -89,31 +63,24 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
         return [self._database.encode(message, raw) for message, raw in self._raw.items()]
 
     def _set_wheel(self, wheel: BoundWheel, sample: WheelSample) -> None:
-        mapped = wheel.map
-        if wheel.count is not None and mapped.count is not None and math.isfinite(sample.travel):
+        mapped, get = wheel.map, wheel.signals.get
+        if (signal := get("count")) is not None and mapped.count is not None and math.isfinite(sample.travel):
             rolled = round(sample.travel / mapped.count.meters_per_count)
             step = rolled - self._rolled[wheel.name]
             self._counted[wheel.name] += abs(step) if mapped.count.counts_up_only else step
             self._rolled[wheel.name] = rolled
-            count = (self._counted[wheel.name] + self._offset[wheel.name]) % (
-                mapped.count.wrap or 1 << wheel.count.length
-            )
-            signed = wheel.count.is_signed and count >= 1 << (wheel.count.length - 1)
-            self._set_raw(wheel.count, count - (1 << wheel.count.length) if signed else count)
-        if wheel.speed is not None and mapped.speed is not None and math.isfinite(sample.speed):
+            whole = 1 << signal.length
+            count = (self._counted[wheel.name] + self._offset[wheel.name]) % (mapped.count.wrap or whole)
+            self._set_raw(signal, count - whole if signal.is_signed and count >= whole // 2 else count)
+        if (signal := get("speed")) is not None and mapped.speed is not None and math.isfinite(sample.speed):
             speed = sample.speed / mapped.speed.scale
-            self._set_raw(wheel.speed, wheel.speed.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
-        if wheel.direction is not None and mapped.direction is not None:
-            numbers = {
-                Direction.STOPPED: mapped.direction.stopped,
-                Direction.FORWARD: mapped.direction.forward,
-                Direction.BACKWARD: mapped.direction.backward,
-            }
-            known = set(numbers.values())
-            unknown = next((each for each in range(1 << wheel.direction.length) if each not in known), 0)
-            self._set_raw(wheel.direction, numbers.get(sample.direction, unknown))
-        if wheel.steering is not None and mapped.steering is not None and math.isfinite(sample.steering):
-            self._set_raw(wheel.steering, wheel.steering.to_bits(mapped.steering.from_si(sample.steering)))
+            self._set_raw(signal, signal.to_bits(abs(speed) if mapped.speed.is_magnitude else speed))
+        if (signal := get("direction")) is not None and mapped.direction is not None:
+            numbers = mapped.direction.numbers
+            unknown = next((each for each in range(1 << signal.length) if each not in numbers.values()), 0)
+            self._set_raw(signal, numbers.get(sample.direction, unknown))
+        if (signal := get("steering")) is not None and mapped.steering is not None and math.isfinite(sample.steering):
+            self._set_raw(signal, signal.to_bits(mapped.steering.from_si(sample.steering)))
 
     def _set_raw(self, signal: BoundSignal, raw: float) -> None:
         self._raw[signal.message][signal.name] = raw
@@ -122,40 +89,28 @@ class WheelsEmulator(SampleEmulator[WheelsSample, CanFrame]):
 MAX_REJECTED_COUNT = 255
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleUnit:
-    """The controller and its vehicle: seconds, m/s, radians."""
-
-    mode: VehicleMode = VehicleMode.AUTONOMOUS
-    status_period: float = 0.05
-    dead_man: float = 0.25
-    """Dead-man timeout."""
-    max_speed: float = 5.0
-    """Faster commands are rejected."""
-    max_steering: float = 0.6
-    supply_voltage: float = 13.8
-    engine_speed: float = 150.0
-    fault_bits: int = 0
-
-
 class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
-    """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones."""
+    """An `Endpoint` of CAN frames. With samples, speed, steering and mode are theirs instead of the commanded ones.
+
+    Commands faster than MAX_SPEED, m/s, or beyond MAX_STEERING, radians, are rejected.
+    """
+
+    STATUS_PERIOD_NS, DEAD_MAN_NS = 50_000_000, 250_000_000
+    MAX_SPEED, MAX_STEERING = 5.0, 0.6
+    SUPPLY_VOLTAGE, ENGINE_SPEED = 13.8, 150.0
 
     def __init__(
         self,
         database: CanDatabase,
         status: StatusMap | None,
         command: CommandMap | None = None,
-        unit: VehicleUnit | None = None,
         samples: Iterable[VehicleStatusSample] = (),
     ):
-        """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
         super().__init__(samples)
-        self.unit = unit or VehicleUnit()
-        self.mode = self.unit.mode
+        self.mode = VehicleMode.AUTONOMOUS
         """Driving mode; set it to press the emergency stop."""
-        self.speed = 0.0
-        self.steering = 0.0
+        self.fault_bits = 0
+        self.speed = self.steering = 0.0
         self.rejected = 0
         """Number of rejected commands."""
         self._database = database
@@ -177,7 +132,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
     def on_receive(self, unit: CanFrame, now: HostTime) -> Sequence[Output[CanFrame]]:
         outputs = self.on_timer(now)
         command = self._command
-        if command is not None and not unit.is_error and unit.key == command.forward_speed.key:
+        if command is not None and not unit.is_error and unit.key == command.key:
             try:
                 self._on_command(command, self._database.decode(unit), now.monotonic_ns)
             except FrameError as error:
@@ -185,12 +140,11 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         return outputs
 
     def on_timer(self, now: HostTime) -> Sequence[Output[CanFrame]]:
-        """Send each status that is due."""
         super().on_timer(now)
         outputs: list[Output[CanFrame]] = []
         while self._status_ns <= now.monotonic_ns:
             outputs += [Send(each) for each in self._make_status(self._status_ns)]
-            self._status_ns += round(self.unit.status_period * 1e9)
+            self._status_ns += self.STATUS_PERIOD_NS
         return outputs
 
     def get_deadline(self) -> int | None:
@@ -204,20 +158,17 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         return fault.kind in ("jump", "restart")
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
-        if command.alive is not None:
-            if raw[command.alive.name] == self._alive:
+        if (alive := command.signals.get("alive")) is not None:
+            if raw[alive.name] == self._alive:
                 self.counts["rejected.repeated"] += 1
                 return
-            self._alive = raw[command.alive.name]
+            self._alive = raw[alive.name]
         enabled = all(raw[name] == bits for name, bits in command.drive_bits.items())
         requested = []
-        for signal, mapped in (
-            (command.forward_speed, command.map.forward_speed),
-            (command.steering_angle, command.map.steering_angle),
-        ):
+        for signal, mapped in command.motion:
             physical = signal.to_physical(raw[signal.name])
-            requested.append(math.nan if physical is None else physical * mapped.scale + mapped.offset)
-        fits = abs(requested[0]) <= self.unit.max_speed and abs(requested[1]) <= self.unit.max_steering
+            requested.append(math.nan if physical is None else mapped.to_si(physical))
+        fits = abs(requested[0]) <= self.MAX_SPEED and abs(requested[1]) <= self.MAX_STEERING
         if not fits or (enabled and self.mode is not VehicleMode.AUTONOMOUS):
             self.rejected += 1
             self.counts["rejected"] += 1
@@ -230,7 +181,7 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         """Follow the command at once, until the dead-man timer expires."""
         if self._follows_samples:
             return
-        ends = 0 if self._commanded_ns is None else self._commanded_ns + round(self.unit.dead_man * 1e9)
+        ends = 0 if self._commanded_ns is None else self._commanded_ns + self.DEAD_MAN_NS
         is_driving = self.mode is VehicleMode.AUTONOMOUS and at_ns < ends
         self.speed, self.steering = self._target if is_driving else (0.0, self.steering)
 
@@ -246,23 +197,19 @@ class VehicleEmulator(SampleEmulator[VehicleStatusSample, CanFrame]):
         status = self._status
         if status is None:
             return []
-        unit = self.unit
-        values = dict(
-            zip(NUMERIC_FIELDS, (self.speed, self.steering, unit.supply_voltage, unit.engine_speed), strict=True)
-        )
+        numbers = (self.speed, self.steering, self.SUPPLY_VOLTAGE, self.ENGINE_SPEED)
+        values = dict(zip(NUMERIC_FIELDS, numbers, strict=True))
         raw: dict[str, dict[str, float]] = {}
         for name, signal in status.signals.items():
             message = raw.setdefault(signal.message, dict.fromkeys(self._database.bind_signals(signal.message), 0))
             if name in values:
-                mapped = getattr(status.map, name)
-                message[signal.name] = signal.to_bits(mapped.from_si(values[name]))
+                bits = signal.to_bits(getattr(status.map, name).from_si(values[name]))
             elif name == "mode":
-                message[signal.name] = status.map.modes.get(self.mode.name.lower(), 0)
+                bits = status.map.modes.get(self.mode.name.lower(), 0)
             else:
-                message[signal.name] = (
-                    unit.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
-                )
-        return [self._database.encode(message, bits) for message, bits in raw.items()]
+                bits = self.fault_bits if name == "fault_bits" else min(self.rejected, MAX_REJECTED_COUNT)
+            message[signal.name] = bits
+        return [self._database.encode(name, values) for name, values in raw.items()]
 
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
@@ -287,7 +234,7 @@ class AxisUnit:
     """Measurements a second; a reading between two gives the last."""
 
 
-class AxisEmulator:
+class AxisEmulator(SampleEmulator[JointsSample, ModbusUnit]):
     """An `Endpoint` of `ModbusUnit` that answers requests.
 
     Faults of its own: restart: it restarts with its first limits and rate. jump: its angle jumps by `amount` degrees.
@@ -295,36 +242,27 @@ class AxisEmulator:
     """
 
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None):
+        super().__init__(())
         self.unit = unit or AxisUnit()
         self._registers = registers
         self._started_ns: int | None = None
         self._exceptions: deque[int] = deque()
-        self.counts: Counter[str] = Counter()
         self._switch_on(0)
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Power on at the first opening; later the axis has continued."""
         if self._started_ns is None:
             self._started_ns = self._updated_ns = now.monotonic_ns
-        return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
+        return [endpoint.EndpointStatus(endpoint.EndpointPhase.STREAMING, "axis emulated")]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
-        if not isinstance(unit, ReadRegisters | WriteRegisters):
+        if not isinstance(unit, ModbusRequest):
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
-        reply = self._make_exception(unit, code) if code else self._answer(unit)
-        self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
+        reply = self._make_exception(unit, code) if code else self._reply(unit)
+        self.counts["exceptions" if isinstance(reply, endpoint.ModbusFailure) else "replies"] += 1
         return [Send(reply)]
-
-    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        return []
-
-    def get_deadline(self) -> int | None:
-        return None
-
-    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        return []
 
     def _switch_on(self, at_ns: int) -> None:
         unit = self.unit
@@ -379,34 +317,32 @@ class AxisEmulator:
             self.degrees = lower + (phase if phase < span else 2.0 * span - phase)
         return self._direction * rate
 
-    def _answer(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
-        if isinstance(unit, WriteRegisters):
+    def _reply(self, unit: ModbusRequest) -> ModbusUnit:
+        if isinstance(unit, endpoint.WriteRegisters):
             return self._write(unit)
         table = self._make_table(unit.table)
         wanted = range(unit.address, unit.address + unit.count)
         # between its registers it has others, which are 0
-        if not 0 < unit.count <= MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
+        if not 0 < unit.count <= endpoint.MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
             return self._make_exception(unit, ILLEGAL_ADDRESS)
-        return Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
+        return endpoint.Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
 
-    def _make_table(self, table: RegisterTable) -> dict[int, int]:
+    def _make_table(self, table: endpoint.RegisterTable) -> dict[int, int]:
         registers = self._registers
+        values = self.commanded | {"angle": self._measured_deg, "rate": self._measured_rate}
+        present = dict(registers.measured) if table == registers.table else {}
+        if table == "holding":
+            present |= registers.commanded
         words: dict[int, int] = {}
-        if table is RegisterTable(registers.table):
-            values = {"angle": self._measured_deg, "rate": self._measured_rate}
-            for name, mapped in registers.measured.items():
-                found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
-                words |= {mapped.address + index: word for index, word in enumerate(found)}
-        if table is RegisterTable.HOLDING:
-            for name, mapped in registers.commanded.items():
-                found = mapped.from_degrees(self.commanded[name])
-                words |= {mapped.address + index: word for index, word in enumerate(found)}
+        for name, mapped in present.items():
+            found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
+            words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
-    def _write(self, unit: WriteRegisters) -> ModbusUnit:
+    def _write(self, unit: endpoint.WriteRegisters) -> ModbusUnit:
         places = {(mapped.address, mapped.word_count): name for name, mapped in self._registers.commanded.items()}
         name = places.get((unit.address, len(unit.values)))
-        if name is None or len(unit.values) > MAX_WRITE:
+        if name is None or len(unit.values) > endpoint.MAX_WRITE:
             return self._make_exception(unit, ILLEGAL_ADDRESS)
         after = self.commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
         axis, rate = self.unit, after["nod_rate"]
@@ -417,10 +353,10 @@ class AxisEmulator:
         if not fits:
             return self._make_exception(unit, ILLEGAL_VALUE)
         self.commanded = after
-        return RegistersWritten(unit.address, len(unit.values), unit.transaction)
+        return endpoint.RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
-    def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
-        return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, unit.transaction)
+    def _make_exception(self, unit: ModbusRequest, code: int) -> endpoint.ModbusFailure:
+        return endpoint.ModbusFailure(endpoint.explain_exception(code), code, unit.transaction)
 
 
 PERIOD_US: Final = 20_000
@@ -457,3 +393,14 @@ class TextJointsEmulator(SampleEmulator[JointsSample, bytes]):
             period = SWEEP_S * (2.0 / 3.0) ** number
             values[name] = 1.0 + seconds if name == "time" else AMPLITUDE * math.sin(math.tau * seconds / period)
         return values
+
+
+EMULATORS: Final[Mapping[str, Callable[..., Endpoint[Any]]]] = {
+    "wheels": lambda settings, samples, database: WheelsEmulator(settings.wheels, database, samples),
+    "vehicle": lambda settings, samples, database: VehicleEmulator(
+        database, settings.status, settings.command, samples=samples
+    ),
+    "text_joints": lambda settings, samples: TextJointsEmulator(settings),
+    "axis": lambda settings, samples: AxisEmulator(settings.registers),
+}
+"""By kind of device."""

@@ -11,7 +11,7 @@ import os
 import select
 import socket
 from collections.abc import Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from modelserver.errors import ModelServerError
 
@@ -36,26 +36,21 @@ class Link(Protocol[U]):
     @property
     def description(self) -> str:
         """Path or address of the line."""
-        ...
 
     @property
     def baud(self) -> int: ...
 
     def open(self, baud: int | None = None) -> None:
         """Open the line, at another baud rate if one is given. Raises LinkError."""
-        ...
 
     def close(self) -> None:
         """Flush the output and close; closing twice is no error."""
-        ...
 
     def poll(self, timeout: float) -> Sequence[U]:
         """Return received units; wait at most `timeout` seconds for the first. Raises LinkError."""
-        ...
 
     def send(self, unit: U) -> None:
         """Send a unit. Raises LinkError."""
-        ...
 
 
 class LinkWrapper(Generic[U]):
@@ -90,10 +85,19 @@ class DescriptorLink:
     """Base of the links whose bytes go through a file descriptor."""
 
     description: str
+    _file: Any = None
+    """A socket or serial port; None: closed."""
 
     def fileno(self) -> int:
         """Return the descriptor. Raises LinkError if the line is not open."""
-        raise NotImplementedError
+        if self._file is None:
+            raise LinkError(self.description, "the line is not open")
+        return int(self._file.fileno())
+
+    def close(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
     def poll(self, timeout: float) -> Sequence[bytes]:
         """Return received bytes; wait at most `timeout` seconds. Raises LinkError if the line is lost."""
@@ -153,36 +157,25 @@ class TcpLink(DescriptorLink):
     def __init__(self, host: str, port: int):
         self._address = (host, port)
         self.description = f"tcp {host}:{port}"
-        self._socket: socket.socket | None = None
 
     def open(self, baud: int | None = None) -> None:
         """Connect; the baud rate is that of the server. Raises LinkError."""
         try:
-            self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
-        except socket.gaierror as error:
-            raise LinkError(self.description, f"no such host ({error.strerror})", "look at address") from None
-        except UnicodeError as error:
-            # a name with an empty part, or one that is too long
-            raise LinkError(self.description, f"no such address ({error})", "look at address") from None
-        except TimeoutError:
-            raise LinkError(self.description, "no answer", "is it switched on and on this network?") from None
-        except OSError as error:
-            why = error.strerror or str(error)
-            fix = "nothing listens there: is the device's server on?" if error.errno == errno.ECONNREFUSED else ""
+            connection = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
+        except (OSError, UnicodeError) as error:
+            why, fix = getattr(error, "strerror", None) or str(error), ""
+            # UnicodeError: a name with an empty part, or one that is too long
+            if isinstance(error, socket.gaierror | UnicodeError):
+                why, fix = f"no such host ({why})", "look at address"
+            elif isinstance(error, TimeoutError):
+                why, fix = "no answer", "is it switched on and on this network?"
+            elif isinstance(error, ConnectionRefusedError):
+                fix = "nothing listens there: is the device's server on?"
             raise LinkError(self.description, why, fix) from None
-        self._socket.setblocking(False)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-
-    def close(self) -> None:
-        connection, self._socket = self._socket, None
-        if connection is not None:
-            connection.close()
-
-    def fileno(self) -> int:
-        if self._socket is None:
-            raise LinkError(self.description, "the line is not open")
-        return self._socket.fileno()
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._file = connection
 
 
 class TcpServerLink(DescriptorLink):
@@ -195,7 +188,6 @@ class TcpServerLink(DescriptorLink):
         self._address = (host, port)
         self.description = f"tcp {host}:{port}"
         self._server: socket.socket | None = None
-        self._client: socket.socket | None = None
         self.clients_accepted = 0
         """Number of clients so far."""
 
@@ -223,12 +215,12 @@ class TcpServerLink(DescriptorLink):
         """Return bytes from the client. A disconnect is no error: another client may connect."""
         if self._server is None:
             raise LinkError(self.description, "the line is not open")
-        known = [each for each in (self._server, self._client) if each is not None]
+        known = [each for each in (self._server, self._file) if each is not None]
         ready, _, _ = select.select(known, (), (), max(0.0, timeout))
         data: Sequence[bytes] = ()
-        if self._client is not None and self._client in ready:
+        if self._file in ready:
             try:
-                data = self.read_available(self._client.fileno())
+                data = self.read_available(self.fileno())
             except LinkError:
                 self.disconnect_client()
         if self._server in ready:
@@ -237,22 +229,20 @@ class TcpServerLink(DescriptorLink):
                 self.disconnect_client()
                 caller.setblocking(False)
                 caller.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._client = caller
+                self._file = caller
                 self.clients_accepted += 1
         return data
 
     def send(self, unit: bytes) -> None:
         """Send bytes to the client; a missing or blocked client is no error."""
-        if self._client is None:
+        if self._file is None:
             return
         try:
-            self._client.sendall(unit)
+            self._file.sendall(unit)
         except BlockingIOError:
             pass
         except OSError:
             self.disconnect_client()
 
     def disconnect_client(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
+        super().close()

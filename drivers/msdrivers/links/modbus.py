@@ -8,25 +8,16 @@ from __future__ import annotations
 
 import logging
 import struct
-import time
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Sequence
 
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadHoldingRegistersResponse,
-    ReadInputRegistersRequest,
-    ReadInputRegistersResponse,
-    WriteMultipleRegistersRequest,
-    WriteMultipleRegistersResponse,
-)
+from pymodbus.pdu import register_message as pdu
 
 from msdrivers.endpoint import (
-    FailureKind,
     ModbusFailure,
+    ModbusRequest,
     ModbusUnit,
     ReadRegisters,
     Registers,
@@ -42,15 +33,13 @@ _HEADER = struct.Struct(">HHHB")
 MAX_LENGTH = 254
 """Bytes after the length field: a unit, and a message of 253 bytes at most."""
 
-REPLY_TIMEOUT_S = 1.0
-"""How long a device may take for a reply before a TIMEOUT failure is reported."""
+MAX_PENDING = 64
+"""Requests whose replies are awaited; the oldest ones were not answered."""
 
 ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
 
 # malformed messages are reported by us
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-
-ModbusRequest: TypeAlias = ReadRegisters | WriteRegisters
 
 
 class _TcpFramer:
@@ -91,18 +80,19 @@ class _TcpFramer:
 
 
 class ModbusLink(LinkWrapper[bytes]):
-    """The driver's end: requests are sent, replies and failures come. Several requests may be under way."""
+    """The driver's end: requests are sent, replies and exceptions come. Several requests may be under way.
 
-    def __init__(self, link: Link[bytes], unit_id: int, clock_ns: Callable[[], int] = time.monotonic_ns):
-        """`unit_id` is the number of the device behind the server."""
+    unit_id: number of the device behind the server.
+    """
+
+    def __init__(self, link: Link[bytes], unit_id: int):
         super().__init__(link)
-        self._unit_id, self._clock_ns = unit_id, clock_ns
+        self._unit_id = unit_id
         self._framer = _TcpFramer(is_server=False)
-        self._pending: dict[int, tuple[ModbusRequest, int]] = {}
+        self._pending: dict[int, ModbusRequest] = {}
 
     @property
     def description(self) -> str:
-        """The address and the device's number."""
         return f"modbus {self._link.description.removeprefix('tcp ')} unit {self._unit_id}"
 
     def open(self, baud: int | None = None) -> None:
@@ -114,18 +104,21 @@ class ModbusLink(LinkWrapper[bytes]):
         """Send a request. Raises LinkError."""
         number = unit.transaction & 0xFFFF
         if isinstance(unit, ReadRegisters):
-            kind = ReadHoldingRegistersRequest if unit.table is RegisterTable.HOLDING else ReadInputRegistersRequest
+            holding = unit.table == "holding"
+            kind = pdu.ReadHoldingRegistersRequest if holding else pdu.ReadInputRegistersRequest
             message: ModbusPDU = kind(address=unit.address, count=unit.count)
         elif isinstance(unit, WriteRegisters):
             values = list(unit.values)
-            message = WriteMultipleRegistersRequest(address=unit.address, count=len(values), registers=values)
+            message = pdu.WriteMultipleRegistersRequest(address=unit.address, count=len(values), registers=values)
         else:
             raise TypeError(f"a driver sends requests, not {type(unit).__name__}")
-        self._pending[number] = (unit, self._clock_ns() + round(REPLY_TIMEOUT_S * 1e9))
+        if len(self._pending) >= MAX_PENDING:
+            del self._pending[next(iter(self._pending))]
+        self._pending[number] = unit
         self._link.send(self._framer.encode(message, number, self._unit_id))
 
     def poll(self, timeout: float) -> Sequence[ModbusUnit]:
-        """Return replies, and a TIMEOUT failure for requests without reply. Raises LinkError."""
+        """Return replies to the requests under way. Raises LinkError."""
         units: list[ModbusUnit] = []
         for data in self._link.poll(timeout):
             try:
@@ -135,26 +128,20 @@ class ModbusLink(LinkWrapper[bytes]):
             units += [
                 self._convert_reply(number, message) for number, _, _, message in frames if number in self._pending
             ]
-        now = self._clock_ns()
-        for number, (request, until) in list(self._pending.items()):
-            if now >= until:
-                del self._pending[number]
-                text = f"no reply for {REPLY_TIMEOUT_S:g} s"
-                units.append(ModbusFailure(FailureKind.TIMEOUT, text, transaction=request.transaction))
         return units
 
     def _convert_reply(self, number: int, message: ModbusPDU | None) -> ModbusUnit:
-        request, _ = self._pending.pop(number)
+        request = self._pending.pop(number)
         if isinstance(message, ExceptionResponse):
             code = message.exception_code
-            return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, request.transaction)
+            return ModbusFailure(explain_exception(code), code, request.transaction)
         if isinstance(request, ReadRegisters) and isinstance(
-            message, ReadHoldingRegistersResponse | ReadInputRegistersResponse
+            message, pdu.ReadHoldingRegistersResponse | pdu.ReadInputRegistersResponse
         ):
             return Registers(request.address, tuple(message.registers), request.transaction)
-        if isinstance(request, WriteRegisters) and isinstance(message, WriteMultipleRegistersResponse):
+        if isinstance(request, WriteRegisters) and isinstance(message, pdu.WriteMultipleRegistersResponse):
             return RegistersWritten(message.address, message.count, request.transaction)
-        return ModbusFailure(FailureKind.LINE, "a reply that does not fit its request", transaction=request.transaction)
+        return ModbusFailure("a reply that does not fit its request", transaction=request.transaction)
 
 
 class ModbusServerLink(LinkWrapper[bytes]):
@@ -193,22 +180,22 @@ class ModbusServerLink(LinkWrapper[bytes]):
                     units.append(request)
                 else:
                     code = ILLEGAL_FUNCTION if message is None else ILLEGAL_VALUE
-                    self.send(ModbusFailure(FailureKind.EXCEPTION, code=code, transaction=number))
+                    self.send(ModbusFailure(code=code, transaction=number))
         return units
 
     def send(self, unit: ModbusUnit) -> None:
-        """Send a reply; nothing without a request, or for a TIMEOUT. Raises LinkError."""
+        """Send a reply; nothing without a request. Raises LinkError."""
         number = unit.transaction & 0xFFFF
         if number not in self._pending:
             return
         unit_id, function = self._pending.pop(number)
         if isinstance(unit, Registers):
-            holding = function == ReadHoldingRegistersResponse.function_code
-            kind = ReadHoldingRegistersResponse if holding else ReadInputRegistersResponse
+            holding = function == pdu.ReadHoldingRegistersResponse.function_code
+            kind = pdu.ReadHoldingRegistersResponse if holding else pdu.ReadInputRegistersResponse
             message: ModbusPDU = kind(registers=list(unit.values))
         elif isinstance(unit, RegistersWritten):
-            message = WriteMultipleRegistersResponse(address=unit.address, count=unit.count)
-        elif isinstance(unit, ModbusFailure) and unit.kind is FailureKind.EXCEPTION:
+            message = pdu.WriteMultipleRegistersResponse(address=unit.address, count=unit.count)
+        elif isinstance(unit, ModbusFailure):
             message = ExceptionResponse(function, unit.code)
         else:
             return
@@ -217,10 +204,10 @@ class ModbusServerLink(LinkWrapper[bytes]):
 
 def _convert_request(message: ModbusPDU | None, number: int) -> ModbusRequest | None:
     """Return the request in a message, None for what is not served here."""
-    if isinstance(message, ReadHoldingRegistersRequest | ReadInputRegistersRequest):
+    if isinstance(message, pdu.ReadHoldingRegistersRequest | pdu.ReadInputRegistersRequest):
         # the class of input registers is made from that of holding ones
-        table = RegisterTable.INPUT if isinstance(message, ReadInputRegistersRequest) else RegisterTable.HOLDING
+        table: RegisterTable = "input" if isinstance(message, pdu.ReadInputRegistersRequest) else "holding"
         return ReadRegisters(message.address, message.count, table, number)
-    if isinstance(message, WriteMultipleRegistersRequest) and len(message.registers) == message.count:
+    if isinstance(message, pdu.WriteMultipleRegistersRequest) and len(message.registers) == message.count:
         return WriteRegisters(message.address, tuple(message.registers), number)
     return None

@@ -10,6 +10,7 @@ import errno
 import getpass
 import glob
 import grp
+import io
 import os
 import termios
 import time
@@ -165,35 +166,26 @@ class SerialLink(DescriptorLink):
     def __init__(self, port: str, baud: int):
         self.description = port
         self.baud = baud
-        self._serial: serial.Serial | None = None
 
     def open(self, baud: int | None = None) -> None:
         """Open the port. Raises LinkError that names the process which holds it."""
         self.baud = baud or self.baud
         try:
-            self._serial = serial.Serial(self.description, self.baud, timeout=0, exclusive=True)
+            self._file = serial.Serial(self.description, self.baud, timeout=0, exclusive=True)
         # pyserial passes on termios.error, which is no OSError
         except (OSError, ValueError, termios.error) as error:
             raise self._explain_error(error) from None
 
     def close(self) -> None:
         """Drain the output, with a time limit, and close the port."""
-        port, self._serial = self._serial, None
-        if port is None:
-            return
-        # not port.flush(): that waits for ever where the other end does not take what was sent
+        # not flush(): that waits for ever where the other end does not take what was sent
         with contextlib.suppress(OSError, termios.error):
             for _ in range(DRAIN_ATTEMPTS):
-                if not port.out_waiting:
+                if self._file is None or not self._file.out_waiting:
                     break
                 time.sleep(DRAIN_INTERVAL_S)
         with contextlib.suppress(OSError, termios.error):
-            port.close()
-
-    def fileno(self) -> int:
-        if self._serial is None:
-            raise LinkError(self.description, "the port is not open")
-        return self._serial.fileno()
+            super().close()
 
     def _explain_error(self, error: Exception) -> LinkError:
         path = self.description
@@ -201,11 +193,8 @@ class SerialLink(DescriptorLink):
         # pyserial reports a failed lock only as text
         if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
             users = find_users(path)
-            return LinkError(
-                f"{path} is in use",
-                f"by {', '.join(users)}" if users else "by a process of another user",
-                "end it, or name another port",
-            )
+            holder = ", ".join(users) or "a process of another user"
+            return LinkError(f"{path} is in use", f"by {holder}", "end it, or name another port")
         if number in (errno.EACCES, errno.EPERM):
             return LinkError(f"{path} may not be opened", "permission denied", explain_permission(path))
         if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
@@ -231,47 +220,39 @@ class PtyLink(DescriptorLink):
         self.description = str(link) if link else "pty"
         self._link = link
         self._path = ""
-        self._emulator_fd = self._driver_fd = -1
+        self._driver_fd = -1
 
     def open(self, baud: int | None = None) -> None:
         """Make the pair, unless there is one. Raises LinkError."""
-        if self._emulator_fd >= 0:
+        if self._file is not None:
             return
         try:
-            # the other end stays open here, so that a driver that closes it causes no hang-up
-            self._emulator_fd, self._driver_fd = os.openpty()
-            tty.setraw(self._driver_fd)
-            os.set_blocking(self._emulator_fd, False)
-            self._path = os.ttyname(self._driver_fd)
             if self._link is not None:
                 remove_stale_link(self._link)
+            # the other end stays open here, so that a driver that closes it causes no hang-up
+            emulator_fd, self._driver_fd = os.openpty()
+            self._file = io.FileIO(emulator_fd, "r+")
+            tty.setraw(self._driver_fd)
+            os.set_blocking(emulator_fd, False)
+            self._path = os.ttyname(self._driver_fd)
+            if self._link is not None:
                 self._link.symlink_to(self._path)
         except OSError as error:
             self.close()
             raise LinkError(self.description, error.strerror or str(error), "give another path") from None
-        except LinkError:
-            self.close()
-            raise
         self.description = str(self._link) if self._link else self._path
 
     def close(self) -> None:
         """End both; a driver that has it open sees its port vanish."""
-        for file in (self._emulator_fd, self._driver_fd):
-            if file >= 0:
-                os.close(file)
+        if self._file is not None:
+            super().close()
+            os.close(self._driver_fd)
         if self._link is not None and self._path:
             # what is not this pseudo-terminal's own link stays: a file, or the link of another emulator
             with contextlib.suppress(OSError):
                 if os.readlink(self._link) == self._path:
                     self._link.unlink()
         self._path = ""
-        self._emulator_fd = self._driver_fd = -1
-
-    def fileno(self) -> int:
-        """Return the emulator's end. Raises LinkError if it is not open."""
-        if self._emulator_fd < 0:
-            raise LinkError(self.description, "the line is not open")
-        return self._emulator_fd
 
     def send(self, unit: bytes) -> None:
         """Send bytes; they are lost when the terminal's buffer is full, as on a real line."""

@@ -12,7 +12,7 @@ from modelserver.errors import ConfigError
 from modelserver.messages import VehicleCommand
 from msdrivers.devices.can import CanDatabase, SignalMap, parse_dbc
 from msdrivers.devices.vehicle import CommandLimits, CommandMap, VehicleDriver
-from msdrivers.endpoint import CanFrame, EndpointStatus, Output, Reopen, Send, make_bus_off_frame
+from msdrivers.endpoint import BUS_OFF_FRAME, CanFrame, EndpointStatus, Output, Reopen, Send
 
 DATABASE = raptor_dbc()
 
@@ -187,7 +187,7 @@ def test_given_two_drivers_on_one_bus_then_the_one_that_is_commanded_drives_and_
 
 def test_given_a_driver_without_status_then_it_recovers_from_bus_off() -> None:
     driver = open_driver(status=None)
-    assert any(isinstance(output, Reopen) for output in driver.on_receive(make_bus_off_frame(), at(0.1)))
+    assert any(isinstance(output, Reopen) for output in driver.on_receive(BUS_OFF_FRAME, at(0.1)))
     assert driver.on_open(at(0.2)) == []
     assert speeds(driver.on_command(make_command(0.3, 0), at(0.3))) == [2.0]
 

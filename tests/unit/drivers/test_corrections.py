@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,7 +36,8 @@ from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
 
 TIMEOUT_S = 20.0
-
+CERTIFICATE = Path(__file__).resolve().parents[2] / "data" / "localhost.pem"
+"""Of localhost, signed by itself, with its key; until 2126."""
 
 STREAM = b"".join(b"\xd3\x00" + bytes((n, 62)) + bytes(n) for n in (20, 23, 60))
 SETTINGS = NtripSettings("caster.example:2101", "MOUNT", "me", "secret")
@@ -168,8 +171,12 @@ def test_given_any_bytes_then_a_session_gives_bytes_or_an_error(data: bytes, hea
 class Caster:
     """A caster on loopback: each connection gets an answer, then waits until the next one or the end."""
 
-    def __init__(self, *answers: bytes):
+    def __init__(self, *answers: bytes, tls: bool = False):
         self._answers = list(answers)
+        self._context: ssl.SSLContext | None = None
+        if tls:
+            self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            self._context.load_cert_chain(CERTIFICATE)
         self._server = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self._server.getsockname()[1]}"
         self.received: list[bytes] = []
@@ -181,8 +188,8 @@ class Caster:
         self._server.settimeout(0.1)
         while not self._ended.is_set():
             with contextlib.suppress(OSError):
-                connection, _ = self._server.accept()
-                with connection:
+                plain, _ = self._server.accept()
+                with plain if self._context is None else self._context.wrap_socket(plain, True) as connection:
                     connection.settimeout(0.1)
                     self.received.append(connection.recv(4096))
                     is_last = len(self._answers) == 1
@@ -204,8 +211,8 @@ class Caster:
 def casters() -> Iterator[Callable[..., Caster]]:
     with contextlib.ExitStack() as stack:
 
-        def make(*answers: bytes) -> Caster:
-            caster = Caster(*answers)
+        def make(*answers: bytes, **options: bool) -> Caster:
+            caster = Caster(*answers, **options)
             stack.callback(caster.close)
             return caster
 
@@ -238,6 +245,29 @@ def test_given_a_caster_then_its_corrections_arrive_with_their_age(casters: Call
             "corrections.connects": 1, "corrections.bytes": len(STREAM), "corrections.age_s": 0,
         }  # fmt: skip
     assert caster.received[0].startswith(b"GET /MOUNT HTTP/1.1")
+
+
+def test_given_a_caster_with_tls_then_its_corrections_arrive_if_its_certificate_is_that_of_an_authority(
+    casters: Callable[..., Caster], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caster = casters(b"ICY 200 OK\r\n\r\n" + STREAM, tls=True)
+    port = caster.address.partition(":")[2]
+    with receiving(f"localhost:{port}", tls=True):
+        wait_for(lambda: "the certificate of localhost is not valid (self-signed certificate)" in caplog.text)
+    # as the message advises
+    monkeypatch.setenv("SSL_CERT_FILE", str(CERTIFICATE))
+    with receiving(f"localhost:{port}", tls=True) as client:
+        wait_for(lambda: client.counts.get("corrections.bytes"))
+        assert b"".join(client.pop_received()) == STREAM
+    with receiving(f"127.0.0.1:{port}", tls=True):
+        wait_for(lambda: "the certificate of 127.0.0.1 is not valid (IP address mismatch" in caplog.text)
+
+
+def test_given_tls_at_a_port_without_it_then_the_log_has_what_to_set(
+    casters: Callable[..., Caster], caplog: pytest.LogCaptureFixture
+) -> None:
+    with receiving(casters(b"ICY 200 OK\r\n\r\n").address, tls=True):
+        wait_for(lambda: "the caster does not speak TLS (WRONG_VERSION_NUMBER): leave tls out" in caplog.text)
 
 
 def test_given_a_lost_connection_then_it_is_made_again(

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from support_gps import START, Line, drive, split_in_half, split_randomly
 
 from modelserver.messages import FixType
-from msdrivers.devices.gpsd import GpsdDriver, GpsdSettings, GpsdStream
+from msdrivers.devices.gpsd import GpsdDriver, GpsdFormat, GpsdSettings
+from msdrivers.devices.stream import FrameScanner
 from msdrivers.emulate.gps import GpsdEmulator
 from msdrivers.endpoint import EndpointPhase
 
@@ -188,7 +189,7 @@ def test_given_gpsd_without_fixes_then_the_status_has_why(
 @given(st.binary(max_size=300), st.integers(0, 100))
 def test_given_any_bytes_then_nothing_is_raised_and_pieces_give_the_same(data: bytes, seed: int) -> None:
     data += b'\n{"class":"TPV","mode":1}\n'
-    stream, whole = GpsdStream(), GpsdStream().feed(data)
+    stream, whole = FrameScanner((GpsdFormat(),)), FrameScanner((GpsdFormat(),)).feed(data)
     pieces = [each for piece in split_randomly(data, seed) for each in stream.feed(piece)]
     assert pieces == whole
     assert whole[-1].name == "TPV"

@@ -185,7 +185,7 @@ def test_given_timer_words_that_take_effect_later_then_the_device_time_is_not_us
     [
         ({"message": 0x07}, "message is one of 2, 3, 12, 13, 14, 49, got 7"),
         ({"message": CommandByte.INSTANTANEOUS_EULER}, "heading is magnetic with message 13"),
-        ({"specific_force_sign": 0}, "specific_force_sign is 1 or -1"),
+        ({"specific_force_sign": 0}, "specific_force_sign is one of 1, -1"),
         ({"bauds": (0,)}, "bauds are above 0"),
         ({"silence": 0.0}, "silence is between 0.05 and 3600, got 0"),
         ({"tick": math.nan}, "tick is between"),

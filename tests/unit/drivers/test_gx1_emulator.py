@@ -52,17 +52,15 @@ def sample(at: float, orientation: so3.Quaternion, reference: OrientationReferen
 def test_given_the_end_of_the_samples_then_it_streams_no_more_and_reports_its_temperature():
     hand = Hand(Gx1Emulator(stationary_samples(0.5), unit=Gx1Unit(streamed_at_start=CommandByte.EULER_VECTORS)))
     assert len(hand.ask(wait=0.6)) == 51
-    assert hand.ask(requests.make_poll(CommandByte.EULER_VECTORS), 0.1) == []
-    assert [packet.command for packet in hand.ask(requests.make_poll(CommandByte.TEMPERATURE))] == [
-        CommandByte.TEMPERATURE
-    ]
+    assert hand.ask(bytes((CommandByte.EULER_VECTORS,)), 0.1) == []
+    assert [packet.command for packet in hand.ask(bytes((CommandByte.TEMPERATURE,)))] == [CommandByte.TEMPERATURE]
 
 
 def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_that_rise():
     hand = Hand(Gx1Emulator(stationary_samples(), unit=Gx1Unit(tick_offset=65_530)))
     started = hand.ask(requests.make_stream(CommandByte.STABILIZED_EULER))[0]
     assert started.field("streamed") == (CommandByte.STABILIZED_EULER,)
-    found = hand.ask(wait=0.1) + hand.ask(requests.make_poll(CommandByte.TEMPERATURE), 0.1)
+    found = hand.ask(wait=0.1) + hand.ask(bytes((CommandByte.TEMPERATURE,)), 0.1)
     assert [packet.command for packet in found].count(CommandByte.TEMPERATURE) == 1
     ticks = [(packet.ticks + 6) % 65_536 for packet in found if packet.ticks is not None]
     assert ticks == sorted(ticks)

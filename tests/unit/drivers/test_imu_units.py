@@ -17,9 +17,16 @@ from modelserver.messages import ImuSample, OrientationReference, SensorHeader, 
 from modelserver.transforms import so3
 from msdrivers.devices import vectornav as vn
 from msdrivers.devices import xsens
-from msdrivers.devices.stream import StreamDriver, recognize
-from msdrivers.devices.vectornav import VectornavDriver, VectornavSettings, VnBinary, VnStream, VnText
-from msdrivers.devices.xsens import ItemId, MtData, SampleTimeUnwrapper, XbusStream, XsensDriver, XsensSettings
+from msdrivers.devices.stream import FrameScanner, StreamDriver, recognize
+from msdrivers.devices.vectornav import (
+    VectornavDriver,
+    VectornavSettings,
+    VnBinary,
+    VnBinaryFormat,
+    VnText,
+    VnTextFormat,
+)
+from msdrivers.devices.xsens import ItemId, MtData, SampleTimeUnwrapper, XbusFormat, XsensDriver, XsensSettings
 from msdrivers.emulate import FaultInjector, parse_fault
 from msdrivers.emulate.imu import VectornavEmulator, XsensEmulator
 from msdrivers.endpoint import Endpoint, EndpointPhase
@@ -68,7 +75,7 @@ VN_FRAMES = {
 @pytest.mark.parametrize("frame", VN_FRAMES)
 def test_given_a_binary_message_of_the_manual_then_its_fields_are_read_and_encoded(frame: str) -> None:
     data = bytes.fromhex(frame)
-    (message,) = VnStream().feed(data)
+    (message,) = FrameScanner((VnBinaryFormat(), VnTextFormat())).feed(data)
     assert isinstance(message, VnBinary)
     for key, values in VN_FRAMES[frame].items():
         assert message.get_floats(key) == pytest.approx(values, rel=1e-6)
@@ -80,11 +87,11 @@ def test_given_text_of_a_unit_then_it_is_read_and_encoded() -> None:
         b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
         b"-00.000018,+00.001122,-00.000551*69\r\n"
     )
-    (message,) = VnStream().feed(line)
+    (message,) = FrameScanner((VnBinaryFormat(), VnTextFormat())).feed(line)
     assert isinstance(message, VnText)
     assert message.words[:2] == ("YMR", "+100.949")
     assert vn.encode_text("WRG,75,1,8,05,1001,073E") == b"$VNWRG,75,1,8,05,1001,073E*25\r\n"
-    assert VnStream().feed(line.replace(b"*69", b"*68")) == []
+    assert FrameScanner((VnBinaryFormat(), VnTextFormat())).feed(line.replace(b"*69", b"*68")) == []
 
 
 XSENS_FRAMES = {
@@ -101,7 +108,7 @@ XSENS_FRAMES = {
 @pytest.mark.parametrize("frame", XSENS_FRAMES)
 def test_given_a_packet_then_its_items_are_read(frame: str) -> None:
     counter, ticks, force, rate, orientation = XSENS_FRAMES[frame]
-    (message,) = XbusStream().feed(bytes.fromhex(frame))
+    (message,) = FrameScanner((XbusFormat(),)).feed(bytes.fromhex(frame))
     data = MtData.parse(message.data)
     assert data.get_integer(ItemId.PACKET_COUNTER) == counter
     assert data.get_integer(ItemId.SAMPLE_TIME_FINE) == ticks

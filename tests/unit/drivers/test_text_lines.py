@@ -135,7 +135,7 @@ def test_given_nothing_then_the_cable_is_to_be_checked() -> None:
         ({"fields": {"specific_force_x": ColumnMap(0)}}, "specific_force_y is missing"),
         ({"fields": {**FIELDS, "time": ColumnMap(7)}}, "is in column 7, but a line has 7"),
         ({"fields": {"time": ColumnMap(0)}}, "or both"),
-        ({"checksum": "crc"}, "none or xor"),
+        ({"checksum": "crc"}, "checksum is one of none, xor"),
         ({"columns": 0}, "columns is between"),
     ],
 )

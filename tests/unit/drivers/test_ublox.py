@@ -10,13 +10,13 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pyubx2 import GET, UBXMessage
+from pyubx2 import GET, UBXMessage, calc_checksum
 from support_gps import SECOND, START, Line, add_noise, drive, split_in_half, split_randomly
 
 from modelserver.messages import FixType, GpsSample
 from msdrivers.devices.gps.driver import GpsDriver, GpsSettings
-from msdrivers.devices.stream import compute_fletcher, recognize, recognize_line
-from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxStream
+from msdrivers.devices.stream import FrameScanner, recognize, recognize_line
+from msdrivers.devices.ublox import UbloxDriver, UbloxSettings, UbxFormat
 from msdrivers.emulate import FaultInjector, parse_fault
 from msdrivers.emulate.gps import ORDER, GpsEmulator, GpsUnit, UbloxEmulator, UbloxUnit, encode_ubx
 from msdrivers.endpoint import EndpointPhase
@@ -94,7 +94,7 @@ def test_given_a_type_of_fix_then_it_is_published(fix_type: FixType) -> None:
 def test_given_a_time_that_the_receiver_is_not_sure_of_then_it_is_not_used() -> None:
     pvt = bytearray(encode_ubx("NAV-PVT", ALL))
     pvt[6 + 11] &= ~0x04  # fullyResolved
-    pvt[-2:] = compute_fletcher(bytes(pvt[2:-2]))
+    pvt[-2:] = calc_checksum(bytes(pvt[2:-2]))
     line = Line(UbloxDriver(UbloxSettings("gps")), UbloxEmulator(()))
     line.open()
     line.deliver(bytes(pvt) + encode_ubx("NAV-EOE", ALL))
@@ -196,8 +196,8 @@ def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
     noise = noise.replace(b"\xb5\x62", b"")
     frame = encode_ubx("NAV-PVT", ALL)
     data = noise[:at] + frame + noise[at:]
-    whole = UbxStream().feed(data)
-    stream = UbxStream()
+    whole = FrameScanner((UbxFormat(),)).feed(data)
+    stream = FrameScanner((UbxFormat(),))
     pieces: list[object] = []
     position = 0
     while position < len(data):
@@ -210,10 +210,10 @@ def test_given_any_bytes_then_valid_messages_are_found_and_nothing_is_raised(
 
 
 def test_given_damaged_lengths_or_payloads_then_they_are_counted() -> None:
-    stream = UbxStream()
+    stream = FrameScanner((UbxFormat(),))
     stream.feed(b"\xb5\x62\x01\x07\xff\xff" + bytes(20))
     short = b"\x01\x07\x04\x00\x00\x00\x00\x00"
-    stream.feed(b"\xb5\x62" + short + compute_fletcher(short))
+    stream.feed(b"\xb5\x62" + short + calc_checksum(short))
     assert stream.counts["rejected.ubx_length"] == 1
     frame = bytearray(encode_ubx("NAV-PVT", ALL))
     frame[20] ^= 1

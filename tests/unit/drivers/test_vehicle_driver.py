@@ -26,17 +26,17 @@ from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, Vehi
 from msdrivers.devices.can import SignalMap
 from msdrivers.devices.vehicle import CommandLimits, CommandMap, StatusMap, VehicleDriver, VehicleSettings
 from msdrivers.emulate import FaultInjector, InjectedFault
-from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
+from msdrivers.emulate.vehicle import VehicleEmulator
 from msdrivers.endpoint import CanFrame, EndpointPhase, EndpointStatus, MeasuredSample, Send
 
 DATABASE = raptor_dbc()
 
 
 def connect(
-    *faults: InjectedFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
+    *faults: InjectedFault, settings: VehicleSettings | None = None
 ) -> tuple[Wire[CanFrame], VehicleDriver, VehicleEmulator]:
     driver = VehicleDriver(settings or vehicle_settings(), DATABASE)
-    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit)
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND)
     return Wire(driver, FaultInjector(lambda: emulator, faults)), driver, emulator
 
 
@@ -71,8 +71,8 @@ def statuses(wire: Wire[CanFrame], begin: float = 0.0) -> list[VehicleStatusSamp
 
 
 def test_given_a_controller_then_its_status_is_published_as_sent() -> None:
-    wire, driver, emulator = connect(unit=VehicleUnit(fault_bits=0x8001))
-    emulator.speed, emulator.steering = 0.0, 0.1
+    wire, driver, emulator = connect()
+    emulator.fault_bits, emulator.steering = 0x8001, 0.1
     wire.run(2.0)
     samples = statuses(wire)
     assert len(samples) == 40
@@ -383,7 +383,7 @@ def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, 
 def test_given_limits_that_cannot_be_then_the_key_is_named() -> None:
     with pytest.raises(ValueError, match="steering_angle is between"):
         CommandLimits(steering_angle=2.0)
-    with pytest.raises(ValueError, match="over_limit is clamp or reject"):
+    with pytest.raises(ValueError, match="over_limit is one of clamp, reject"):
         CommandLimits(over_limit="perhaps")  # type: ignore[arg-type]
 
 

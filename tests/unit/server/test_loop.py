@@ -39,6 +39,7 @@ from modelserver.messages import (
     Reply,
     RequestHeader,
     SensorHeader,
+    SetFrame,
     SetHTransform,
     SetStateVector,
     StateVectorReply,
@@ -375,6 +376,7 @@ def test_given_random_bytes_on_any_channel_then_they_are_counted_and_the_next_go
                 (GetExplanation, ("Camera:Origin", "World:UTM")),
                 (GetDynamics, ()),
                 (ReloadModel, ()),
+                (SetFrame, ("Camera:Marker",)),
                 (SetStateVector, (PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())),)),
                 (SetHTransform, (PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())),)),
             )

@@ -24,7 +24,7 @@ from support_samples import (
 )
 
 from modelserver.config.vehicle_file import load_config
-from modelserver.core import CoreState
+from modelserver.core import CoreState, step
 from modelserver.errors import Status
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.formats.yaml_geometry import decode_snapshot
@@ -149,6 +149,15 @@ def test_given_two_reloads_in_sequence_in_raw_mode_then_odom_stays_where_it_was(
     twice = after.reconfigure(makings)
     assert before.estimate(before.utime).odom.distance(twice.estimate(before.utime).odom)[0] < 0.1
     assert twice.drift == after.drift != ()
+
+
+def test_given_inertial_samples_alone_then_the_reasons_against_a_pose_name_no_step_of_the_clock(tmp_path: Path) -> None:
+    state = load(tmp_path).start_core(FakeClock(START).now())
+    for number in range(20):
+        state, _ = step(state, imu(START + number * 10_000), FakeClock(START + number * 10_000).now())
+    error = state.view.no_pose_error()
+    assert "no usable GPS fix yet" in str(error)
+    assert "clock" not in str(error)
 
 
 def read_again(vehicle: Vehicle, file: str = "") -> Callable[[LoadModel, CoreState], PollReload]:
@@ -297,7 +306,7 @@ def test_given_the_signal_then_the_next_pass_reads_the_file_and_sends_it_out(
     new = rig.loop.state.model.revision
     assert new != old
     assert [part.model_revision for part in rig.parts] == [old, new]
-    assert caplog.messages[-1] == f"the geometry was reloaded: revision {new}, before {old}"
+    assert caplog.messages[-1] == f"the geometry was changed: revision {new}, before {old}"
     content = SnapshotAssembler().add(rig.parts[-1])
     assert content is not None
     snapshot = decode_snapshot(content)

@@ -68,8 +68,12 @@ def find_vehicle_file() -> Path:
 
 def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesses) -> None:
     """Start all processes, query, and print. Raises LaunchError if something is missing."""
-    typer.echo(f"1. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to emulated devices")
-    start = time.monotonic()
+    typer.echo("1. Emulated devices, a process each, on one simulated drive")
+    start_utime = get_start_utime(1 + 2 * len(lines.devices))
+    options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
+    typer.echo("\n".join(map(escape, start_devices(children, lines, start_utime, options))))
+
+    typer.echo(f"\n2. Daemon and drivers, a process each, for {find_vehicle_file()} with connections to these devices")
     commands = start_programs(children, lines.vehicle, lines.devices, ("--url", lines.url))
     typer.echo("\n".join(map(escape, commands)))
     # heavy imports, while the child processes load
@@ -84,11 +88,6 @@ def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesse
     # a dozen processes on a busy machine: a reply may be late
     with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=1.0, retries=9) as platform:
         wait_for_reports(listener, lines.devices, children)
-
-        typer.echo("\n2. Emulated devices, a process each, found by their drivers")
-        start_utime = get_start_utime(time.monotonic() - start)
-        options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
-        typer.echo("\n".join(map(escape, start_devices(children, lines, start_utime, options))))
         run = make_simulation(vehicle, start_utime, seconds + EXTRA_SECONDS)
 
         typer.echo("\n3. Queries of the geometry")

@@ -47,9 +47,6 @@ SELF: Final = "up"
 VIEW: Final = "view"
 """Name of the viewer in the output."""
 
-REPORT_TIMEOUT_S: Final = 20.0
-"""Timeout for the first report of every driver before the emulated devices start, seconds."""
-
 POLL_S: Final = 0.5
 
 
@@ -92,6 +89,8 @@ def command(
     )
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
         began = time.monotonic()
+        if emulate:
+            start_devices(children, lines, get_start_utime(1 + 2 * len(vehicle.drivers)), faults=of_devices)
         start_programs(children, lines.vehicle, vehicle.drivers, ("--url", url) if url else ())
         if view:
             bus = ("--url", url or vehicle.lcm.url, "--prefix", vehicle.lcm.channel_prefix)
@@ -101,13 +100,6 @@ def command(
         def is_over() -> bool:
             return stop.is_set() or time.monotonic() >= began + seconds
 
-        if emulate:
-            deadline, drivers = time.monotonic() + REPORT_TIMEOUT_S, tuple(vehicle.drivers)
-            supervise(
-                *(children, listener, printer),
-                lambda: is_over() or listener.has_drivers(drivers) or time.monotonic() >= deadline,
-            )
-            start_devices(children, lines, get_start_utime(time.monotonic() - began), faults=of_devices)
         supervise(children, listener, printer, is_over)
         printer.print(SELF, "stopping")
 

@@ -227,10 +227,11 @@ class EmulatedConnections:
     devices: Mapping[str, tuple[str, ...]]
 
 
-LEAD_S: Final = 1.5
-LEAD_FACTOR: Final = 0.5
-"""Time from the start of the emulated devices to the drive, plus this fraction of the loading time of the processes
-before, which measures how slow the machine is. The vehicle is stationary at first, so a late device misses nothing."""
+LOADING: Final = 1.3
+"""Time that a process takes to load by that which this one has taken so far: 0.5 and 0.38 s of the processor."""
+
+MOST_LEAD_S: Final = 10.0
+"""Longest time from the start of the processes to the drive; what is slower misses its beginning."""
 
 SERVICE: Final = "service"
 """Name of the daemon among the processes; a driver has its own, and its emulated device that name and " device"."""
@@ -264,9 +265,15 @@ def start_devices(
     return [_start(children, f"{name} device", each, is_last=True) for name, each in words.items()]
 
 
-def get_start_utime(loading_time: float) -> int:
-    """Return when a drive may begin, if the processes before its devices took so many seconds to load."""
-    return round((time.time() + LEAD_S + LEAD_FACTOR * loading_time) * 10) * 100_000
+def get_start_utime(count: int) -> int:
+    """Return when a drive may begin for which `count` processes start now, by the time that this one has taken.
+
+    The vehicle is stationary at first: a device that is half a second late misses nothing.
+    """
+    started_ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+    age = time.clock_gettime(time.CLOCK_BOOTTIME) - started_ticks / os.sysconf("SC_CLK_TCK")
+    lead = LOADING * age * count / (os.cpu_count() or 1)
+    return round((time.time() + min(lead, MOST_LEAD_S)) * 10) * 100_000
 
 
 def _start(children: ChildProcesses, name: str, words: tuple[str, ...], *, is_last: bool = False) -> str:

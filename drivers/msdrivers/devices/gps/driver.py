@@ -1,7 +1,7 @@
 """Driver of a satellite receiver, NovAtel or NMEA 0183: configures it, publishes its fixes, diagnoses errors.
 
 Both protocols are read interleaved on one port (`GpsStream`). A fix is a position log with its velocity and heading
-(`FixAssembler`), or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
+of one instant, or an NMEA epoch of a receiver that has no logs. Missing values stay nan.
 
 A NovAtel receiver is configured by commands (`StreamDriver`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
@@ -11,53 +11,19 @@ read.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.messages.values import NAN
-from modelserver.transforms.so3 import Vector3
-from msdrivers.devices import check_ranges
-from msdrivers.devices.gps import (
-    DAY,
-    WEEK,
-    course_from_track,
-    resolve_rollover,
-    to_covariance,
-    utime_of,
-)
+from msdrivers.devices import check_choice, check_ranges
+from msdrivers.devices.gps import DAY, WEEK, course_from_track, novatel, resolve_rollover, to_covariance, utime_of
 from msdrivers.devices.gps.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
-from msdrivers.devices.gps.novatel import (
-    AsciiFormat,
-    BinaryFormat,
-    CommandResponse,
-    HeadingLog,
-    LogHeader,
-    NovatelLog,
-    Position,
-    PositionType,
-    Prompt,
-    PromptFormat,
-    SolutionStatus,
-    TextFormat,
-    TimeStatus,
-    Velocity,
-)
-from msdrivers.devices.stream import (
-    SECOND_NS,
-    ByteSettings,
-    FrameScanner,
-    Script,
-    SetupStep,
-    StreamDriver,
-    check_silence,
-)
+from msdrivers.devices.gps.novatel import CommandResponse, HeadingLog, LogHeader, NovatelLog, Position, Prompt, Velocity
+from msdrivers.devices.stream import SECOND_NS, ByteSettings, FrameScanner, Script, SetupStep, StreamDriver
 from msdrivers.endpoint import EndpointPhase, HostTime, Output, Send
 
-PROTOCOLS = ("novatel", "nmea")
-HEADING_LOGS = ("", "HEADING", "HEADING2")
 POSITION_LOG = "BESTPOS"
 
 HOLD_NS = SECOND_NS // 10
@@ -90,30 +56,16 @@ class GpsSettings(ByteSettings):
 
     def __post_init__(self) -> None:
         ByteSettings.__post_init__(self)
-        for name, known in (("protocol", PROTOCOLS), ("heading_log", HEADING_LOGS)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} is one of {', '.join(filter(None, known))}, got '{getattr(self, name)}'")
+        check_choice(self, protocol=("novatel", "nmea"), heading_log=("", "HEADING", "HEADING2"))
         check_ranges(self, rate_hz=(0.1, 20.0))
         for command in self.commands:
             if not command.strip() or not command.isprintable() or not command.isascii():
                 raise ValueError(f"commands: {command!r} is no line of text")
-        check_silence(self.silence, self.rate_hz)
 
     @property
     def logs(self) -> tuple[str, ...]:
         """The names of the logs that a NovAtel receiver is asked for."""
         return (POSITION_LOG, "BESTVEL", *filter(None, [self.heading_log])) if self.protocol == "novatel" else ()
-
-    def make_setup_commands(self) -> tuple[str, ...]:
-        """Return the commands that set the receiver up, in order."""
-        if self.protocol != "novatel":
-            return self.commands
-        wanted = (f"log thisport {log.lower()}b ontime {1.0 / self.rate_hz:.6g}" for log in self.logs)
-        return ("unlogall thisport", *self.commands, *wanted)
-
-    def make_undo_commands(self) -> tuple[str, ...]:
-        """Return the commands that stop the logs again."""
-        return tuple(f"unlog thisport {log.lower()}b" for log in self.logs)
 
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
@@ -127,12 +79,8 @@ class GpsStream(FrameScanner[Any]):
     """
 
     def __init__(self) -> None:
-        super().__init__((SentenceFormat(), BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat()))
-        self._epochs = EpochAssembler()
-
-    @property
-    def counts(self) -> dict[str, int]:
-        return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
+        super().__init__((SentenceFormat(), *novatel.FORMATS))
+        self._epochs = EpochAssembler(self.reject)
 
     def feed(self, data: bytes) -> list[GpsMessage]:
         messages: list[GpsMessage] = []
@@ -145,21 +93,15 @@ class GpsStream(FrameScanner[Any]):
         return self._epochs.flush()
 
     def clear(self) -> None:
-        """Discard what is incomplete after the line was closed; counters and offsets continue."""
         super().clear()
         self._epochs.clear()
 
 
-USABLE_TIME = frozenset(TimeStatus) - {
-    TimeStatus.UNKNOWN,
-    TimeStatus.APPROXIMATE,
-    TimeStatus.COARSEADJUSTING,
-    TimeStatus.SATTIME,
-}
+USABLE_TIME = {each for each in novatel.TimeStatus if novatel.TimeStatus.COARSE <= each < novatel.TimeStatus.SATTIME}
 """With the other statuses the header's time may be wrong by seconds or years."""
 
 FIX_TYPES: dict[int, FixType] = {
-    PositionType[name]: fix_type
+    novatel.PositionType[name]: fix_type
     for fix_type, names in {
         FixType.FIX_2D: "FIXEDHEIGHT",
         FixType.FIX_3D: "SINGLE INS_PSRSP",
@@ -199,10 +141,11 @@ def sample_from_novatel(
 ) -> GpsSample:
     """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
     # without a solution the receiver sends zeros
-    empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
+    empty = position.type == novatel.PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
     height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
     velocity = velocity if velocity is not None and _is_solved(velocity) else None
     heading = heading if heading is not None and _is_solved(heading) else None
+    track = math.radians(velocity.track) if velocity else NAN
     return GpsSample(
         header,
         FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
@@ -213,7 +156,9 @@ def sample_from_novatel(
         undulation=undulation,
         satellites=position.used,
         position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
-        velocity=_to_enu(velocity) if velocity else None,
+        velocity=(velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical)
+        if velocity
+        else None,
         velocity_latency=max(0.0, velocity.latency - position.solution_age) if velocity else NAN,
         speed=velocity.horizontal if velocity else NAN,
         course=course_from_track(velocity.track) if velocity else NAN,
@@ -223,127 +168,7 @@ def sample_from_novatel(
 
 
 def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
-    return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
-
-
-def _to_enu(velocity: Velocity) -> Vector3:
-    track = math.radians(velocity.track)
-    return velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical
-
-
-WGS84_DATUM = 61
-
-
-@dataclass(frozen=True, slots=True)
-class GpsFix:
-    """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
-    than that."""
-
-    host_utime: int
-    device_utime: int
-    solution: NmeaEpoch | Position
-    velocity: Velocity | None = None
-    heading: HeadingLog | None = None
-    delay: float = 0.0
-
-    def to_sample(self, header: SensorHeader) -> GpsSample:
-        if isinstance(self.solution, NmeaEpoch):
-            return sample_from_nmea(header, self.solution)
-        return sample_from_novatel(header, self.solution, self.velocity, self.heading)
-
-
-class FixAssembler:
-    """Assembles logs and epochs to fixes, each instant once.
-
-    logs: the names of the position log and of what belongs to it; empty for NMEA only.
-    """
-
-    def __init__(self, logs: Sequence[str]) -> None:
-        self._logs = tuple(logs)
-        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
-        self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
-        self._last_log: tuple[int, int] | None = None
-        self._last_epoch: tuple[int, int | None] | None = None
-        self._last_solution = -1
-        self.counts: Counter[str] = Counter()
-        """`repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
-        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
-        `unknown_type`: fixes published as none for their type."""
-
-    def clear(self) -> None:
-        """Discard pending data: the line was closed, or the receiver has restarted."""
-        self._parts.clear()
-        self._waiting = None
-
-    def get_deadline(self) -> int | None:
-        return self._waiting[2] if self._waiting else None
-
-    def on_timer(self, now: HostTime) -> list[GpsFix]:
-        """Release a position whose hold time has passed."""
-        return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
-
-    def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
-        """Process an NMEA epoch whose first byte was received at `host_utime`."""
-        if self._logs:
-            self.counts["superseded"] += 1
-            return []
-        instant = (epoch.utime, epoch.time_of_day)
-        if epoch.time_of_day is not None and instant == self._last_epoch:
-            self.counts["repeated"] += 1
-            return []
-        self._last_epoch = instant
-        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), epoch)]
-
-    def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
-        """Process a log whose first byte was received at `host_utime`."""
-        if log.header.name not in self._logs or log.body is None:
-            return []
-        if log.header.is_secondary:
-            self.counts["rejected.secondary_antenna"] += 1
-            return []
-        instant = (log.header.week, log.header.milliseconds)
-        if not isinstance(log.body, Position):
-            assert isinstance(log.body, (Velocity, HeadingLog))
-            self._parts[log.header.name] = (instant, log.body)
-            return self._release_if_complete(instant)
-        solution = instant[0] * WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
-        if instant == self._last_log or (log.body.solution_age > 0.0 and solution == self._last_solution):
-            self.counts["repeated"] += 1
-            return []
-        self._last_solution = solution
-        if log.body.datum != WGS84_DATUM:
-            self.counts["rejected.datum"] += 1
-            return []
-        if log.body.type not in PositionType.__members__.values():
-            self.counts["unknown_type"] += 1
-        fixes = self._release()
-        self._last_log = instant
-        device = get_log_utime(log.header, now.utime)
-        fix = GpsFix(host_utime, device, log.body, delay=max(0.0, log.body.solution_age))
-        self._waiting = (fix, instant, now.monotonic_ns + HOLD_NS)
-        return fixes + self._release_if_complete(instant)
-
-    def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
-        """Release the pending position if its velocity and heading are complete."""
-        if self._waiting is None or self._waiting[1] != instant:
-            return []
-        here = {name for name, (when, _) in self._parts.items() if when == instant}
-        return self._release() if here.issuperset(self._logs[1:]) else []
-
-    def _release(self) -> list[GpsFix]:
-        if self._waiting is None:
-            return []
-        fix, instant, _ = self._waiting
-        self._waiting = None
-        for when, part in self._parts.values():
-            if when == instant:
-                fix = replace(fix, velocity=part) if isinstance(part, Velocity) else replace(fix, heading=part)
-        return [fix]
-
-
-def get_log_utime(header: LogHeader, pivot: int) -> int:
-    """Return the utime of a log; 0 if the receiver's time is not usable."""
-    return utime_of(header.week, header.milliseconds * 1000, pivot) if header.time_status in USABLE_TIME else 0
+    return log.status == novatel.SolutionStatus.SOL_COMPUTED and log.type != novatel.PositionType.NONE
 
 
 def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
@@ -361,7 +186,7 @@ _PROBLEMS = {
     "rejected.datum": 'positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`',
     "unknown_type": "the receiver names a position type that is not known here: its fixes are published as none",
 }
-"""What is reported once, by the counter of the fixes."""
+"""What is reported once, by its counter."""
 
 _EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_field")
 """Counters by which the baud rate is right."""
@@ -370,9 +195,13 @@ _EVIDENCE = ("nmea.", "novatel.", "rejected.nmea_incomplete", "rejected.nmea_fie
 class GpsDriver(StreamDriver[GpsMessage]):
     """An `Endpoint` of bytes at the host's end of a receiver's line; see `GpsSettings`.
 
-    Further counts: what was left out and why, `restarts`.
+    Further counts: `repeated`: duplicate instants. `superseded`: NMEA epochs of a receiver with logs. `rejected.datum`:
+    positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna. `unknown_type`:
+    fixes published as none for their type. `restarts`.
     """
 
+    # an end of line first, to flush partial input
+    identification = b"\r\nunlogall thisport\r\n"
     answer_timeout = 1.0
     _settings: GpsSettings
     _stream: GpsStream
@@ -383,49 +212,43 @@ class GpsDriver(StreamDriver[GpsMessage]):
         self.device = settings.protocol
         self.description = "NovAtel receiver" if self._is_novatel else "NMEA receiver"
         self.awaited = POSITION_LOG if self._is_novatel else "NMEA"
-        self._fixes = FixAssembler(settings.logs)
+        self._waiting: tuple[LogHeader, Position, int, int] | None = None
+        """The position that waits for its velocity, when it was received, utime, and until when, monotonic."""
+        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
+        self._last_log: tuple[int, int] | None = None
+        self._last_epoch: tuple[int, int | None] | None = None
+        self._last_solution = -1
         self._counts_before: Mapping[str, int] = {}
         """Those of the stream at the last fix or search."""
-        self._seen_problems: set[str] = set()
-        self._last_byte_ns: int | None = None
-        self._answered_ns: int | None = None
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        return {**super().counts, **self._fixes.counts}
-
-    def _make_identification(self) -> bytes:
-        # an end of line first, to flush partial input
-        return b"\r\n" + _encode_command(self._settings.make_setup_commands()[0])
+        self._gap_ns: int | None = None
+        """When the line has paused long enough."""
+        self._prompt_until_ns = 0
+        """Until then a prompt belongs to a response."""
 
     def _on_start(self) -> None:
-        self._fixes.clear()
-        self._last_byte_ns = None
+        self._forget_logs()
+        self._gap_ns = None
         self._counts_before = self._stream.counts
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
-        self._last_byte_ns = now.monotonic_ns
+        self._gap_ns = now.monotonic_ns + GAP_NS
         return super().on_receive(unit, now)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Stop the requested logs."""
         self._setup.stop()
-        return [Send(_encode_command(each)) for each in self._settings.make_undo_commands()]
+        return [Send(_encode_command(f"unlog thisport {log.lower()}b")) for log in self._settings.logs]
 
     def _get_extra_deadline(self) -> int | None:
-        return min((each for each in (self._gap_ns, self._fixes.get_deadline()) if each is not None), default=None)
+        deadlines = self._gap_ns, self._waiting[-1] if self._waiting else None
+        return min((each for each in deadlines if each is not None), default=None)
 
     def _on_extra_timer(self, now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         if self._gap_ns is not None and now.monotonic_ns >= self._gap_ns:
-            self._last_byte_ns = None
+            self._gap_ns = None
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
-        return out + self._publish_fixes(self._fixes.on_timer(now), now)
-
-    @property
-    def _gap_ns(self) -> int | None:
-        return None if self._last_byte_ns is None else self._last_byte_ns + GAP_NS
+        return out + (self._release(now) if self._waiting and now.monotonic_ns >= self._waiting[-1] else [])
 
     def _on_message(self, message: GpsMessage, now: HostTime) -> list[Output[bytes]]:
         if isinstance(message, CommandResponse):
@@ -434,37 +257,93 @@ class GpsDriver(StreamDriver[GpsMessage]):
             return self._on_prompt(message, now)
         arrival = self._find_arrival(message.start, now)
         if isinstance(message, NovatelLog):
-            return self._publish_fixes(self._fixes.add_log(message, arrival, now), now)
-        return self._publish_fixes(self._fixes.add_epoch(message, arrival, now), now)
+            return self._on_log(message, arrival, now)
+        return self._on_epoch(message, arrival, now)
 
-    def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
-        out: list[Output[bytes]] = []
-        for fix in fixes:
-            self._counts_before = self._stream.counts
-            header = self._make_header(fix.host_utime, fix.device_utime)
-            out += self._publish(fix.to_sample(header), now, delay=fix.delay)
-        for name in [each for each in _PROBLEMS if self._fixes.counts[each] and each not in self._seen_problems]:
-            self._seen_problems.add(name)
-            out += self._set_status(self._phase, _PROBLEMS[name])
-        return out
+    def _on_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[Output[bytes]]:
+        if self._is_novatel:
+            return self._leave_out("superseded")
+        instant = (epoch.utime, epoch.time_of_day)
+        if epoch.time_of_day is not None and instant == self._last_epoch:
+            return self._leave_out("repeated")
+        self._last_epoch = instant
+        header = self._make_header(host_utime, _get_epoch_utime(epoch, now.utime))
+        return self._publish_fix(sample_from_nmea(header, epoch), now)
+
+    def _on_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[Output[bytes]]:
+        header, body = log.header, log.body
+        if header.name not in self._settings.logs or body is None:
+            return []
+        if header.is_secondary:
+            return self._leave_out("rejected.secondary_antenna")
+        instant = (header.week, header.milliseconds)
+        if not isinstance(body, Position):
+            self._parts[header.name] = (instant, body)
+            return self._release_if_complete(now)
+        solution = instant[0] * WEEK // 1000 + instant[1] - round(body.solution_age * 1000.0)
+        if instant == self._last_log or (body.solution_age > 0.0 and solution == self._last_solution):
+            return self._leave_out("repeated")
+        self._last_solution = solution
+        if body.datum != novatel.WGS84_DATUM:
+            return self._leave_out("rejected.datum")
+        out = self._release(now)
+        if body.type not in novatel.PositionType.__members__.values():
+            out += self._leave_out("unknown_type")
+        self._last_log = instant
+        self._waiting = (header, body, host_utime, now.monotonic_ns + HOLD_NS)
+        return out + self._release_if_complete(now)
+
+    def _release_if_complete(self, now: HostTime) -> list[Output[bytes]]:
+        """Publish the waiting position if its velocity and heading are there."""
+        if self._waiting is None:
+            return []
+        header = self._waiting[0]
+        here = {name for name, (when, _) in self._parts.items() if when == (header.week, header.milliseconds)}
+        return self._release(now) if here.issuperset(self._settings.logs[1:]) else []
+
+    def _release(self, now: HostTime) -> list[Output[bytes]]:
+        """Publish the waiting position with what there is of its instant."""
+        if self._waiting is None:
+            return []
+        (log, position, host_utime, _), self._waiting = self._waiting, None
+        parts = [part for when, part in self._parts.values() if when == (log.week, log.milliseconds)]
+        velocity = next((part for part in parts if isinstance(part, Velocity)), None)
+        heading = next((part for part in parts if isinstance(part, HeadingLog)), None)
+        is_usable = log.time_status in USABLE_TIME
+        device_utime = utime_of(log.week, log.milliseconds * 1000, now.utime) if is_usable else 0
+        sample = sample_from_novatel(self._make_header(host_utime, device_utime), position, velocity, heading)
+        return self._publish_fix(sample, now, max(0.0, position.solution_age))
+
+    def _publish_fix(self, sample: GpsSample, now: HostTime, delay: float = 0.0) -> list[Output[bytes]]:
+        self._counts_before = self._stream.counts
+        return self._publish(sample, now, delay=delay)
+
+    def _leave_out(self, name: str) -> list[Output[bytes]]:
+        """Count what is not used, and report it once."""
+        self._counts[name] += 1
+        is_first = self._counts[name] == 1 and name in _PROBLEMS
+        return self._set_status(self._phase, _PROBLEMS[name]) if is_first else []
+
+    def _forget_logs(self) -> None:
+        self._waiting = None
+        self._parts.clear()
 
     def _on_command_response(self, answer: CommandResponse, now: HostTime) -> list[Output[bytes]]:
-        self._answered_ns = now.monotonic_ns
+        self._prompt_until_ns = now.monotonic_ns + round(self.answer_timeout * SECOND_NS)
         if self._setup_step is None:
-            commands = self._settings.make_setup_commands()[1:]
-            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in commands]
+            interval = f"{1.0 / self._settings.rate_hz:.6g}"
+            wanted = (f"log thisport {log.lower()}b ontime {interval}" for log in self._settings.logs)
+            steps = [SetupStep(_encode_command(each), f"'{each}'") for each in (*self._settings.commands, *wanted)]
             return self._on_identity("a NovAtel receiver", steps, now)
         fix = "check the settings `commands` and the logs"
         return self._on_acknowledgement(now, f"{answer.error}; {fix}" if answer.error else "")
 
     def _on_prompt(self, prompt: Prompt, now: HostTime) -> list[Output[bytes]]:
         """Set up again after a restart: a prompt that belongs to no response."""
-        answered_ns, timeout_ns = self._answered_ns, round(self.answer_timeout * SECOND_NS)
-        is_expected = answered_ns is not None and now.monotonic_ns - answered_ns < timeout_ns
-        if not self._is_novatel or self._setup.is_running or is_expected:
+        if not self._is_novatel or self._setup.is_running or now.monotonic_ns < self._prompt_until_ns:
             return []
         self._counts["restarts"] += 1
-        self._fixes.clear()
+        self._forget_logs()
         text = f"the receiver has restarted (prompt [{prompt.port}] without a command), setting it up again"
         return [*self._set_status(EndpointPhase.CONFIGURING, text), *self._setup.start(self._run_setup(), now)]
 

@@ -185,7 +185,6 @@ class NmeaSentence(NmeaValues):
 
     @property
     def has_position(self) -> bool:
-        """Whether there are coordinates, valid or not."""
         return self.latitude == self.latitude and self.longitude == self.longitude
 
 
@@ -326,10 +325,12 @@ _MODE = {
 def determine_fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
     """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
     placed = _list_places(sentences)
-    if not placed or any(map(_is_invalid, sentences)) or _has_no_mode(sentences) or _has_no_satellites(sentences):
+    if not placed or any(map(_is_invalid, sentences)) or _has_no_mode(sentences):
         return FixType.NONE
+    # some receivers keep the last quality when they lose all satellites
+    is_empty = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
     dimension = max((each.dimension for each in sentences if each.dimension is not None), default=None)
-    if dimension == 1:
+    if dimension == 1 or (is_empty and count_satellites(sentences) == 0):
         return FixType.NONE
     types = (_QUALITY.get(each.quality) if each.quality is not None else _best_mode(each.mode) for each in placed)
     found = next((each for each in types if each is not None), FixType.FIX_3D)
@@ -344,7 +345,6 @@ def _list_places(sentences: Iterable[NmeaSentence]) -> list[NmeaSentence]:
 
 
 def _is_invalid(sentence: NmeaSentence) -> bool:
-    """Return whether a sentence flags the fix invalid."""
     if sentence.kind == "GGA":
         return sentence.quality not in _QUALITY
     if sentence.kind in ("RMC", "GLL"):
@@ -382,12 +382,6 @@ def count_satellites(sentences: Sequence[NmeaSentence]) -> int:
     return counted or sum(each.listed for each in sentences)
 
 
-def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
-    """Return whether a GGA counts no satellites in use: some receivers keep the last quality when they lose all."""
-    counts = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
-    return counts and count_satellites(sentences) == 0
-
-
 POSITION_KINDS = ("GGA", "GNS", "RMC", "GLL")
 """Sentences with a position, the most detailed first."""
 _MOTION = frozenset({"VTG", "HDT"})
@@ -420,10 +414,16 @@ class NmeaEpoch(NmeaValues):
 
 
 class EpochAssembler:
-    """Sentences in, epochs out. Memory is bounded by one epoch."""
+    """Sentences in, epochs out. Memory is bounded by one epoch.
 
-    def __init__(self) -> None:
+    reject: counts, as `late`, sentences that are not used: received after their epoch was complete, or too many.
+    """
+
+    def __init__(self, reject: Callable[[str], object]) -> None:
+        self._reject = reject
         self._sentences: list[NmeaSentence] = []
+        self._timed: NmeaSentence | None = None
+        """The first of them with a time."""
         self._reference: int | None = None
         self._last_instant: int | None = None
         self._cycle: Counter[str] = Counter()
@@ -434,25 +434,24 @@ class EpochAssembler:
         self._is_line_silent = self._starts_after_silence = False
         self._order_counts: Counter[tuple[str, bool]] = Counter()
         """How often a pause showed that a kind of sentence comes first, or not."""
-        self.late = 0
-        """Unused sentences: received after their epoch was complete, or too many."""
 
     def add(self, sentence: NmeaSentence) -> list[NmeaEpoch]:
         """Return the epochs that the sentence completes: at most the one before it, and its own."""
         closed = []
         timed = sentence.kind in _TIMED
-        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._get_instant()[0]:
+        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._timed:
             closed += self._close(by_end=False)
         if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
-            self.late += 1
+            self._reject("late")
             return closed
         if sentence.day is not None and sentence.time_of_day is not None:
             self._reference = sentence.day * DAY + sentence.time_of_day
         if not self._sentences:
             self._starts_after_silence, self._is_line_silent = self._is_line_silent, False
-        elif timed and self._starts_after_silence and not self._get_instant()[0]:
+        elif timed and self._starts_after_silence and self._timed is None:
             self._learn_order(self._sentences, leads=True)
         self._sentences.append(sentence)
+        self._timed = self._timed or (sentence if timed else None)
         if self._is_end(sentence):
             closed += self._close(by_end=True)
         return closed
@@ -466,7 +465,7 @@ class EpochAssembler:
 
     def clear(self) -> None:
         """Forget the epoch under way, and the order of sentences: another receiver may speak."""
-        self._sentences, self._is_line_silent = [], False
+        self._sentences, self._timed, self._is_line_silent = [], None, False
         self._order_counts.clear()
 
     def _learn_order(self, sentences: list[NmeaSentence], leads: bool) -> None:
@@ -490,22 +489,15 @@ class EpochAssembler:
 
         return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or is_selected(n, each.kind)]
 
-    def _get_instant(self) -> tuple[bool, int | None]:
-        """Return whether the pending epoch has a timed sentence, and its time."""
-        return next(((True, each.time_of_day) for each in self._sentences if each.kind in _TIMED), (False, None))
-
     def _starts_epoch(self, sentence: NmeaSentence) -> bool:
-        started, instant = self._get_instant()
-        if not started:
-            return False
-        if sentence.time_of_day != instant:
-            return True
-        return instant is None and any(each.kind == sentence.kind for each in self._sentences)
+        if self._timed is None or sentence.time_of_day != self._timed.time_of_day:
+            return self._timed is not None
+        return sentence.time_of_day is None and any(each.kind == sentence.kind for each in self._sentences)
 
     def _is_late(self, sentence: NmeaSentence, timed: bool) -> bool:
         if timed:
-            started, _ = self._get_instant()
-            late = not started and sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            is_same = sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            late = is_same and self._timed is None
             self._is_regular = self._is_regular and not (late and self._is_closed_by_end)
             return late
         if not self._sentences and self._is_closed_by_end and sentence.kind != self._first:
@@ -524,10 +516,11 @@ class EpochAssembler:
         return all(received[kind] >= number for kind, number in self._cycle.items())
 
     def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
-        sentences, self._sentences = self._sentences, []
-        if not any(each.kind in _TIMED for each in sentences):
+        sentences, timed = self._sentences, self._timed
+        self._sentences, self._timed = [], None
+        if timed is None:
             return []
-        instant = next(each.time_of_day for each in sentences if each.kind in _TIMED)
+        instant = timed.time_of_day
         cycle = Counter(each.kind for each in sentences)
         if cycle != self._cycle or self._stable_since is None or instant is None or instant < self._stable_since:
             self._stable_since = instant

@@ -115,7 +115,6 @@ class LogHeader(NamedTuple):
 
     @property
     def is_secondary(self) -> bool:
-        """Whether the log is of the secondary antenna."""
         return self.antenna == 1
 
 
@@ -208,8 +207,8 @@ MESSAGE_IDS = {
 MAX_ANTENNA = 31
 """The largest measurement source: five bits of a binary log's message type."""
 
-DATUMS = {"WGS84": 61}
-"""Datum names of ASCII logs to the numbers of binary ones; others become 0, for the driver takes WGS 84 only."""
+WGS84_DATUM = 61
+"""The only datum that the driver takes: the names of others in ASCII logs become 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +267,7 @@ _STATION = _Column(
     lambda raw: raw.partition(b"\0")[0].decode("ascii", "replace"),
     lambda text: text.encode("ascii"),
 )
-_DATUM = _Column("I", lambda word: DATUMS.get(word, 0))
+_DATUM = _Column("I", lambda word: WGS84_DATUM if word == "WGS84" else 0)
 _RESERVED = _Column("4x")
 _TAIL = (_Column("x"),) * 6
 """Counts of observations and masks that end several logs."""
@@ -537,3 +536,6 @@ class PromptFormat:
             return ParsedFrame(prompt.end(), "novatel.prompt", Prompt(start, prompt[1].decode("ascii")))
         part = self._part.match(buffer, at, at + 12)
         return None if part is not None and part.end() == len(buffer) and len(buffer) - at < 12 else NO_FRAME
+
+
+FORMATS = (BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat())
