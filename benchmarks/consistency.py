@@ -34,7 +34,7 @@ from scipy.stats import chi2
 
 from benchmarks import husky_nis
 from benchmarks.requirements import HEALTHY, MILD_FAULT, Required
-from benchmarks.rough_simulation import GroundMotion, RoughSimulation, SideSlip, Terrain
+from benchmarks.rough_simulation import EncoderModel, GroundMotion, RoughSimulation, SideSlip, Terrain, TriadModel
 from modelserver.earth.geodesy import origin_at
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
@@ -44,7 +44,6 @@ from modelserver.geometry import ModelBuilder
 from modelserver.messages import Estimate, FixType, OrientationReference, WheelsSample
 from modelserver.simulation import (
     DrivePhase,
-    EncoderModel,
     Event,
     GpsModel,
     ImuModel,
@@ -52,11 +51,10 @@ from modelserver.simulation import (
     Timing,
     Trajectory,
     TrajectoryMotion,
-    TriadModel,
     WheelsModel,
     city,
 )
-from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.sensors import NoiseSource
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from modelserver.dynamics import Dynamics
 from modelserver.geometry import Joint, JointType, Model, ModelBuilder
-from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.parts import RigidInertia
 from modelserver.transforms import Pose
 
 BOUND = 3.0

@@ -10,7 +10,7 @@ from benchmarks.protocols import data_directory
 from benchmarks.support import ROOT
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import Decision, Verdict
-from modelserver.server.offline import OfflineRun
+from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.eventlog import LogFile
 from mstools.commands.import_bag import import_bag

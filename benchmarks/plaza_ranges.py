@@ -18,7 +18,7 @@ from benchmarks.recordings.plaza import Array, Beacons
 from benchmarks.support import ROOT
 from modelserver.earth.geodesy import Geodesy
 from modelserver.errors import ModelServerError
-from modelserver.server.offline import OfflineRun
+from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import Vehicle, get_configured_origin
 from modelserver.wire.eventlog import LogEvent, LogFile
 

@@ -7,7 +7,7 @@
   the mean over all gaps. A gap that would end after the recording is left out: at 15 % the last one of most recordings.
 
 An error is horizontal, in the frame of the antenna, at the fix's stamp; the estimate uses the events that arrived
-before (`modelserver.server.offline`). Three numbers belong together: accuracy, share of time valid, and error beyond
+before (`modelserver.server.recordings`). Three numbers belong together: accuracy, share of time valid, and error beyond
 the limit while valid (`Integrity`). The common scorer is stored beside the recordings and gets an estimate at each
 withheld fix. Invalid estimates count; missing ones are reported. `load_with_overrides` changes a vehicle file for an
 experiment.
@@ -34,7 +34,7 @@ import yaml
 from benchmarks.support import ROOT
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample
-from modelserver.server.offline import OfflineRun
+from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile

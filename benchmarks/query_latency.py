@@ -29,8 +29,7 @@ from modelserver.client.remote import Platform
 from modelserver.messages import CHANNEL_OF, GetTransformation
 from modelserver.wire.channels import to_subscription_pattern
 from modelserver.wire.codec import decode, encode, pack_get_transformation
-from modelserver.wire.provider import resolve_url
-from modelserver.wire.receiver import open_receiver
+from modelserver.wire.provider import open_receiver, resolve_url
 
 INTEREST, REFERENCE = "Digiclops:ImagePlane", "Raptor:CG"
 ROUNDS, CALLS = 40, 100

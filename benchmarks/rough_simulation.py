@@ -14,7 +14,7 @@ Limits: waves shorter than a few wheelbases are steeper for this vehicle than fo
 Read top-down: `make_motion` -> `GroundMotion.at` -> `SlipAngle.at`, `Terrain.evaluate`, `_Slope`.
 
 `RoughSimulation` is the product's `Simulation` with these options. Aiding sensors (absolute poses, visual odometry,
-ranges) are true up to the noise that they state.
+ranges) are true up to the noise that they state. `EncoderModel` and `TriadModel` are faults of the product's sensors.
 """
 
 from __future__ import annotations
@@ -22,18 +22,42 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from modelserver.geometry.model import Model
-from modelserver.messages import AbsolutePoseSample, Origin, RangeSample, RelativePoseSample
-from modelserver.simulation import Event, Simulation
-from modelserver.simulation.noise import Intervals, NoiseSource, Run, Timing, is_within
-from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
+from modelserver.messages import AbsolutePoseSample, Direction, Origin, RangeSample, RelativePoseSample, WheelSample
+from modelserver.simulation import Event, GpsModel, ImuModel, Simulation
+from modelserver.simulation.sensors import (
+    Encoder,
+    GaussMarkov,
+    Intervals,
+    NoiseSource,
+    Run,
+    Timing,
+    WheelsModel,
+    apply_rows,
+    is_within,
+)
+from modelserver.simulation.trajectory import Attitude, Coefficients, MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 
 # --- ground and side slip -----------------------------------------------------------------------------------
+
+
+def compute_higher_rates(trajectory: Trajectory, t: float) -> Vector3:
+    """Return first and second rate of curvature (1/m/s, 1/m/s2) and jerk (m/s3, second rate of speed)."""
+    piece, u = trajectory._locate(t)
+    curvature, speed = piece.curvature_rate, piece.speed_rate
+    rates = (curvature, _derive(curvature, piece.duration), _derive(speed, piece.duration))
+    return so3.to_vector3(sum(c * u**n for n, c in enumerate(rate)) for rate in rates)
+
+
+@lru_cache(maxsize=4096)
+def _derive(coefficients: Coefficients, duration: float) -> Coefficients:
+    return tuple(n * each / duration for n, each in enumerate(coefficients))[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +102,7 @@ class SlipAngle:
     def at(self, t: float, motion: TrajectoryMotion, higher: Vector3) -> Vector3:
         """Return the slip angle at `t` seconds and its first and second rate, rad, rad/s, rad/s2.
 
-        `motion` is the trajectory's at `t`, and `higher` the result of `Trajectory.higher_rates`.
+        `motion` is the trajectory's at `t`, and `higher` the result of `compute_higher_rates`.
         """
         v, v1, v2 = motion.speed, motion.forward_acceleration, higher[2]
         size, sign = abs(v), math.copysign(1.0, v)
@@ -215,7 +239,7 @@ class GroundMotion:
         yaw, yaw_rate, yaw_acceleration = plan.yaw, plan.yaw_rate, plan.yaw_acceleration
         along, across = plan.speed, 0.0
         if self._slip is not None:
-            b, b1, b2 = self._slip.at(t, plan, self._trajectory.higher_rates(t))
+            b, b1, b2 = self._slip.at(t, plan, compute_higher_rates(self._trajectory, t))
             yaw, yaw_rate, yaw_acceleration = yaw - b, yaw_rate - b1, yaw_acceleration - b2
             along, across = plan.speed * math.cos(b), plan.speed * math.sin(b)
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -482,3 +506,153 @@ class RoughSimulation(Simulation):
             more_sensors=aiding,
             **more,
         )
+
+
+# --- faults of encoders, gyros and accelerometers ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderModel:
+    """Faults of the wheels and encoders; by default none.
+
+    Attributes
+    ----------
+    burst_rate, burst_seconds, burst_excess : wheel spin of each wheel: starts per second, duration, share of excess
+        travel
+    stuck : (wheel, time): from then on the encoder gives no pulses
+    swapped : wheels that count backward when they roll forward
+    """
+
+    burst_rate: float = 0.0
+    burst_seconds: float = 1.0
+    burst_excess: float = 0.5
+    stuck: tuple[tuple[str, float], ...] = ()
+    swapped: frozenset[str] = frozenset()
+
+    def __call__(self, model: WheelsModel, name: str, noise: NoiseSource, run: Run) -> FaultyEncoder:
+        return FaultyEncoder(self, model, name, noise, run)
+
+
+class FaultyEncoder(Encoder):
+    """One encoder with faults, which draw from a generator of the wheel's own."""
+
+    def __init__(self, faulty: EncoderModel, model: WheelsModel, name: str, noise: NoiseSource, run: Run):
+        super().__init__(model, name, noise, run)
+        self._faulty, self._faults = faulty, run.noise(f"wheels/wheels/{name}").generator
+        self._stuck_from = min((t for wheel, t in faulty.stuck if wheel == name), default=math.inf)
+        self._sign = -1.0 if name in faulty.swapped else 1.0
+        self._burst = self._faults.exponential(1.0 / faulty.burst_rate) if faulty.burst_rate else math.inf
+        self._travel = 0.0
+
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+        if self._is_spinning(t):
+            excess *= 1.0 + self._faulty.burst_excess
+        found = super().sample(t, rolled, speed, excess, steering)
+        if t >= self._stuck_from:
+            found = replace(found, travel=self._travel, speed=0.0, direction=Direction.STOPPED)
+        self._travel = found.travel
+        if self._sign > 0.0:
+            return found
+        back = {Direction.FORWARD: Direction.BACKWARD, Direction.BACKWARD: Direction.FORWARD}
+        direction = back.get(found.direction, found.direction)
+        return replace(found, travel=-found.travel, speed=-found.speed, direction=direction)
+
+    def _is_spinning(self, t: float) -> bool:
+        faulty = self._faulty
+        while t >= self._burst + faulty.burst_seconds:
+            self._burst += faulty.burst_seconds + self._faults.exponential(1.0 / faulty.burst_rate)
+        return t >= self._burst
+
+
+_MOVING_SPEED = 0.05
+"""Speed in m/s above which the vehicle vibrates."""
+
+
+@dataclass(frozen=True, slots=True)
+class TriadModel:
+    """Errors of three gyros or accelerometers beyond white noise and constant bias, in rad/s or m/s2; 0 for none.
+
+    Attributes
+    ----------
+    scale_sigma : standard deviation of each axis's scale error, drawn once
+    misalignment_sigma : standard deviation of the misalignment between two axes, rad, drawn once
+    instability : standard deviation of the in-run bias, a Gauss-Markov process of `instability_time` seconds
+    walk : random walk of the bias, unit/sqrt(s)
+    vibration : standard deviation of each sample's vibration while the vehicle moves
+    """
+
+    scale_sigma: float = 0.0
+    misalignment_sigma: float = 0.0
+    instability: float = 0.0
+    instability_time: float = 300.0
+    walk: float = 0.0
+    vibration: float = 0.0
+
+    def __call__(self, rate_hz: float, noise: NoiseSource) -> Callable[[Vector3, float], Vector3]:
+        return Triad(self, rate_hz, noise).measure
+
+
+class Triad:
+    """One simulated triad of gyros or accelerometers: y = M x + b_walk(t) + b_instability(t) + vibration.
+
+    M has scale errors and misalignment drawn once, b_walk is a random walk, b_instability a first-order Gauss-Markov
+    process.
+    """
+
+    def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
+        self._model = model
+        self._noise = noise.prefetch()
+        misalignment = [noise.vector(model.misalignment_sigma) for _ in range(3)]
+        scale = noise.vector(model.scale_sigma)
+        x, y, z = ([1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)] for i in range(3))
+        self._rows = (so3.to_vector3(x), so3.to_vector3(y), so3.to_vector3(z))
+        self._instability = [GaussMarkov(model.instability, model.instability_time, noise) for _ in range(3)]
+        self._walk = (0.0, 0.0, 0.0)
+        self._drift = model.walk / math.sqrt(rate_hz)
+        self._period = 1.0 / rate_hz
+
+    def measure(self, true: Vector3, speed: float) -> Vector3:
+        """Return the measured vector for a true one at the vehicle's `speed`, m/s."""
+        model = self._model
+        if self._drift:
+            self._walk = so3.add(self._walk, self._noise.vector(self._drift))
+        errors = [self._walk]
+        if model.instability:
+            errors.append(so3.to_vector3(each.step(self._period) for each in self._instability))
+        if model.vibration and abs(speed) > _MOVING_SPEED:
+            errors.append(self._noise.vector(model.vibration))
+        return so3.add(apply_rows(self._rows, true), so3.add(*errors))
+
+
+# --- sensors without errors -------------------------------------------------------------------------------------------
+
+
+def make_noise_free_gps(timing: Timing = Timing(4.0)) -> GpsModel:  # noqa: B008 - immutable
+    return GpsModel(timing, correlated_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0, baseline_sigma=0.0)
+
+
+def make_noise_free_wheels(
+    timing: Timing = Timing(20.0),  # noqa: B008 - immutable
+    steered: frozenset[str] = frozenset(),
+) -> WheelsModel:
+    return WheelsModel(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
+
+
+def make_noise_free_imu(
+    timing: Timing = Timing(100.0),  # noqa: B008 - immutable
+    yaw_offset: float = 0.0,
+    earth_rotation: bool = True,
+) -> ImuModel:
+    """Return a unit without error; its yaw still starts at `yaw_offset` and integrates its gyros."""
+    return ImuModel(
+        timing,
+        gyro_bias_sigma=0.0,
+        gyro_walk=0.0,
+        gyro_noise=0.0,
+        accelerometer_bias_sigma=0.0,
+        accelerometer_noise=0.0,
+        tilt_sigma=0.0,
+        tilt_noise=0.0,
+        yaw_offset=yaw_offset,
+        earth_rotation=earth_rotation,
+    )

@@ -14,7 +14,7 @@ import pytest
 from support_geometry import random_pose
 
 from modelserver.geometry import Body, Joint, JointType, Mimic, Model, ModelBuilder
-from modelserver.geometry.inertia import RigidInertia, from_spatial_inertia
+from modelserver.geometry.parts import RigidInertia, from_spatial_inertia
 from modelserver.transforms import Pose, so3
 
 CART = """\

@@ -10,8 +10,9 @@ from typing import Any
 
 import support_stream_faults as faults
 
+from benchmarks.rough_simulation import EncoderModel
 from modelserver.messages import ImuSample
-from modelserver.simulation import EncoderModel, Event, GpsModel, ImuModel, Timing, WheelsModel
+from modelserver.simulation import Event, GpsModel, ImuModel, Timing, WheelsModel
 
 FROM_S = 10.0
 """When a fault begins, seconds since the drive did."""

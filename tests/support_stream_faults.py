@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from modelserver.messages import RelativePoseSample, SensorHeader
 from modelserver.simulation import Event
-from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.sensors import NoiseSource
 
 _E = TypeVar("_E", bound=Event)
 

@@ -9,7 +9,7 @@ from support_formats import names
 from support_spatial import axes, poses
 
 from modelserver.geometry import Joint, JointType, Material, Mimic, Model, ModelBuilder, Shape, ShapeKind
-from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.parts import RigidInertia
 from modelserver.transforms import Pose
 
 URDF = """\

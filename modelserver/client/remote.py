@@ -87,8 +87,7 @@ from modelserver.wire.channels import REPLY_PREFIX, SIGNED, to_subscription_patt
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
 from modelserver.wire.fields import MAX_PAIRS
 from modelserver.wire.generated import pack_pose_demand, unpack_pose_demand
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
-from modelserver.wire.receiver import Receiver, open_receiver
+from modelserver.wire.provider import Receiver, handle_message, open_lcm, open_receiver, resolve_url
 
 Time: TypeAlias = int | datetime | np.datetime64
 """An instant: microseconds since the Unix epoch, a datetime with a time zone, or a numpy.datetime64 (UTC)."""

@@ -20,17 +20,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    Problem,
-    Severity,
-    Suggestion,
-    SyntaxProblemError,
-    quote,
-    suggest_key,
-    suggest_name,
-)
+from modelserver import errors
 from modelserver.yaml_tree import NodeKind, YamlNode, parse_yaml
 
 MAX_BYTES = 1 << 20
@@ -45,7 +35,7 @@ Path_ = tuple[str | int, ...]
 
 def read_partly(
     raw: bytes, name: str, schema: type[S], blanks: Mapping[str, str] | None = None
-) -> tuple[S | None, tuple[Problem, ...]]:
+) -> tuple[S | None, tuple[errors.Problem, ...]]:
     """Return the instance of a dataclass, None where too little is valid, and every problem in the order of the file.
 
     `blanks` are values for required top-level keys that are missing or wrong, so that the rest can be examined. Raises
@@ -58,15 +48,10 @@ def read_partly(
     return found, tuple(sorted(reader.problems, key=lambda each: each.line))
 
 
-_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
-
-
-def get_adapter(schema: type[S]) -> TypeAdapter[S]:
+@cache
+def get_adapter(schema: type) -> TypeAdapter[Any]:
     """Return pydantic's validator of a dataclass, cached: building one takes a hundred times as long as using it."""
-    found = _ADAPTERS.get(schema)
-    if found is None:
-        found = _ADAPTERS[schema] = TypeAdapter(schema)
-    return found
+    return TypeAdapter(schema)
 
 
 def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
@@ -83,7 +68,6 @@ def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
 
 
 def get_value(values: Any, at: Path_) -> Any:
-    """Return the value at a path; None if there is none."""
     for step in at:
         values = values.get(step) if isinstance(values, dict) else None
     return values
@@ -100,7 +84,7 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
         raise make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
         node = parse_yaml(raw, has_aliases=False)
-    except SyntaxProblemError as error:
+    except errors.SyntaxProblemError as error:
         raise make_error(name, error.line, str(error), error.fix) from None
     if node.kind is not NodeKind.MAPPING:
         missing = dataclasses.MISSING
@@ -122,7 +106,7 @@ class SettingsReader:
         self.name = name
         self.schema = schema
         self.lines: dict[Path_, int] = {}
-        self.problems: list[Problem] = []
+        self.problems: list[errors.Problem] = []
 
     def validate(self, values: Any, blanks: Mapping[str, str]) -> Any:
         """Return the instance that the values make, None where too little is valid; record every problem."""
@@ -172,7 +156,7 @@ class SettingsReader:
         return values
 
     def add_problem(self, at: Path_, message: str, fix: str) -> None:
-        self.problems.append(Problem(Severity.ERROR, message, self.locate(at), fix))
+        self.problems.append(errors.Problem(errors.Severity.ERROR, message, self.locate(at), fix))
 
     def rename(self, values: Any, at: Path_, meant: str) -> bool:
         """Move the value under a misspelled key to the key that is meant; return whether there is such a key."""
@@ -184,12 +168,12 @@ class SettingsReader:
         self.lines.update({(*at[:-1], meant, *path[len(at) :]): line for path, line in below.items()})
         return True
 
-    def locate(self, at: Path_) -> Location:
+    def locate(self, at: Path_) -> errors.Location:
         """Return the location of a path, or of the nearest section around it."""
         line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
-        return Location(self.name, line, ".".join(map(str, at)))
+        return errors.Location(self.name, line, ".".join(map(str, at)))
 
-    def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
+    def explain(self, detail: Any) -> list[tuple[Path_, errors.Problem]]:
         """Turn one of pydantic's errors into problems, each with its path, line and suggestion."""
         at: Path_ = tuple(detail["loc"])
         kind = detail["type"]
@@ -199,7 +183,7 @@ class SettingsReader:
         fix = ""
         if kind in ("unexpected_keyword_argument", "extra_forbidden"):
             near, fix = self.suggest_keys(str(at[-1]), at[:-1])
-            message = f"unknown key {quote(str(at[-1]))}"
+            message = f"unknown key {errors.quote(str(at[-1]))}"
         elif kind == "missing" and isinstance(at[-1], int):
             at = at[:-1]
             message = f"{at[-1]} has too few numbers"
@@ -207,15 +191,15 @@ class SettingsReader:
             fix, message = f"add a line: {at[-1]}: ...", f"{at[-1]} is missing"
         else:
             near, fix, message = self.explain_value(detail)
-        return [(at, Problem(Severity.ERROR, message, self.locate(at), fix, near))]
+        return [(at, errors.Problem(errors.Severity.ERROR, message, self.locate(at), fix, near))]
 
-    def _explain_section(self, at: Path_, text: str) -> list[tuple[Path_, Problem]]:
+    def _explain_section(self, at: Path_, text: str) -> list[tuple[Path_, errors.Problem]]:
         """Return the problems that a section's own rules found, one per line; each begins with its key."""
         found = []
         for message in text.splitlines():
             key = message.partition(" ")[0].rstrip(":")
             there = (*at, key) if key in list_known_keys(self.schema, at) else at
-            found.append((there, Problem(Severity.ERROR, _shorten(message), self.locate(there))))
+            found.append((there, errors.Problem(errors.Severity.ERROR, _shorten(message), self.locate(there))))
         return found
 
     def suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
@@ -227,10 +211,14 @@ class SettingsReader:
             for each in list_known_keys(self.schema, (*at, section)):
                 below.setdefault(each, []).append(".".join(map(str, (*at, section))))
         # a key that is present already is not what was meant
-        near = Suggestion() if key in below else suggest_key(key, [each for each in known if each not in present])
+        near = (
+            errors.Suggestion()
+            if key in below
+            else errors.suggest_key(key, [each for each in known if each not in present])
+        )
         if near:
             return near, f"write {near[0]}"
-        deeper = (key,) if key in below else tuple(suggest_key(key, below))
+        deeper = (key,) if key in below else tuple(errors.suggest_key(key, below))
         if deeper:
             return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"
         return (), f"known here: {', '.join(known)}"
@@ -242,9 +230,9 @@ class SettingsReader:
         if detail["type"] in ("dataclass_type", "dict_type"):
             message = "expected a mapping (key: value, one per line)"
         if isinstance(got, (str, int, float, bool)):
-            message += f", got {quote(str(got))}"
+            message += f", got {errors.quote(str(got))}"
         if detail["type"] == "literal_error" and isinstance(got, str):
-            near = suggest_name(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
+            near = errors.suggest_name(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
         return near, f"write {near[0]}" if near else "", _shorten(message)
 
 
@@ -283,11 +271,9 @@ def list_known_keys(schema: Any, at: Path_) -> list[str]:
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
 
 
-@cache
-def _get_type_hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+_get_type_hints = cache(get_type_hints)
 
 
-def make_error(name: str, line: int, message: str, fix: str) -> ConfigError:
+def make_error(name: str, line: int, message: str, fix: str) -> errors.ConfigError:
     """Return the error of a file that cannot be read; line 0 for the whole file."""
-    return ConfigError([Problem(Severity.ERROR, message, Location(name, line), fix)])
+    return errors.ConfigError([errors.Problem(errors.Severity.ERROR, message, errors.Location(name, line), fix)])

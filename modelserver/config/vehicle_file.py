@@ -15,21 +15,13 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict
 
+from modelserver import files
 from modelserver.config import reader
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.raw.settings import RawSettings
 from modelserver.estimation.sensor_rig import MagnetometerCalibration
-from modelserver.files import (
-    INSTALLED_FOLDER,
-    PROCESS_FIX,
-    STATE_FOLDER,
-    FileKind,
-    NotRegularFileError,
-    detect_file_kind,
-    read_start,
-)
 from modelserver.geometry import names
 from modelserver.messages import Mode
 
@@ -46,31 +38,37 @@ FrameName: TypeAlias = Annotated[str, AfterValidator(names.complete)]
 """A frame, `Body:Frame`; a body's name alone is its frame `Origin`."""
 
 
-def _check(section: object, *problems: str, channel: str = "", **ranges: tuple[float, float]) -> None:
-    """Raise ValueError, with a line for each of the `problems`, if there are any.
+class _Section:
+    """A section of the file, whose `channel`, `latency` and settings with `RANGES` are checked if it has them."""
 
-    Further problems are the settings out of their `ranges`, the `latency`, and the `channel` if that is a key.
-    """
-    found = list(problems)
-    if channel:
-        name = getattr(section, channel)
-        if not (0 < len(name) <= MAX_CHANNEL and name.isascii() and name.isprintable() and " " not in name):
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def check(self, *problems: str, channel: str = "channel") -> None:
+        """Raise ValueError, with a line for each problem, the given `problems` first; `channel` names that key."""
+        found = list(problems)
+        name = getattr(self, channel, None)
+        if name is not None and not (
+            0 < len(name) <= MAX_CHANNEL and name.isascii() and name.isprintable() and " " not in name
+        ):
             found.append(f"{channel} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {quote(name)}")
-    latency = getattr(section, "latency", 0.0)
-    if not 0.0 <= latency <= MAX_LATENCY:
-        hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
-        found.append(f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}")
-    for key, (low, high) in ranges.items():
-        value = getattr(section, key)
-        if not low <= value <= high:
-            digits = "" if isinstance(value, int) else "g"
-            found.append(f"{key} is between {low:{digits}} and {high:{digits}}, got {value:{digits}}")
-    if found:
-        raise ValueError("\n".join(found))
+        latency = getattr(self, "latency", 0.0)
+        if not 0.0 <= latency <= MAX_LATENCY:
+            hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
+            found.append(f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}")
+        for key, low, high in getattr(self, "RANGES", ()):
+            value = getattr(self, key)
+            if not low <= value <= high:
+                digits = "" if isinstance(value, int) else "g"
+                found.append(f"{key} is between {low:{digits}} and {high:{digits}}, got {value:{digits}}")
+        if found:
+            raise ValueError("\n".join(found))
 
 
 @dataclass(frozen=True, slots=True)
-class LcmConfig:
+class LcmConfig(_Section):
     """The message bus."""
 
     url: str = ""
@@ -88,13 +86,16 @@ class LcmConfig:
         ]
         if not self.reply_prefix:
             problems.append("reply_prefix must not be empty: with it no request can make the server publish on POSE")
-        _check(self, *problems)
+        self.check(*problems)
 
 
 @dataclass(frozen=True, slots=True)
-class PublishConfig:
+class PublishConfig(_Section):
     """What the service publishes, and when."""
 
+    RANGES = (
+        ("rate_hz", 0.1, 1000.0), ("health_hz", 0.01, 100.0), ("state_hz", 0.0, 50.0), ("snapshot_s", 0.5, 3600.0),
+    )  # fmt: skip
     mode: Literal["timer", "event"] = "timer"
     """`timer` publishes POSE at `rate_hz`; `event` at every accepted sample of the IMU or the GPS."""
     rate_hz: float = 50.0
@@ -108,12 +109,9 @@ class PublishConfig:
     snapshot_s: float = 5.0
     """Seconds between publications of the whole geometry, for mirrors and logs that start later."""
 
-    def __post_init__(self) -> None:
-        _check(self, rate_hz=(0.1, 1000.0), health_hz=(0.01, 100.0), state_hz=(0.0, 50.0), snapshot_s=(0.5, 3600.0))
-
 
 @dataclass(frozen=True, slots=True)
-class SensorConfig:
+class SensorConfig(_Section):
     """A sensor: its channel, and the frame of the geometry at which it is mounted."""
 
     channel: str
@@ -124,9 +122,6 @@ class SensorConfig:
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
     publisher: str = ""
     """The `header.source` of its samples, which others on the channel do not displace; empty: a driver of this file."""
-
-    def __post_init__(self) -> None:
-        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +142,10 @@ class ImuConfig(SensorConfig):
 
 
 @dataclass(frozen=True, slots=True)
-class SpeedometerConfig:
+class SpeedometerConfig(_Section):
     """One speed for the whole vehicle, where no wheels are measured: forward_speed of the vehicle controller."""
 
+    RANGES = (("sigma", 1e-3, 5.0),)
     channel: str = "VEHICLE_STATUS"
     """Channel of the vehicle controller's status (vehicle_status_t)."""
     sigma: float = 0.1
@@ -159,14 +155,12 @@ class SpeedometerConfig:
     latency: float = 0.0
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
 
-    def __post_init__(self) -> None:
-        _check(self, channel="channel", sigma=(1e-3, 5.0))
-
 
 @dataclass(frozen=True, slots=True)
-class SteeringConfig:
+class SteeringConfig(_Section):
     """Source of the angle of steered wheels that do not measure it themselves."""
 
+    RANGES = (("sigma", 1e-4, 0.5), ("limit", 0.05, 1.5), ("max_age", 0.01, 10.0))
     wheels: tuple[str, ...]
     """Names of the wheels in `frames` that steer by the controller's steering_angle."""
     channel: str = "VEHICLE_STATUS"
@@ -185,12 +179,11 @@ class SteeringConfig:
 
     def __post_init__(self) -> None:
         none = ["wheels names the wheels that steer, e.g. [front_left, front_right]; got none"]
-        problems = [] if self.wheels else none
-        _check(self, *problems, channel="channel", sigma=(1e-4, 0.5), limit=(0.05, 1.5), max_age=(0.01, 10.0))
+        self.check(*([] if self.wheels else none))
 
 
 @dataclass(frozen=True, slots=True)
-class WheelsConfig:
+class WheelsConfig(_Section):
     """The wheel odometry."""
 
     channel: str = "WHEELS"
@@ -208,12 +201,9 @@ class WheelsConfig:
     latency: float = 0.0
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
 
-    def __post_init__(self) -> None:
-        _check(self, channel="channel")
-
 
 @dataclass(frozen=True, slots=True)
-class AidingConfig:
+class AidingConfig(_Section):
     """A further source of measurements. Its messages name their frames."""
 
     channel: str
@@ -223,21 +213,15 @@ class AidingConfig:
     latency: float = 0.0
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
 
-    def __post_init__(self) -> None:
-        _check(self, channel="channel")
-
 
 @dataclass(frozen=True, slots=True)
-class JointsConfig:
+class JointsConfig(_Section):
     """The joint positions, received if the geometry has joints that move."""
 
     channel: str = "JOINTS"
     """Channel on which the drivers publish them."""
     latency: float = 0.0
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
-
-    def __post_init__(self) -> None:
-        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +252,6 @@ class SensorsConfig:
 
     @property
     def steering(self) -> SteeringConfig | None:
-        """Source of the steering angle; None without one beside the wheels."""
         return self.wheels.steering if self.wheels is not None else None
 
 
@@ -294,7 +277,7 @@ class OriginConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class LocalizationConfig:
+class LocalizationConfig(_Section):
     """How the pose is estimated."""
 
     mode: Literal["full", "raw", "no_imu", "no_wheels", "no_gps", "dead_reckoning"] = "full"
@@ -306,18 +289,22 @@ class LocalizationConfig:
     magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
 
     def __post_init__(self) -> None:
-        _check(self, channel="mode_channel" if self.mode_channel else "")
+        self.check(channel="mode_channel" if self.mode_channel else "channel")
 
     @property
     def initial_mode(self) -> Mode:
-        """The mode from the start, as the core represents it."""
         return Mode[self.mode.upper()]
 
 
 @dataclass(frozen=True, slots=True)
-class LimitsConfig:
+class LimitsConfig(_Section):
     """Memory and processing time for requests, bounded so that no client can starve the pose."""
 
+    RANGES = (
+        ("client_hz", 1.0, 100_000.0), ("request_share", 0.0, 1.0), ("waiting_requests", 0, 4096),
+        ("wait_ms", 0, 60_000), ("queued_requests", 1, 65536), ("requests_per_pass", 1, 1024),
+        ("client_reply_bytes", 1e4, 1e9),
+    )  # fmt: skip
     history_s: float = 60.0
     """Seconds of poses stored for queries about the past, at most 600."""
     waiting_requests: int = 64
@@ -336,20 +323,8 @@ class LimitsConfig:
     """Bytes per second of long replies (many transformations, history) to each client."""
 
     def __post_init__(self) -> None:
-        problems = []
-        if not 0.0 < self.history_s <= 600.0:
-            problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
-        _check(
-            self,
-            *problems,
-            client_hz=(1.0, 100_000.0),
-            request_share=(0.0, 1.0),
-            waiting_requests=(0, 4096),
-            wait_ms=(0, 60_000),
-            queued_requests=(1, 65536),
-            requests_per_pass=(1, 1024),
-            client_reply_bytes=(1e4, 1e9),
-        )
+        has_history = 0.0 < self.history_s <= 600.0
+        self.check(*([] if has_history else [f"history_s is above 0 and at most 600, got {self.history_s:g}"]))
 
 
 KEY_HINT = (
@@ -359,9 +334,10 @@ KEY_HINT = (
 
 
 @dataclass(frozen=True, slots=True)
-class CommandsConfig:
+class CommandsConfig(_Section):
     """Commands from the bus that change the state of the service. None is allowed by default."""
 
+    RANGES = (("window_s", 0.1, 300.0),)
     reload: bool = False
     """Whether the geometry file may be reloaded."""
     frames: bool = False
@@ -378,18 +354,18 @@ class CommandsConfig:
     def __post_init__(self) -> None:
         enabled = [name for name in ("reload", "frames", "set_pose") if getattr(self, name) and not self.key_file]
         enabled += ["drive: signed"] if self.drive == "signed" and not self.key_file else []
-        _check(self, *(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled), window_s=(0.1, 300.0))
+        self.check(*(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled))
 
     @property
     def is_drive_signed(self) -> bool:
-        """Whether commands to the vehicle controller must be signed."""
         return self.drive == "signed" or (self.drive == "auto" and bool(self.key_file))
 
 
 @dataclass(frozen=True, slots=True)
-class WarmStartConfig:
+class WarmStartConfig(_Section):
     """The state of the localization that is persisted in `state_directory`, and when the next start restores it."""
 
+    RANGES = (("period_s", 0.5, 600.0), ("max_age_s", 0.0, 31536000.0), ("max_pose_age_s", 0.0, 600.0))
     persist: bool = True
     """Whether the state of the localization is persisted."""
     period_s: float = 5.0
@@ -400,12 +376,9 @@ class WarmStartConfig:
     """Longest time without a running service after which the pose of a stationary vehicle is restored, seconds; 0:
     never."""
 
-    def __post_init__(self) -> None:
-        _check(self, period_s=(0.5, 600.0), max_age_s=(0.0, 31536000.0), max_pose_age_s=(0.0, 600.0))
-
 
 @dataclass(frozen=True, slots=True)
-class JournalConfig:
+class JournalConfig(_Section):
     """The journal: everything that is received and sent, on disk; see docs/journal.md."""
 
     directory: str = ""
@@ -421,7 +394,7 @@ class JournalConfig:
             problems.append(f"megabytes is 0 for no journal, or 32 to 1000000, got {self.megabytes}")
         if not 0.2 <= self.sync_s <= 60.0:
             problems.append(f"sync_s is between 0.2 and 60 seconds, got {self.sync_s:g}")
-        _check(self, *problems)
+        self.check(*problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -513,15 +486,15 @@ NOT_A_VEHICLE_FILE = "not a vehicle file"
 _START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
 _MODEL_HINT = "modelserver query takes it with --model"
 _GEOMETRY_HINT = f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}"
-_FIXES: dict[FileKind, str] = {
-    FileKind.EMPTY: _START_HINT,
-    FileKind.COMMENTS: _START_HINT,
-    FileKind.GEOMETRY: _GEOMETRY_HINT,
-    FileKind.URDF: _GEOMETRY_HINT,
-    FileKind.MIRO_PROCESS: PROCESS_FIX,
-    FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
-    FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
-    FileKind.BINARY: "give the vehicle file, which is YAML",
+_FIXES: dict[files.FileKind, str] = {
+    files.FileKind.EMPTY: _START_HINT,
+    files.FileKind.COMMENTS: _START_HINT,
+    files.FileKind.GEOMETRY: _GEOMETRY_HINT,
+    files.FileKind.URDF: _GEOMETRY_HINT,
+    files.FileKind.MIRO_PROCESS: files.PROCESS_FIX,
+    files.FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
+    files.FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
+    files.FileKind.BINARY: "give the vehicle file, which is YAML",
 }
 
 
@@ -529,12 +502,12 @@ def _read_bytes(path: Path) -> bytes:
     """Read a vehicle file. Raises ConfigError for a file of another type, OSError."""
     try:
         # the beginning of a larger file shows its type; the reader rejects it
-        raw = read_start(path, reader.MAX_BYTES + 1)
-    except NotRegularFileError as error:
+        raw = files.read_start(path, reader.MAX_BYTES + 1)
+    except files.NotRegularFileError as error:
         there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
         fix = f"give {path / there}" if error.is_directory and there else "give the vehicle file itself"
         raise reader.make_error(str(path), 0, f"this is {error.kind}, {NOT_A_VEHICLE_FILE}", fix) from None
-    kind = detect_file_kind(raw)
+    kind = files.detect_file_kind(raw)
     if kind in _FIXES:
         what = kind.value if kind.is_empty else f"{kind.value}, {NOT_A_VEHICLE_FILE}"
         raise reader.make_error(str(path), 0, what, _FIXES[kind].format(name=path.name))
@@ -547,8 +520,8 @@ def _resolve_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
 
     def resolve_state(given: str) -> str:
         # the units and the container have /etc read-only, and state where the file hierarchy standard has it
-        is_relative = str(path.parent.resolve()) == INSTALLED_FOLDER and not given.startswith(("/", "~"))
-        return resolve(os.path.join(STATE_FOLDER, given) if given and is_relative else given)
+        is_relative = str(path.parent.resolve()) == files.INSTALLED_FOLDER and not given.startswith(("/", "~"))
+        return resolve(os.path.join(files.STATE_FOLDER, given) if given and is_relative else given)
 
     return dataclasses.replace(
         config,

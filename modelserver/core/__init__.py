@@ -14,6 +14,13 @@ Time enters only with an event, as an `Instant` of both host clocks. `_HANDLERS`
 
 A message from the bus never raises out of `step`. What cannot be used is counted by channel and reason, and the health
 report publishes the counts.
+
+Health report: a full one is due once a period (`health_period_ns`). Between two of them, the conditions that matter to
+an operator (`HealthConditions`) are evaluated every `CHANGE_PERIOD_NS`, and a report is sent at once when they have
+changed. Rates, delays and the distribution of tick delays always cover a whole period: a report for a change repeats
+the last ones.
+
+Sensor timeout: a source is silent after `get_silence_limit` of its usual interval, a moving average (`state`).
 """
 
 from __future__ import annotations
@@ -21,7 +28,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, TypeAlias, get_args
@@ -29,57 +36,19 @@ from typing import Any, Final, TypeAlias, get_args
 import numpy as np
 
 from modelserver import messages
-from modelserver.core.health import report_if_due
-from modelserver.core.state import (
-    DEGRADED,
-    LATE_LIMIT_S,
-    RUNNING,
-    SAMPLE_FUTURE_LIMIT_S,
-    START,
-    START_REPORT_NS,
-    STARTING,
-    AllOutputs,
-    CoreSettings,
-    CoreState,
-    ExpectedSensor,
-    Instant,
-    Outputs,
-    SourceTraffic,
-    StepResult,
-    TimedRequest,
-    WaitingRequest,
-    count_decision,
-    count_message,
-    count_rejection,
-    handle_rejected,
-    handle_warning,
-    is_clock_off,
-    mark_received,
-    note_offset,
-    start,
-)
+from modelserver.core.state import *
+from modelserver.earth.geodesy import compute_geodetic
 from modelserver.errors import Status
+from modelserver.estimation.filter.protection_levels import compute_longest_axis
 from modelserver.estimation.history import Localizer, LocalizerEvent, PersistentLocalizer
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.messages import (
-    CHANNEL_OF,
-    MAX_CHANNEL_LENGTH,
-    Denied,
-    GetExplanation,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    Output,
-    Request,
-    RequestHeader,
-    SendReply,
-)
 from modelserver.named_tuples import new_tuple
 from modelserver.query.answers import DeferredAnswer, complete_names, compute_replies, is_deferred, make_error_reply
+from modelserver.query.dynamics import find_stability
 from modelserver.query.view import PlatformView
 from modelserver.transforms.transformation import find_covariance_problem
+from modelserver.version import __version__
 
 
 def step(state: CoreState, event: messages.Event | ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
@@ -88,18 +57,18 @@ def step(state: CoreState, event: messages.Event | ModelLoaded, now: Instant) ->
 
 # --- requests ---------------------------------------------------------------------------------------------------------
 
-_TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)
+_TIMED: Final = get_args(TimedRequest)
 """Requests that name a time, and may wait for its data."""
 
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
-def is_answerable(header: RequestHeader, prefix: str) -> bool:
+def is_answerable(header: messages.RequestHeader, prefix: str) -> bool:
     """Return whether a server may reply on the request's reply channel: within its prefix, plain, not too long."""
     channel = header.reply_channel
     # the length first: what is looked up is cached
-    return len(channel) <= MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
+    return len(channel) <= messages.MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
 
 
 @lru_cache(maxsize=1024)
@@ -107,17 +76,17 @@ def _is_plain(channel: str, prefix: str) -> bool:
     return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
 
 
-def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:
+def handle_request(state: CoreState, request: messages.Request, now: Instant) -> tuple[CoreState, AllOutputs]:
     """Answer a request, defer a long answer, or let the request wait until the data it asks for arrive."""
     if not is_answerable(request.header, state.settings.reply_prefix):
-        return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+        return count_rejection(state, messages.CHANNEL_OF[type(request)], "reply_channel"), ()
     request = complete_names(request)
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
         if len(state.waiting) < state.settings.waiting_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
             waiting = WaitingRequest(request, now.monotonic_ns + wait_ms * 1_000_000)
             return state._replace(waiting=(*state.waiting, waiting)), ()
-        state = count_rejection(state, CHANNEL_OF[type(request)], "overload")
+        state = count_rejection(state, messages.CHANNEL_OF[type(request)], "overload")
         why = f"{len(state.waiting)} requests wait already, the limit (limits.waiting_requests); ask without wait_ms"
         return state, reply_error(state, type(request), request.header, Status.OVERLOADED, why, now)
     # a third of the cost of `_replace`, for every request
@@ -130,15 +99,15 @@ def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[Co
 def _must_wait(state: CoreState, request: TimedRequest) -> bool:
     """Return whether the data that a request asks for are yet to come, and it may wait for them."""
     ends = (names.WORLD_UTM, state.view.base_frame)
-    if isinstance(request, (GetTransformation, GetMotion, GetExplanation)):
+    if isinstance(request, (messages.GetTransformation, messages.GetMotion, messages.GetExplanation)):
         ends = (request.frame_of_interest, request.frame_of_reference)
     return state.view.is_awaiting_data(request.time, *ends)
 
 
-def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[Output]]:
+def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[messages.Output]]:
     """Answer the waiting requests whose data have arrived or whose deadline has passed."""
     remaining: list[WaitingRequest] = []
-    replies: list[Output] = []
+    replies: list[messages.Output] = []
     for request in state.waiting:
         if now.monotonic_ns < request.deadline_ns and _must_wait(state, request.request):
             remaining.append(request)
@@ -149,41 +118,48 @@ def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[Outp
     return state, replies
 
 
-def _make_replies(state: CoreState, request: Request, now: Instant) -> tuple[SendReply, ...]:
+def _make_replies(state: CoreState, request: messages.Request, now: Instant) -> tuple[messages.SendReply, ...]:
     channel = request.header.reply_channel
-    return tuple([SendReply(channel, reply) for reply in compute_replies(state.view, request, now.utime)])
+    return tuple([messages.SendReply(channel, reply) for reply in compute_replies(state.view, request, now.utime)])
 
 
-def reply_overloaded(state: CoreState, request: Request, now: Instant) -> Outputs:
+def reply_overloaded(state: CoreState, request: messages.Request, now: Instant) -> Outputs:
     message = "the server is overloaded and dropped the request; try again later"
     return reply_error(state, type(request), request.header, Status.OVERLOADED, message, now)
 
 
-def reply_internal_error(state: CoreState, request: Request, now: Instant) -> Outputs:
-    """Reply to a request whose handling raised an exception in the server."""
+def reply_internal_error(state: CoreState, request: messages.Request, now: Instant) -> Outputs:
     message = "internal error of the server; its log has the traceback"
     return reply_error(state, type(request), request.header, Status.INTERNAL, message, now)
 
 
-def handle_denied(state: CoreState, command: Denied, now: Instant) -> StepResult:
+def handle_denied(state: CoreState, command: messages.Denied, now: Instant) -> StepResult:
     """Count a denied command, and reply with the reason to a sender whose signature is verified."""
     state = count_rejection(state, command.channel, command.reason)
     if command.request_type is None or command.header is None:
         return state, ()
+    status, why = Status.FORBIDDEN, f"the command is denied: {command.message}"
     if command.is_malformed:
         status, why = Status.MALFORMED, command.message
-    else:
-        status, why = Status.FORBIDDEN, f"the command is denied: {command.message}"
     return state, reply_error(state, command.request_type, command.header, status, why, now)
 
 
 def reply_error(
-    state: CoreState, kind: type[Request], header: RequestHeader, status: Status, message: str, now: Instant
+    state: CoreState,
+    kind: type[messages.Request],
+    header: messages.RequestHeader,
+    status: Status,
+    message: str,
+    now: Instant,
 ) -> Outputs:
     """Reply with an error and its reason; without output if the reply channel is not permitted."""
     if not is_answerable(header, state.settings.reply_prefix):
         return ()
-    return (SendReply(header.reply_channel, make_error_reply(state.view, kind, header, status, message, now.utime)),)
+    return (
+        messages.SendReply(
+            header.reply_channel, make_error_reply(state.view, kind, header, status, message, now.utime)
+        ),
+    )
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------
@@ -199,7 +175,6 @@ WARM_START: Final = "warm_start"
 
 
 def process_sample(state: CoreState, sample: messages.Sample, now: Instant) -> StepResult:
-    """Process a sample of a sensor."""
     header = sample.header
     source = f"sensor:{header.source}"
     state = check_host_clock(state, now, count_message(state.traffic, source, header.host_utime, now))
@@ -233,21 +208,16 @@ def check_host_clock(state: CoreState, now: Instant, traffic: Mapping[str, Sourc
 
 
 def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant) -> StepResult:
-    """Process positions of joints."""
     joints, rejected = state.view.joints.update(sample, now.utime)
     for reason, count in Counter(rejected).items():
         state = count_rejection(state, f"sensor:{sample.header.source}", reason, count)
     if joints is state.view.joints:
         return state, ()
-    state = state._replace(view=state.view._replace(joints=joints))
-    if not state.waiting:
-        return state, ()
-    state, replies = answer_waiting(state, now)
+    state, replies = answer_waiting(state._replace(view=state.view._replace(joints=joints)), now)
     return state, tuple(replies)
 
 
 def switch_mode(state: CoreState, command: messages.SwitchMode, now: Instant) -> StepResult:
-    """Switch the localization mode."""
     source = f"command:{command.header.source}"
     state = state._replace(traffic=count_message(state.traffic, source, command.header.host_utime, now))
     if command.header.utime > now.utime + COMMAND_FUTURE_LIMIT_S * 1e6:
@@ -308,7 +278,6 @@ def update_localizer(
 
 
 def report_start(state: CoreState, decision: messages.Decision, now: Instant) -> StepResult:
-    """Report what became of the persisted state of an earlier run."""
     if now.monotonic_ns - state.started_ns <= START_REPORT_NS:
         state, _ = handle_warning(state, messages.HealthWarning(START, decision.reason), now)
     return state, (messages.ReportStart(decision.reason),)
@@ -338,7 +307,6 @@ MAX_TICK_LATENCIES: Final = 512
 
 
 def handle_tick(state: CoreState, tick: messages.Tick, now: Instant) -> StepResult:
-    """Do what is due by the clock."""
     outputs: list[messages.Output] = []
     settings, before = state.settings, state.ticks
     state = check_host_clock(state, now, state.traffic)
@@ -390,6 +358,210 @@ def get_state_to_persist(state: CoreState, now: Instant) -> messages.PersistedSt
     return found._replace(vehicle=state.settings.vehicle, utime=now.utime, monotonic_ns=now.monotonic_ns)
 
 
+# --- the health report -----------------------------------------------------------------------------------------------
+
+MIN_MESSAGES = 3
+"""Messages of a source before it can count as silent: its usual interval is not known earlier."""
+
+MIN_DROPPED = 20
+"""Measurements of a source that are dropped in a row before a warning: 8 s of wheels, 2 s of a GPS receiver."""
+
+
+STABILITY = "stability"
+"""Subject of the warning about the tip-over margin."""
+
+
+def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant) -> tuple[CoreState, Outputs]:
+    """Return the state after a tick, and the report that is due, if any."""
+    is_full = now.monotonic_ns >= state.health_due_ns
+    inputs = state.health_inputs
+    if not is_full and now.monotonic_ns < inputs.due_ns:
+        return state, ()
+    stability, warning = find_stability(state.view, now.utime)
+    conditions = evaluate_conditions(state, now, is_unstable=bool(warning))
+    if gauges is not None:
+        cpu_share = messages.NAN
+        if inputs.gauges_ns and now.monotonic_ns > inputs.gauges_ns:
+            cpu_share = (gauges.cpu_s - inputs.gauges.cpu_s) / ((now.monotonic_ns - inputs.gauges_ns) * 1e-9)
+        inputs = inputs._replace(gauges=gauges, gauges_ns=now.monotonic_ns, cpu_share=cpu_share)
+    has_changed = conditions != inputs.reported
+    inputs = inputs._replace(due_ns=now.monotonic_ns + CHANGE_PERIOD_NS, reported=conditions)
+    state = state._replace(health_inputs=inputs)
+    if not (is_full or has_changed):
+        return state, ()
+    if is_full:
+        state = _update_rates(state, now)
+    report = messages.PublishHealth(_make_report(state, now, stability, warning))
+    if is_full:
+        # from now, not from the due time: after a pause one report is enough
+        due = now.monotonic_ns + state.settings.health_period_ns
+        state = state._replace(tick_latencies=(), health_sent_ns=now.monotonic_ns, health_due_ns=due)
+    return state, (report,)
+
+
+def evaluate_conditions(state: CoreState, now: Instant, is_unstable: bool = False) -> HealthConditions:
+    """Return the conditions whose change is reported at once."""
+    silent = tuple([name for name, traffic in state.traffic.items() if _is_silent(name, traffic, now)])
+    return HealthConditions(
+        state.run_state,
+        state.pose_invalid,
+        state.model.revision,
+        silent,
+        tuple(_list_missing(state)),
+        state.warnings,
+        tuple([(name, reason) for name, reason, _ in _find_unusable(state, now)]),
+        is_unstable,
+    )
+
+
+def _list_missing(state: CoreState) -> list[str]:
+    """Return the channels of the configured sensors without any message; joints count only if the geometry has some."""
+    return [
+        each.channel for each in state.missing_sensors if each.kind is not messages.JointsSample or state.model.joints
+    ]
+
+
+def _find_unusable(state: CoreState, now: Instant) -> Iterator[tuple[str, str, str]]:
+    """Yield subject, reason and text of a warning for each sensor that localization cannot use."""
+    if state.localizer is not None:
+        for finding in state.localizer.summary(now.utime).findings:
+            if not finding.is_choice:
+                fix = f"; {finding.fix}" if finding.fix else ""
+                yield f"sensors.{finding.sensor} ({finding.reason})", finding.reason, f"{finding.text}{fix}"
+    for name, traffic in state.traffic.items():
+        if traffic.num_off and is_clock_off(state.traffic, name, now) and not _is_silent(name, traffic, now):
+            offset = format_offset(traffic.offset, now.utime * 1e-6)
+            yield name, "clock", f"its clock is off: its stamps are {offset} their receipt; its samples are not used"
+        elif traffic.dropped >= MIN_DROPPED and not _is_silent(name, traffic, now):
+            counts = f"{traffic.count} received, {traffic.used} of {traffic.measured} measurements used"
+            yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
+
+
+def _is_silent(name: str, traffic: SourceTraffic, now: Instant) -> bool:
+    return (
+        traffic.count >= MIN_MESSAGES
+        and (now.monotonic_ns - traffic.last_received_ns) * 1e-9 > get_silence_limit(traffic.interval)
+        # commands have no rate
+        and name.startswith("sensor:")
+    )
+
+
+def _update_rates(state: CoreState, now: Instant) -> CoreState:
+    elapsed = (now.monotonic_ns - state.health_sent_ns) * 1e-9 if state.health_sent_ns else 0.0
+
+    def start_period(each: SourceTraffic) -> SourceTraffic:
+        rate = (each.count - each.reported) / elapsed if elapsed > 0 else 0.0
+        return each._replace(reported=each.count, rate=rate, delay=messages.NAN, reported_delay=each.delay)
+
+    return state._replace(traffic={name: start_period(traffic) for name, traffic in state.traffic.items()})
+
+
+def _make_report(state: CoreState, now: Instant, stability: messages.StabilityHealth, warning: str) -> messages.Health:
+    latencies = sorted(state.tick_latencies)
+    estimate = None if state.localizer is None else state.localizer.estimate(now.utime)
+    gauges = state.health_inputs.gauges
+    channels = [_make_channel_health(name, traffic, now) for name, traffic in state.traffic.items()]
+    channels += [
+        messages.ChannelHealth(channel, 0, 0.0, messages.NAN, messages.NAN, True) for channel in _list_missing(state)
+    ]
+    invalid = state.view.invalid | (messages.VALID if estimate is None else estimate.invalid)
+    warnings = {**state.warnings, **{name: text for name, _, text in _find_unusable(state, now)}}
+    if warning:
+        warnings[STABILITY] = warning
+    return messages.Health(
+        utime=now.utime,
+        uptime=(now.monotonic_ns - state.started_ns) * 1e-9,
+        version=__version__,
+        vehicle=state.settings.vehicle,
+        model_revision=state.model.revision,
+        state=state.run_state,
+        invalid_reasons=invalid,
+        invalid_text=_explain(state, invalid, now),
+        pose_epoch=0 if estimate is None else estimate.pose_epoch,
+        origin_id=0 if estimate is None or estimate.origin is None else estimate.origin.origin_id,
+        poses_published=state.poses_published,
+        requests_answered=state.requests_answered,
+        requests_waiting=len(state.waiting),
+        ticks_missed=state.ticks_missed,
+        handler_errors=state.handler_errors,
+        tick_latency_p50=percentile(latencies, 0.5),
+        tick_latency_p90=percentile(latencies, 0.9),
+        tick_latency_p99=percentile(latencies, 0.99),
+        tick_latency_max=percentile(latencies, 1.0),
+        channels=tuple(sorted(channels, key=lambda each: each.channel)),
+        rejected=tuple(messages.RejectedCount(*key, count) for key, count in sorted(state.rejected.items())),
+        warnings=tuple(sorted(warnings.items())),
+        host=gauges.host,
+        pid=gauges.pid,
+        requests_queued=gauges.queued,
+        memory=gauges.memory,
+        cpu_share=state.health_inputs.cpu_share,
+        localization=_make_localization_health(state, estimate, now),
+        stability=stability,
+    )
+
+
+def _explain(state: CoreState, invalid: messages.Invalid, now: Instant) -> str:
+    """Return why the pose is invalid, in words: with the distance that is left where the vehicle must drive."""
+    text = invalid.explain()
+    if messages.Invalid.NOT_MOVED_YET not in invalid or state.localizer is None:
+        return text
+    distance = state.localizer.summary(now.utime).distance_to_heading
+    if math.isnan(distance):
+        return text
+    if distance < 1.0:
+        return f"{text}; the vehicle has moved, but its fixes do not show the heading yet"
+    return f"{text}; drive about {distance:.0f} m more"
+
+
+def percentile(ordered: Sequence[float], share: float) -> float:
+    """Return the percentile `share` (0 to 1) of values in rising order, one of the values; 0 without any."""
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else 0.0
+
+
+def _make_localization_health(
+    state: CoreState, estimate: messages.Estimate | None, now: Instant
+) -> messages.LocalizationHealth:
+    if state.localizer is None or estimate is None:
+        return messages.LocalizationHealth()
+    summary = state.localizer.summary(now.utime)
+    geodetic = None
+    if estimate.utm is not None and estimate.origin is not None:
+        geodetic = compute_geodetic(estimate.utm, names.WORLD_UTM, estimate.origin)
+    P = estimate.covariance
+    return messages.LocalizationHealth(
+        summary.mode,
+        summary.phase,
+        summary.stationary,
+        estimate.horizontal_protection_level,
+        estimate.heading_protection_level,
+        estimate.seconds_to_limit,
+        (now.utime - summary.fix_utime) * 1e-6 if summary.fix_utime else messages.NAN,
+        *((messages.NAN,) * 4 if geodetic is None else geodetic),
+        messages.NAN if P is None else math.sqrt(compute_longest_axis(P[0], P[7], P[1])),
+        messages.NAN if P is None else math.sqrt(P[14]),
+        estimate.horizontal_level,
+        estimate.heading_level,
+        estimate.limit_risk,
+        summary.horizontal_limit,
+        summary.heading_limit,
+    )
+
+
+def _make_channel_health(name: str, traffic: SourceTraffic, now: Instant) -> messages.ChannelHealth:
+    age = (now.monotonic_ns - traffic.last_received_ns) * 1e-9
+    return messages.ChannelHealth(
+        name,
+        traffic.count,
+        traffic.rate,
+        age,
+        traffic.reported_delay,
+        _is_silent(name, traffic, now),
+        traffic.measured,
+        traffic.used,
+    )
+
+
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
@@ -412,10 +584,9 @@ class ModelLoaded:
         return isinstance(self.request, messages.ReloadModel) and self.request.dry_run
 
 
-COMMANDS: Final = (messages.ReloadModel, messages.SetFrame, messages.SetStateVector, messages.SetHTransform)
-"""Requests that must be signed."""
-
 Command: TypeAlias = messages.ReloadModel | messages.SetFrame | messages.SetStateVector | messages.SetHTransform
+COMMANDS: Final = get_args(Command)
+"""Requests that must be signed."""
 
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())
 """Default covariance of a pose that is set: 1 m and 5 degrees."""
@@ -580,21 +751,3 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreSta
     messages.HealthWarning: handle_warning,
     messages.Denied: handle_denied,
 }
-
-__all__ = [
-    "DEGRADED",
-    "RUNNING",
-    "STARTING",
-    "AllOutputs",
-    "CoreSettings",
-    "CoreState",
-    "ExpectedSensor",
-    "Instant",
-    "get_state_to_persist",
-    "is_answerable",
-    "reply_error",
-    "reply_internal_error",
-    "reply_overloaded",
-    "start",
-    "step",
-]

@@ -252,12 +252,10 @@ class CoreState(NamedTuple):
 
     @property
     def localizer(self) -> Localizer | None:
-        """The localizer; None for a vehicle without localization sensors."""
         return self.view.localizer
 
     @property
     def history(self) -> History:
-        """The estimates of the last seconds."""
         return self.view.history
 
 
@@ -371,7 +369,6 @@ def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:
 
 
 def get_silence_limit(interval: float) -> float:
-    """Return after how many seconds a source with this mean interval counts as silent."""
     return max(MIN_SILENCE_S, SILENT_INTERVALS * interval)
 
 

@@ -51,10 +51,10 @@ from modelserver.dynamics.tree import (
 )
 from modelserver.errors import LimitError, MalformedRequestError, ModelServerError, find_nearest_names, quote
 from modelserver.extras import make_install_command
-from modelserver.geometry.inertia import RigidInertia, to_rows
 from modelserver.geometry.joint import JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import format_names
+from modelserver.geometry.parts import RigidInertia, to_rows
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose, compute_turn_motion, compute_turn_rate
 from modelserver.transforms.so3 import Array
@@ -156,6 +156,11 @@ class Dynamics:
             )
         self.model = model
         self.tree = tree
+        self.coordinates = tree.coordinates
+        """The names of the generalized coordinates, in the order of all arrays."""
+        self.cut = tree.cut
+        """The constraints that are left out because they close loops."""
+        self.massless = tree.massless
         self.uncertainty = uncertainty
         self.gravitational_acceleration = gravity
         self.mass = math.fsum(link.inertia.mass for link in self.tree.links.values() if link.inertia is not None)
@@ -186,20 +191,6 @@ class Dynamics:
         # their rows and columns in the upper triangle
         self._blocks = [((rows, slice(rows.start, nv)), (slice(rows.stop), rows)) for rows, _ in self._vectors]
         self._zeros = np.zeros(nv)
-
-    @property
-    def coordinates(self) -> tuple[str, ...]:
-        """The names of the generalized coordinates, in the order of all arrays."""
-        return self.tree.coordinates
-
-    @property
-    def cut(self) -> tuple[str, ...]:
-        """The constraints that are left out because they close loops."""
-        return self.tree.cut
-
-    @property
-    def massless(self) -> tuple[str, ...]:
-        return self.tree.massless
 
     @property
     def default_position(self) -> Array:
@@ -343,7 +334,10 @@ class Dynamics:
     ) -> Generator[None, None, Array | None]:
         """Return in steps what `center_covariance` does: with many bodies it takes milliseconds."""
         q, sigmas = self._read(q, "q"), self.by_name(self._read(sigma, "sigma"))
-        positions = {each.name: self._position_of(each, q) for each in self.tree.joints}
+        positions = {
+            each.name: tuple((each.multiplier * q[list(each.columns)] + each.offset).tolist())
+            for each in self.tree.joints
+        }
         return iterate_center_covariance(
             self.model, self.tree, frame, positions, sigmas, self.uncertainty, is_frame_exact
         )
@@ -421,10 +415,6 @@ class Dynamics:
                 f"{format_names(self.coordinates)}"
             )
         return found
-
-    def _position_of(self, joint: TreeJoint, q: Array) -> tuple[float, ...]:
-        values = q[list(joint.columns)].tolist()
-        return tuple([joint.multiplier * value + joint.offset for value in values])
 
     def _configure(self, values: Values) -> tuple[Array, Array, list[_Turn]]:
         """Return the coordinates (n,), Pinocchio's configuration, and the blocks of S."""

@@ -91,13 +91,6 @@ class SupportPolygon(NamedTuple):
         return cls(names, points, mean, axes, _find_hull(((points - mean) @ axes[:2].T).tolist()))
 
 
-def compute_margin(polygon: SupportPolygon, center: Array, force: Array, moment: Array) -> tuple[float, int]:
-    """Return the margin theta, and the number of its edge: that from the corner of this number to the next."""
-    angles = [compute_edge_angle(polygon, n, center, force, moment) for n in range(len(polygon.corners))]
-    number = min(range(len(angles)), key=angles.__getitem__)
-    return angles[number], number
-
-
 def compute_edge_angle(polygon: SupportPolygon, number: int, center: Array, force: Array, moment: Array) -> float:
     """Return theta about the edge from the corner `number` to the next one."""
     # plain floats: numpy costs ten times as much for three numbers
@@ -162,7 +155,8 @@ def compute_tip_over(
     size = float(np.linalg.norm(force))
     if not size > 0.0:
         raise MalformedRequestError("no force presses the vehicle on its contacts; the margin needs gravity")
-    margin, number = compute_margin(polygon, center, force, moment)
+    angles = [compute_edge_angle(polygon, n, center, force, moment) for n in range(len(polygon.corners))]
+    margin, number = min((angle, n) for n, angle in enumerate(angles))
     sigma = math.nan
     if center_covariance is not None and force_covariance is not None:
         J = np.zeros(6)

@@ -31,10 +31,10 @@ import numpy as np
 
 from modelserver.errors import MalformedRequestError
 from modelserver.geometry import names
-from modelserver.geometry.inertia import RigidInertia, from_spatial_inertia
 from modelserver.geometry.joint import Coordinates, Joint, JointType, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import format_names
+from modelserver.geometry.parts import RigidInertia
 from modelserver.geometry.topology import Crossing, Edge, EdgeKind, list_crossing_edges
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -84,7 +84,6 @@ class Tree(NamedTuple):
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The bodies without mass."""
         return tuple(name for name, link in self.links.items() if link.inertia is None)
 
 
@@ -161,11 +160,8 @@ def build_tree(model: Model, root: str = "", floating: bool = True, cut_loops: b
 
 
 def _get_inertia(model: Model, body: str) -> RigidInertia | None:
-    stated = model.body(body).inertia
-    if stated is None:
-        return None
-    found = from_spatial_inertia(stated)
-    if found is None:
+    found = model.body(body).rigid_inertia
+    if found is None and model.body(body).inertia is not None:
         raise MalformedRequestError(
             f"body {body}: its 6x6 inertia is not that of a rigid body; state mass, center of mass and inertia instead"
         )

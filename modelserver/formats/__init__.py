@@ -16,32 +16,11 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import NamedTuple
 
+from modelserver import files
 from modelserver.errors import GeometryError, Location, Problem, Severity, quote
-from modelserver.files import (
-    PROCESS_FIX,
-    FileKind,
-    FileTooLargeError,
-    NotRegularFileError,
-    detect_file_kind,
-    find_geometry_path,
-    read_regular,
-)
-from modelserver.formats.common import SavedModel
+from modelserver.formats.common import SavedModel as SavedModel
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
-
-__all__ = [
-    "FORMATS",
-    "MAX_BYTES",
-    "FileExamination",
-    "SavedModel",
-    "check_file",
-    "examine_file",
-    "format_of_path",
-    "load_model",
-    "parse_model",
-    "save_model",
-]
 
 _WRITERS = {"yaml": "yaml_geometry", "miro": "miro", "urdf": "urdf"}
 
@@ -62,11 +41,11 @@ _OTHER_XML = {
 
 _EXAMPLE_HINT = "docs/geometry-files.md has an example to begin with"
 _FIXES = {
-    FileKind.EMPTY: _EXAMPLE_HINT,
-    FileKind.COMMENTS: _EXAMPLE_HINT,
-    FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
-    FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
-    FileKind.MIRO_PROCESS: PROCESS_FIX,
+    files.FileKind.EMPTY: _EXAMPLE_HINT,
+    files.FileKind.COMMENTS: _EXAMPLE_HINT,
+    files.FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
+    files.FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
+    files.FileKind.MIRO_PROCESS: files.PROCESS_FIX,
 }
 """Fix for a file that is not a geometry file."""
 
@@ -86,11 +65,11 @@ def read_content(path: str | os.PathLike[str]) -> bytes:
     Raises GeometryError for a directory, a FIFO, a device or a file that is too large, OSError if it cannot be opened.
     """
     try:
-        return read_regular(path, MAX_BYTES)
-    except NotRegularFileError as error:
+        return files.read_regular(path, MAX_BYTES)
+    except files.NotRegularFileError as error:
         message = f"this is {error.kind}, not a geometry file"
         fix = "name the file inside it" if error.is_directory else "save the geometry to a file, and give that"
-    except FileTooLargeError as error:
+    except files.FileTooLargeError as error:
         message, fix = str(error.strerror), "name a geometry file; point clouds and meshes do not belong in one"
     raise GeometryError([Problem(Severity.ERROR, message, Location(os.fspath(path)), fix)])
 
@@ -104,9 +83,9 @@ def parse_content(
     """
     builder = ModelBuilder(strict=strict)
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
-    kind = detect_file_kind(text)
+    kind = files.detect_file_kind(text)
     if kind in _FIXES:
-        named = find_geometry_path(text) if kind is FileKind.VEHICLE else ""
+        named = files.find_geometry_path(text) if kind is files.FileKind.VEHICLE else ""
         what = kind.value if kind.is_empty else f"{kind.value}, not a geometry file"
         builder.add_error(what, Location(file), _FIXES[kind] + (f", {quote(named, 100)}" if named else ""))
         return builder
@@ -140,7 +119,7 @@ def _pause_garbage_collector() -> Iterator[None]:
 
 
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    from modelserver.formats import frame_tree, miro, urdf, xml_document
+    from modelserver.formats import miro, urdf, xml_document
     from modelserver.formats.common import label
 
     root = xml_document.parse(content, builder, file)
@@ -158,8 +137,8 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
         builder.add_error(_OTHER_XML["config_group"], first, "give the file with BodyName and ConstraintName in it")
         return
     before = len(builder.problems)
-    if next(frame_tree.find_instances(root), None) is not None:
-        frame_tree.load(root, builder, file, variables)
+    if next(miro.find_instances(root), None) is not None:
+        miro.load_frame_tree(root, builder, file, variables)
         if not miro.has_bodies(root):
             return
         # one configuration may hold both

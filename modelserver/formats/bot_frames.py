@@ -23,14 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from modelserver.errors import Location, Suggestion, SyntaxProblemError, has_error, quote, suggest_name
-from modelserver.formats.common import (
-    MAX_POSITION,
-    MAX_SUGGESTIONS,
-    ElementReader,
-    find_cycles,
-    label,
-    suggest_known_key,
-)
+from modelserver.formats import common
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, Joint, JointType
@@ -75,20 +68,7 @@ class ParamBlock:
 
 
 def is_bot_param(content: bytes) -> bool:
-    """Return whether a file is probably a libbot2 parameter file with coordinate frames."""
     return _BEGIN.match(content) is not None and _FRAMES_BLOCK.search(content) is not None
-
-
-def parse_param_file(content: bytes, builder: ModelBuilder, file: str) -> ParamBlock | None:
-    """Parse a file into one block; None, with an error in `builder`, for a syntax error."""
-    try:
-        return _ParamParser(content.decode("utf-8-sig")).parse()
-    except UnicodeDecodeError as error:
-        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
-        builder.add_error(message, Location(file, content.count(b"\n", 0, error.start) + 1), "save it as UTF-8")
-    except SyntaxProblemError as error:
-        builder.add_error(str(error), Location(file, error.line), error.fix)
-    return None
 
 
 class _ParamParser:
@@ -148,7 +128,6 @@ class _ParamParser:
                 raise SyntaxProblemError(f"expected = or {{ after {quote(text)}, got {quote(mark[1])}", line, fix)
 
     def parse_value(self, name: str, line: int) -> ParamValue:
-        """Parse the right side of an assignment, including its semicolon."""
         token = self.next_token()
         if token[0] == "cast":
             token = self.next_token()
@@ -186,13 +165,16 @@ _CHANNEL_KEYS = ("update_channel", "pose_update_channel")
 
 
 def load(content: bytes, builder: ModelBuilder, file: str) -> None:
-    """Add the frames of a parameter file, and their problems, to `builder`."""
-    root = parse_param_file(content, builder, file)
-    if root is not None:
-        _BotFramesReader(builder, file).read(root)
+    try:
+        _BotFramesReader(builder, file).read(_ParamParser(content.decode("utf-8-sig")).parse())
+    except UnicodeDecodeError as error:
+        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
+        builder.add_error(message, Location(file, content.count(b"\n", 0, error.start) + 1), "save it as UTF-8")
+    except SyntaxProblemError as error:
+        builder.add_error(str(error), Location(file, error.line), error.fix)
 
 
-class _BlockReader(ElementReader):
+class _BlockReader(common.ElementReader):
     """Reads the entries of a block; duplicates are errors, unknown names warnings."""
 
     def __init__(self, builder: ModelBuilder, file: str, block: ParamBlock, place: str, known: tuple[str, ...]):
@@ -221,7 +203,7 @@ class _BlockReader(ElementReader):
         line = self.fields[key].line
         if key == "quat":
             return self.repair_quaternion(values, line)
-        if max(map(abs, values)) > MAX_POSITION:
+        if max(map(abs, values)) > common.MAX_POSITION:
             self.error(f"{key} is out of reach", "look for a slip in the exponent", line)
             return None
         if key == "rpy":
@@ -253,7 +235,7 @@ class _BotFrame:
     parent_source: Location
 
 
-class _BotFramesReader(ElementReader):
+class _BotFramesReader(common.ElementReader):
     def __init__(self, builder: ModelBuilder, file: str):
         super().__init__(builder, file)
         self.frames: dict[str, _BotFrame] = {}
@@ -262,8 +244,8 @@ class _BotFramesReader(ElementReader):
     def has_errors(self) -> bool:
         return has_error(self.builder.problems)
 
-    def enter(self, line: int, place: str) -> ElementReader:
-        return ElementReader(self.builder, self.file, line, place)
+    def enter(self, line: int, place: str) -> common.ElementReader:
+        return common.ElementReader(self.builder, self.file, line, place)
 
     def read(self, root: ParamBlock) -> None:
         for name, value in root.values():
@@ -294,7 +276,7 @@ class _BotFramesReader(ElementReader):
         for name, value in (entry for block in blocks for entry in block.values()):
             if name == "root_frame":
                 named.append(value)
-            elif near := suggest_known_key(name, ("root_frame",)):
+            elif near := common.suggest_known_key(name, ("root_frame",)):
                 at.warning(f"unknown name {quote(name)}; ignored", f"write {near[0]}", value.line, near)
         if not named or not named[0].texts:
             at.error("root_frame is missing", 'add root_frame = "local";')
@@ -306,14 +288,14 @@ class _BotFramesReader(ElementReader):
         top = named[0].texts[0]
         return top if self.is_valid_name(top, self.enter(named[0].line, "root_frame")) else None
 
-    def is_valid_name(self, name: str, at: ElementReader) -> bool:
+    def is_valid_name(self, name: str, at: common.ElementReader) -> bool:
         fault = names.find_body_problem(name)
         if fault:
             at.error(f"frame {quote(name)}: {fault}", "rename it, here and in relative_to")
         return not fault
 
     def read_frame(self, name: str, block: ParamBlock, top: str) -> None:
-        place = f"frame {label(name)}"
+        place = f"frame {common.label(name)}"
         at = self.enter(block.line, place)
         if (name == top and not block.entries) or not self.is_valid_name(name, at):
             return
@@ -343,26 +325,26 @@ class _BotFramesReader(ElementReader):
             self.frames[name] = _BotFrame(name, parent.texts[0], pose, driven, at.locate(), parent_source)
 
     def check_parents(self, top: str) -> bool:
-        """Report missing parents and cycles; return whether there are none."""
         missing = [each for each in self.frames.values() if each.parent != top and each.parent not in self.frames]
         for number, frame in enumerate(missing):
             near = Suggestion()
-            if number < MAX_SUGGESTIONS:
+            if number < common.MAX_SUGGESTIONS:
                 near = suggest_name(frame.parent, (top, *self.frames))
             message = f"relative_to names frame {quote(frame.parent)}, which does not exist"
             fix = f"write {near[0]}" if near else "name the root frame, or a frame of this file"
             self.builder.add_error(message, frame.parent_source, fix, near)
         if missing:
             return False
-        for cycle in find_cycles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
-            message = f"frames form a cycle: {' in '.join(map(label, cycle))}"
-            fix = f"one of them must be relative to the root frame {label(top)}, or to one that is"
+        for cycle in common.find_cycles(
+            self.frames, lambda name: self.frames[name].parent if name in self.frames else None
+        ):
+            message = f"frames form a cycle: {' in '.join(map(common.label, cycle))}"
+            fix = f"one of them must be relative to the root frame {common.label(top)}, or to one that is"
             self.builder.add_error(message, self.frames[cycle[-1]].parent_source, fix)
         return not self.has_errors
 
     def add_to_model(self, top: str, block: ParamBlock) -> None:
-        """Add the frames as bodies, root first, and their constraints."""
-        sources = {top: Location(self.file, block.line, f"frame {label(top)}")}
+        sources = {top: Location(self.file, block.line, f"frame {common.label(top)}")}
         sources |= {name: frame.source for name, frame in self.frames.items()}
         bodies = {
             name: self.builder.add_body(name, source=source).add_frame(ORIGIN, source=source)
@@ -371,14 +353,10 @@ class _BotFramesReader(ElementReader):
         for name, frame in self.frames.items():
             mount = name if name != ORIGIN else f"{ORIGIN}_"
             bodies[frame.parent].add_frame(mount, source=frame.source)
-            pose = Pose.identity() if frame.is_driven else frame.pose
-            joint = _make_floating_joint(frame.pose) if frame.is_driven else FIXED
+            pose, joint = frame.pose, FIXED
+            if frame.is_driven:
+                # the coordinates are the whole transform
+                rest = () if pose == Pose.identity() else (*pose.xyz, *so3.logarithm(pose.wxyz))
+                pose, joint = Pose.identity(), Joint(JointType.FLOATING, default=rest)
             ends = (names.join(frame.parent, mount), names.join(name, ORIGIN))
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=frame.source)
-
-
-def _make_floating_joint(rest: Pose) -> Joint:
-    """Return a joint whose coordinates are the whole transform of a frame, by default `rest`."""
-    if rest == Pose.identity():
-        return Joint(JointType.FLOATING)
-    return Joint(JointType.FLOATING, default=(*rest.xyz, *so3.logarithm(rest.wxyz)))

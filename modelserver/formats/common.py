@@ -20,8 +20,10 @@ from xml.sax import saxutils
 import numpy as np
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_key
+from modelserver.geometry.builder import MAX_POSITION as MAX_POSITION
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
+from modelserver.geometry.parts import BodyFrame, Constraint
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
@@ -53,9 +55,6 @@ ROUNDING_DEVIATION = 1e-3
 MAX_DEVIATION = 0.05
 """Rotations with a greater |R'R - I| are rejected: that is a mistake, not rounding."""
 
-MAX_POSITION = 1e9
-"""Greatest coordinate, meters: beyond it the rounding of sums exceeds a micrometer."""
-
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
@@ -83,7 +82,6 @@ class ElementReader:
         self.place = place
 
     def line_of(self, key: str) -> int:
-        """Return the line of a named value; 0 if it is absent."""
         return 0
 
     def locate(self, at: int | str = 0) -> Location:
@@ -161,36 +159,28 @@ class ElementReader:
 
         `where` names the rows for the fix, e.g. `Row1 to Row3`.
         """
-        (a, b, c), (d, e, f), (g, h, i) = rows
-        if (a, b, c, d, e, f, g, h, i) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0):
+        R = np.array(rows)
+        if np.array_equal(R, np.eye(3)):
             return so3.IDENTITY
-        products = (
-            a * a + d * d + g * g - 1.0,
-            b * b + e * e + h * h - 1.0,
-            c * c + f * f + i * i - 1.0,
-            a * b + d * e + g * h,
-            a * c + d * f + g * i,
-            b * c + e * f + h * i,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            deviation = float(np.abs(R.T @ R - np.eye(3)).max())
         # a product that overflowed to nan must fail this test
-        if not all(abs(value) <= MAX_DEVIATION for value in products):
-            worst = max((abs(value) for value in products), key=lambda value: math.inf if math.isnan(value) else value)
-            message = f"this is not a rotation: |R'R - I| is {worst:.3g}, more than {MAX_DEVIATION:g}"
+        if not deviation <= MAX_DEVIATION:
+            message = f"this is not a rotation: |R'R - I| is {deviation:.3g}, more than {MAX_DEVIATION:g}"
             fix = f"look for a wrong digit or sign in {where}: each row and column has length 1, at right angles"
             self.error(message, fix, line)
             return None
-        if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+        if np.linalg.det(R) < 0.0:
             fix = f"turn the sign of one row or column in {where}; axes are right-handed"
             self.error(
                 "this is a reflection, not a rotation (determinant -1): one axis points the wrong way", fix, line
             )
             return None
-        deviation = max(abs(value) for value in products)
         if deviation < 1e-14:
             return so3.from_matrix(rows)
         matrix, deviation = so3.nearest_rotation(rows)
         if deviation > ROUNDING_DEVIATION:
-            moved = float(np.abs(matrix - np.asarray(rows)).max())
+            moved = float(np.abs(matrix - R).max())
             self.warning(
                 f"this is not quite a rotation: |R'R - I| is {deviation:.2g}, more than {ROUNDING_DEVIATION:g}; "
                 f"replaced by the nearest one, entries changed by up to {moved:.2g}",
@@ -239,7 +229,6 @@ def format_number(value: float) -> str:
 
 
 def escape(value: str) -> str:
-    """Escape a text for an XML attribute."""
     return saxutils.escape(value, {'"': "&quot;"})
 
 
@@ -268,12 +257,12 @@ def format_names(names: list[str], limit: int = 5) -> str:
 
 def list_text_and_sigma_features(model: Model) -> Iterator[str]:
     """Yield how many descriptions and sigmas a format without them drops."""
-    frames = [frame for body in model.bodies for frame in body]
-    texts = [each.description for each in model.bodies] + [each.description for each in frames]
-    texts += [model.description, *(each.description for each in model.constraints)]
+    surveyed: list[BodyFrame | Constraint] = [frame for body in model.bodies for frame in body]
+    surveyed += model.constraints
+    texts = [model.description, *(each.description for each in model.bodies), *(each.description for each in surveyed)]
     if described := sum(map(bool, texts)):
         yield f"{described} descriptions"
-    if sigmas := sum(each is not None for each in (*(f.sigma for f in frames), *(c.sigma for c in model.constraints))):
+    if sigmas := sum(each.sigma is not None for each in surveyed):
         yield f"{sigmas} sigmas"
 
 
@@ -306,7 +295,6 @@ LARGEST_ANGLE: Final = math.tau + 0.01
 
 
 def is_far(position: Iterable[float]) -> bool:
-    """Return whether a position, m, was hardly meant in meters."""
     return math.hypot(*position) > FARTHEST
 
 

@@ -42,11 +42,10 @@ from modelserver.formats.common import (
 from modelserver.formats.xml_document import get_line, get_name, get_tag, iterate_children
 from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
-from modelserver.geometry.inertia import RigidInertia, Rows, from_spatial_inertia
 from modelserver.geometry.joint import FIXED, TYPES_WITH_AXIS, Coordinates, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import ORIGIN
-from modelserver.geometry.parts import DIMENSIONS, Material, Shape, ShapeKind
+from modelserver.geometry.parts import DIMENSIONS, Body, Material, RigidInertia, Shape, ShapeKind
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -78,7 +77,6 @@ _JOINT_ELEMENTS = ("origin", "parent", "child", "axis", "limit", "mimic")
 
 
 def load(root: Element, builder: ModelBuilder, file: str) -> None:
-    """Add the links and joints below `root`, and their problems, to `builder`."""
     reader = _UrdfReader(UrdfElement(builder, file, root))
     if not reader.has_macros():
         reader.read()
@@ -151,7 +149,6 @@ class _UrdfReader:
             self.add_joints(bodies)
 
     def reject(self, at: UrdfElement, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Report an error in the tree of links and joints."""
         at.error(message, fix, nearest=nearest)
         self.has_errors = True
 
@@ -178,7 +175,6 @@ class _UrdfReader:
         self.joints[at.name] = _ParsedJoint(at.name, parent, child, pose, joint, at)
 
     def read_end(self, at: UrdfElement, parts: dict[str, UrdfElement], key: str) -> str | None:
-        """Read the link that a joint names as its parent or child."""
         if key not in parts:
             at.error(f"<{key}> is missing", f'add <{key} link="..."/>')
             return None
@@ -248,7 +244,6 @@ class _UrdfReader:
             self.builder.add_constraint(name, *ends, pose, joint=joint, source=at.locate())
 
     def read_motion(self, at: UrdfElement, parts: dict[str, UrdfElement]) -> Joint | None:
-        """Read the motion of a joint; None, with an error, if it is wrong."""
         name = at.read_text("type", f"add type, one of {', '.join(_JOINT_TYPES)}")
         if name is None:
             return None
@@ -349,7 +344,6 @@ class UrdfElement(ElementReader):
         return (self.enter(child, self.place) for child in iterate_children(self.element))
 
     def get(self, key: str) -> str:
-        """Return the trimmed text of an attribute, empty for none."""
         return (self.element.get(key) or "").strip()
 
     def warn_unknown(self, known: tuple[str, ...]) -> bool:
@@ -554,13 +548,13 @@ def _format_shape(key: str, shape: Shape, materials: dict[str, Material]) -> Ite
     return format_element(key, inside, **({"name": shape.name} if shape.name else {}))
 
 
-def _format_inertial(inertia: Rows | None) -> Iterator[str]:
+def _format_inertial(body: Body) -> Iterator[str]:
     """Yield the inertial of a body, along the axes of its link; nothing if it is not that of a rigid body."""
-    found = None if inertia is None else from_spatial_inertia(inertia)
+    found = body.rigid_inertia
     if found is None:
         return
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = found.about_center
-    greatest = max(abs(value) for row in inertia or () for value in row)
+    greatest = max(abs(value) for row in body.inertia or () for value in row)
     x, y, z = (_round_off(value, max(map(abs, found.center))) for value in found.center)
     moments = {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
     inside = [*_format_origin(Pose((x, y, z))), *format_element("mass", value=found.mass)]
@@ -596,7 +590,7 @@ def save(model: Model) -> SavedModel:
         parts: list[str] = []
         if body:
             found = model.body(body)
-            parts += _format_inertial(found.inertia)
+            parts += _format_inertial(found)
             for key, shapes in (("visual", found.visuals), ("collision", found.collisions)):
                 parts += [line for shape in shapes for line in _format_shape(key, shape, materials)]
         inside += format_element("link", parts, name=name)
@@ -610,7 +604,6 @@ def save(model: Model) -> SavedModel:
 
 
 def list_link_names(model: Model) -> dict[str, str]:
-    """Return the link in the file for each written frame of `model`, by full name."""
     return _UrdfWriter(model).link_names
 
 
@@ -641,14 +634,10 @@ class _UrdfWriter:
             crossing.constraint.name for crossing in self.crossings.values() if not _is_movable_in_urdf(crossing)
         ]
         """Movable joints that are written as fixed."""
-        joints = {crossing.constraint.name: crossing.constraint.joint for crossing in self.crossings.values()}
-        movable = {name for name, joint in joints.items() if joint.is_movable and name not in self.fixed_joints}
-        self.mimicked_joints = {
-            name: joint.mimic.joint
-            for name, joint in joints.items()
-            if joint.mimic is not None and name in movable and joint.mimic.joint in movable
-        }
-        """The joint that each joint with a written <mimic> follows."""
+        movable = self.joint_names & {*model.joints} - {*self.fixed_joints}
+        leaders = {name: mimic.joint for name in movable if (mimic := model.joints[name].joint.mimic) is not None}
+        self.mimicking_joints = {name for name, leader in leaders.items() if leader in movable}
+        """Joints that are written with a <mimic>."""
         for body in self.bodies:
             self.add_frame_links(body.name)
             if body.name in self.crossings:
@@ -692,9 +681,9 @@ class _UrdfWriter:
             return
         full = self.find_intermediate_frame(body)
         last = self.link_names[full] if full else body
-        joint = (
-            each.joint if each.name in self.mimicked_joints or each.joint.mimic is None else _remove_mimic(each.joint)
-        )
+        joint = each.joint
+        if each.name not in self.mimicking_joints:
+            joint = Joint(joint.type, joint.axis, joint.lower, joint.upper, joint.rate_limit)
         if crossing.forward:
             self.joints.append(_WrittenJoint(each.name, parent, last, mount @ each.pose, joint))
         else:
@@ -723,18 +712,16 @@ class _UrdfWriter:
         self.joints.append(_WrittenJoint(name, parent, child, pose))
 
     def list_unsupported(self) -> Iterator[str]:
-        """Yield the features that are dropped, and the frames that become links."""
         model = self.model
         yield from list_text_and_sigma_features(model)
-        inertias = [(body.name, body.inertia) for body in model.bodies if body.inertia is not None]
-        if odd := [name for name, inertia in inertias if from_spatial_inertia(inertia) is None]:
+        if odd := [each.name for each in model.bodies if each.inertia is not None and each.rigid_inertia is None]:
             yield f"the inertia of {format_names(odd)}: not that of a rigid body with mass"
         if posed := [body.name for body in model.bodies if body.pose is not None]:
             yield f"the own transform of {format_names(posed)}"
         if self.fixed_joints:
             yield f"the motion of {format_names(self.fixed_joints)}; written as fixed at the default position"
         movable = {name: each.joint for name, each in model.joints.items() if name not in self.fixed_joints}
-        if free := [n for n, joint in movable.items() if joint.mimic is not None and n not in self.mimicked_joints]:
+        if free := [n for n, joint in movable.items() if joint.mimic is not None and n not in self.mimicking_joints]:
             yield f"which joint {format_names(free)} follows"
         # the default of a joint that follows another is that of the other one
         if defaults := [name for name, joint in movable.items() if joint.default and joint.mimic is None]:
@@ -761,10 +748,6 @@ def _is_movable_in_urdf(crossing: Crossing) -> bool:
     if kind in (JointType.PLANAR, JointType.FLOATING):
         return crossing.forward
     return kind is not JointType.SPHERICAL
-
-
-def _remove_mimic(joint: Joint) -> Joint:
-    return Joint(joint.type, joint.axis, joint.lower, joint.upper, joint.rate_limit)
 
 
 def _format_joint(written: _WrittenJoint) -> Iterator[str]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from lxml import etree
 
 from modelserver.errors import Location
-from modelserver.formats.common import ElementReader, label, suggest_known_key
+from modelserver.formats.common import ElementReader
 from modelserver.geometry.builder import ModelBuilder
 
 if TYPE_CHECKING:
@@ -88,8 +88,9 @@ def _read_as_ros(content: bytes) -> Element | None:
 
 
 def _is_doctype_rejected(content: bytes, builder: ModelBuilder, file: str) -> bool:
-    start = _find_doctype(content)
-    if start < 0:
+    before = _BEFORE_DOCTYPE.match(content)
+    start = 0 if before is None else before.end()
+    if not content.startswith(b"<!DOCTYPE", start):
         return False
     declaration = re.compile(rb"[^>\[]*").match(content, start)
     assert declaration is not None
@@ -103,19 +104,12 @@ def _is_doctype_rejected(content: bytes, builder: ModelBuilder, file: str) -> bo
     return True
 
 
-def _find_doctype(content: bytes) -> int:
-    """Return the offset of the DOCTYPE before the first element, -1 for none."""
-    found = _BEFORE_DOCTYPE.match(content)
-    return found.end() if found is not None and content.startswith(b"<!DOCTYPE", found.end()) else -1
-
-
 def get_tag(element: Element) -> str:
     """Return the element's name without a namespace."""
     return str(element.tag).rpartition("}")[2]
 
 
 def get_name(element: Element) -> str:
-    """Return the attribute `name` of an element, empty for none."""
     return (element.get("name") or "").strip()
 
 
@@ -129,33 +123,3 @@ def get_line(element: Element) -> int:
     # stubs miss that sourceline is a number or None
     number: Any = element.sourceline
     return int(number or 0)
-
-
-class NamedParameters(ElementReader):
-    """The children `<parameter name=... value=...>` of an element, by name; unknown and duplicate ones are reported."""
-
-    def __init__(self, element: Element, known: tuple[str, ...], builder: ModelBuilder, file: str, place: str):
-        super().__init__(builder, file, get_line(element), place)
-        parameters: list[tuple[str, Element, int]] = []
-        for child in iterate_children(element):
-            if (tag := get_tag(child)) == "parameter":
-                parameters.append((get_name(child), child, get_line(child)))
-            else:
-                fix, near = "write <parameter name=... value=.../>", suggest_known_key(tag, ("parameter",))
-                self.warning(f"unexpected element <{label(tag)}>; ignored", fix, get_line(child), tuple(near))
-        self.elements: dict[str, Element] = self.select(parameters, known, "parameter")
-
-    def locate(self, at: int | str = 0) -> Location:
-        """Return the location of a line or a parameter; of the element if the parameter is absent."""
-        child = self.elements.get(at) if isinstance(at, str) else None
-        if child is None:
-            return super().locate(at)
-        return Location(self.file, get_line(child), f"{self.place}, {at}" if self.place else str(at))
-
-    def read_text(self, name: str) -> str | None:
-        """Return the trimmed value of a parameter; None if it is absent or, with an error, has no value."""
-        child = self.elements.get(name)
-        value = None if child is None else child.get("value")
-        if child is not None and value is None:
-            self.error(f"parameter {name} has no value", f'write <parameter name="{name}" value="..."/>', name)
-        return None if value is None else value.strip()

@@ -12,26 +12,17 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from modelserver.errors import has_error, quote, suggest_name
-from modelserver.formats.common import (
-    LARGEST_SIGMA,
-    LARGEST_SURVEY_SIGMA,
-    MAX_POSITION,
-    ElementReader,
-    looks_like_degrees,
-    looks_like_radians,
-    parse_number,
-)
+from modelserver.formats import common
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.geometry.inertia import RigidInertia, Rows
 from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
-from modelserver.geometry.parts import Sigma
+from modelserver.geometry.parts import RigidInertia, Rows, Sigma
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
 from modelserver.yaml_tree import NodeKind, YamlNode
 
 
-class YamlMapping(ElementReader):
+class YamlMapping(common.ElementReader):
     """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
 
     Null values are left out of the fields; unknown and duplicate keys are errors.
@@ -98,7 +89,7 @@ class YamlMapping(ElementReader):
         try:
             if not node.is_plain:
                 raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
-            return parse_number(node.text)
+            return common.parse_number(node.text)
         except ValueError as error:
             self.error(f"{key}: {error}", fix, node.line)
             return None
@@ -184,7 +175,7 @@ def _read_rotation(at: YamlMapping, key: str) -> Quaternion | None:
 def check_unit(at: YamlMapping, angles: Iterable[float], key: str, line: int) -> None:
     """Warn of angles that look like those of the other unit."""
     is_degrees = key.endswith("_deg")
-    is_other = looks_like_radians if is_degrees else looks_like_degrees
+    is_other = common.looks_like_radians if is_degrees else common.looks_like_degrees
     found = next((each for each in angles if math.isfinite(each) and is_other(each)), None)
     if found is None:
         return
@@ -251,7 +242,7 @@ def read_sigma(owner: YamlMapping) -> SigmaDefaults | None:
     found = {key: _read_deviations(at, node, key, units[key]) for key, node in at.fields.items()}
     if degrees := found.get("rpy_deg"):
         found["rpy"] = so3.to_vector3(map(math.radians, degrees))
-    elif (turn := max(found.get("rpy") or (0.0,))) >= LARGEST_SURVEY_SIGMA:
+    elif (turn := max(found.get("rpy") or (0.0,))) >= common.LARGEST_SURVEY_SIGMA:
         at.warning(
             f"rpy: a sigma of {turn:g} rad ({math.degrees(turn):.0f} deg)",
             "write rpy_deg where degrees are meant",
@@ -393,36 +384,30 @@ class _YamlJointReader:
         A coordinate that a mapping omits has the value `omitted`; None if it must have all.
         """
         at = self.at
-        plain, degrees = at.fields.get(key), at.fields.get(f"{key}_deg")
-        if degrees is None:
-            if plain is None:
-                return {}
-            if len(self.names) > 1:
-                return self.read_by_coordinate(key, plain, read, omitted)
-        elif plain is not None:
-            at.error(f"{key} and {key}_deg are both given", "keep one of the two", degrees.line)
+        given = [(name, at.fields[name]) for name in (key, f"{key}_deg") if name in at.fields]
+        if not given:
             return {}
+        name, node = given[-1]
+        is_degrees, is_angle = name != key, self.is_angle.get("", False)
+        if len(given) > 1:
+            at.error(f"{key} and {name} are both given", "keep one of the two", node.line)
+        elif len(self.names) > 1 and not is_degrees:
+            return self.read_by_coordinate(key, node, read, omitted)
         elif len(self.names) > 1:
-            first = next(name for name, angle in self.is_angle.items() if angle)
+            first = next(each for each, angle in self.is_angle.items() if angle)
             fix = f"write {key}: {{{first}_deg: ...}}, by coordinate"
-            at.error(f"{key}_deg: a {self.kind} joint has several coordinates", fix, degrees.line)
-            return {}
-        elif not self.is_angle[""]:
-            at.error(f"{key}_deg: a {self.kind} joint moves in meters", f"write {key}: in meters", degrees.line)
-            return {}
-        node, name = (degrees, f"{key}_deg") if plain is None else (plain, key)
-        value = None if node is None else read(node, name)
-        if value is not None and degrees is not None:
-            check_unit(at, value, name, degrees.line)
-        value = value if degrees is None else _to_radians(value)
-        if key == "sigma" and value and self.is_angle[""] and value[0] >= LARGEST_SIGMA:
-            line = 0 if node is None else node.line
-            at.warning(
-                f"a sigma of {value[0]:g} rad ({math.degrees(value[0]):.0f} deg) of a joint",
-                "write sigma_deg where degrees are meant",
-                line,
-            )
-        return {} if value is None else {"": value}
+            at.error(f"{name}: a {self.kind} joint has several coordinates", fix, node.line)
+        elif is_degrees and not is_angle:
+            at.error(f"{name}: a {self.kind} joint moves in meters", f"write {key}: in meters", node.line)
+        elif (value := read(node, name)) is not None:
+            if is_degrees:
+                check_unit(at, value, name, node.line)
+                value = tuple(map(math.radians, value))
+            if key == "sigma" and is_angle and value[0] >= common.LARGEST_SIGMA:
+                size = f"{value[0]:g} rad ({math.degrees(value[0]):.0f} deg)"
+                at.warning(f"a sigma of {size} of a joint", "write sigma_deg where degrees are meant", node.line)
+            return {"": value}
+        return {}
 
     def read_by_coordinate(self, key: str, node: YamlNode, read: _Read, omitted: _Values | None) -> dict[str, _Values]:
         at = self.at
@@ -441,8 +426,8 @@ class _YamlJointReader:
                 at.error(f"{key}: {each} is a length, not an angle", f"write {name}: in meters", inside.line)
             elif name in found:
                 at.error(f"{name} and {name}_deg are both given", "keep one of the two", inside.line)
-            value = read(inside, each)
-            found[name] = (_to_radians(value) if is_degrees else value) or omitted or ()
+            value = read(inside, each) or omitted or ()
+            found[name] = tuple(map(math.radians, value)) if is_degrees else value
         missing = [name for name in self.names if name not in found]
         if missing and omitted is None:
             fix = "state it of each coordinate; 0 is exact"
@@ -483,17 +468,10 @@ class _YamlJointReader:
 
     def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
         value = self.at.read_number(node, key, fix)
-        if value is not None and abs(value) > MAX_POSITION:
-            self.at.error(f"{key}: {value:g} is out of reach; the limit is {MAX_POSITION:g}", fix, node.line)
+        if value is not None and abs(value) > common.MAX_POSITION:
+            self.at.error(f"{key}: {value:g} is out of reach; the limit is {common.MAX_POSITION:g}", fix, node.line)
             return None
         return value
-
-    def read_joint_name(self, at: YamlMapping, key: str) -> str:
-        """Return the name of the joint that this one follows; empty, with an error, if there is none."""
-        name = at.read_text(key)
-        if at.fields[key].kind is NodeKind.SCALAR and not name:
-            self.at.error(f"{key} names no joint", f"write {key}: NAME, of another constraint", key)
-        return name
 
     def read_mimic(self) -> Mimic | None:
         at, node = self.at, self.at.fields.get("mimic")
@@ -503,15 +481,17 @@ class _YamlJointReader:
             fix = "remove mimic; what follows another is revolute or prismatic"
             at.error(f"a {self.kind} joint has several coordinates and cannot follow another", fix, node.line)
             return None
-        if node.kind is not NodeKind.MAPPING:
-            name = self.read_joint_name(at, "mimic")
-            return Mimic(name) if name else None
-        inside = at.enter(node, f"{at.place}, mimic", ("joint", "multiplier", "offset", "offset_deg"))
-        fields = inside.fields
-        name = self.read_joint_name(inside, "joint") if "joint" in fields else ""
-        if "joint" not in fields:
+        inside, key = at, "mimic"
+        if node.kind is NodeKind.MAPPING:
+            inside = at.enter(node, f"{at.place}, mimic", ("joint", "multiplier", "offset", "offset_deg"))
+            key = "joint"
+        fields, name = inside.fields, inside.read_text(key)
+        if key not in fields:
             at.error("mimic does not name the joint that it follows", "write mimic: {joint: NAME}", node.line)
-        read = {key: self.read_number(fields[key], key, f"write {key}: number") for key in fields if key != "joint"}
+        elif fields[key].kind is NodeKind.SCALAR and not name:
+            at.error(f"{key} names no joint", f"write {key}: NAME, of another constraint", key)
+        numbers = [each for each in ("multiplier", "offset", "offset_deg") if each in fields]
+        read = {each: self.read_number(fields[each], each, f"write {each}: number") for each in numbers}
         multiplier, offset = read.get("multiplier", 1.0), read.get("offset", 0.0)
         if "offset_deg" in fields:
             line, degrees = fields["offset_deg"].line, read["offset_deg"]
@@ -521,7 +501,3 @@ class _YamlJointReader:
             elif not self.is_angle[""]:
                 at.error(f"offset_deg: a {self.kind} joint moves in meters", "write offset: in meters", line)
         return None if not name or multiplier is None or offset is None else Mimic(name, multiplier, offset)
-
-
-def _to_radians(degrees: _Values | None) -> _Values | None:
-    return None if degrees is None else tuple(map(math.radians, degrees))

@@ -29,7 +29,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import yaml
@@ -353,15 +353,10 @@ class _GeometryReader:
 
 def _override(base: list[_FrameNode], own: list[_FrameNode]) -> list[_FrameNode]:
     """Return the frames of the template, replaced by those of the body with the same name, then the others."""
-    mine: dict[str, _FrameNode] = {}
-    extra: list[_FrameNode] = []
     names = {frame.name for frame, _ in base}
-    for placed in own:
-        name = placed[0].name
-        if name in names and name not in mine:
-            mine[name] = placed
-        else:
-            extra.append(placed)
+    # of several with one name the first
+    mine = {placed[0].name: placed for placed in reversed(own) if placed[0].name in names}
+    extra = [placed for placed in own if mine.get(placed[0].name) is not placed]
     return [mine.get(placed[0].name, placed) for placed in base] + extra
 
 
@@ -380,12 +375,7 @@ def save(model: Model, exact: bool = False) -> SavedModel:
     With `exact`, rotations are written as quaternions at full precision, so that the revision of the model is the same
     when a program reads it back.
     """
-    lines = ["modelserver: geometry/1"]
-    if model.name:
-        lines.append(f"name: {format_text(model.name)}")
-    if model.description:
-        lines.append(f"description: {format_text(model.description)}")
-    lines += ["", "bodies:"]
+    lines = ["modelserver: geometry/1", *_format_texts(name=model.name, description=model.description), "", "bodies:"]
     for number, body in enumerate(model.bodies):
         lines += ([""] if number else []) + _format_body(body, exact)
     if model.constraints:
@@ -396,9 +386,7 @@ def save(model: Model, exact: bool = False) -> SavedModel:
 
 
 def _format_body(body: Body, exact: bool) -> list[str]:
-    lines = [f"  {format_text(body.name)}:"]
-    if body.description:
-        lines.append(f"    description: {format_text(body.description)}")
+    lines = [f"  {format_text(body.name)}:", *(f"    {each}" for each in _format_texts(description=body.description))]
     if body.pose is not None:
         lines.append(f"    transform: {{{', '.join(_format_pose(body.pose, exact) or ['xyz: [0, 0, 0]'])}}}")
     if body.inertia is not None:
@@ -420,15 +408,13 @@ def _format_frame(frame: BodyFrame, exact: bool) -> list[str]:
     short = f"{head} {{{', '.join(fields)}}}"
     if not frame.description and len(short) <= WIDTH:
         return [short]
-    described = [f"description: {format_text(frame.description)}"] if frame.description else []
-    return [head, *(f"        {each}" for each in described + fields)]
+    return [head, *(f"        {each}" for each in _format_texts(description=frame.description) + fields)]
 
 
 def _format_constraint(constraint: Constraint, exact: bool) -> list[str]:
     fields = [f"from: {_format_full_name(constraint.from_)}", f"to: {_format_full_name(constraint.to)}"]
-    if constraint.description:
-        fields.append(f"description: {format_text(constraint.description)}")
-    fields += _format_pose(constraint.pose, exact) + _format_sigma(constraint.sigma) + _format_joint(constraint.joint)
+    fields += _format_texts(description=constraint.description) + _format_pose(constraint.pose, exact)
+    fields += _format_sigma(constraint.sigma) + _format_joint(constraint.joint)
     return [f"  {format_text(constraint.name)}:", *(f"    {each}" for each in fields)]
 
 
@@ -443,15 +429,12 @@ def _format_shape(shape: Shape, exact: bool) -> list[str]:
     else:
         sizes = zip(DIMENSIONS[shape.kind], shape.size, strict=True)
         lines = [f"{shape.kind}: {{{', '.join(f'{what}: {format_number(value)}' for what, value in sizes)}}}"]
-    lines += _format_pose(shape.pose, exact)
-    if shape.name:
-        lines.append(f"name: {format_text(shape.name)}")
+    lines += _format_pose(shape.pose, exact) + _format_texts(name=shape.name)
     if shape.material is not None:
         lines += ["material:", f"  name: {format_text(shape.material.name)}"]
         if shape.material.color is not None:
             lines.append(f"  color: {_format_list(shape.material.color)}")
-        if shape.material.texture:
-            lines.append(f"  texture: {format_text(shape.material.texture)}")
+        lines += [f"  {each}" for each in _format_texts(texture=shape.material.texture)]
     return [f"- {lines[0]}", *(f"  {line}" for line in lines[1:])]
 
 
@@ -557,6 +540,11 @@ def _format_list(values: tuple[float, ...]) -> str:
     return f"[{', '.join(map(format_number, values))}]"
 
 
+def _format_texts(**texts: str) -> list[str]:
+    """Return `key: text` for each text that is not empty."""
+    return [f"{key}: {format_text(text)}" for key, text in texts.items() if text]
+
+
 def _format_full_name(name: str) -> str:
     """Return a full name; its colon needs no quotes, because no space follows it."""
     body, _, frame = name.partition(":")
@@ -566,14 +554,11 @@ def _format_full_name(name: str) -> str:
 
 def format_text(value: str) -> str:
     """Return a text as YAML, without quotes if every reader reads the same text."""
-    if _PLAIN_TEXT.fullmatch(value) and value.isprintable() and _resolves_to_text(value):
-        return value
+    if _PLAIN_TEXT.fullmatch(value) and value.isprintable():
+        tag = _RESOLVER.resolve(yaml.ScalarNode, value, (True, False))  # type: ignore[no-untyped-call]
+        if tag == "tag:yaml.org,2002:str":
+            return value
     return quote_text(value)
-
-
-def _resolves_to_text(value: str) -> bool:
-    tag = _RESOLVER.resolve(yaml.ScalarNode, value, (True, False))  # type: ignore[no-untyped-call]
-    return bool(tag == "tag:yaml.org,2002:str")
 
 
 def quote_text(value: str) -> str:
@@ -610,18 +595,11 @@ class ModelSnapshot:
     """Microseconds by which the stamps on `joints_channel` are later than the measurement."""
 
 
-_SETTINGS: Final[dict[str, Callable[[Any], Any]]] = {
-    "vehicle": str,
-    "base_frame": str,
-    "rolling_frame": str,
-    "history_s": float,
-    "joints_channel": str,
-    "joints_latency_us": int,
-}
+_KINDS: Final[dict[Any, Callable[[Any], Any]]] = {"str": str, "float": float, "int": int}
+_SETTINGS: Final = {each.name: _KINDS[each.type] for each in fields(ModelSnapshot) if each.name != "model"}
 
 
 def encode_snapshot(snapshot: ModelSnapshot) -> bytes:
-    """Encode a snapshot as a zlib stream of JSON."""
     content = {key: getattr(snapshot, key) for key in _SETTINGS}
     content |= {"revision": snapshot.model.revision, "geometry": save(snapshot.model, exact=True).text}
     return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)

@@ -30,20 +30,10 @@ from modelserver.errors import (
     quote,
     suggest_name,
 )
-from modelserver.geometry import names
+from modelserver.geometry import names, parts
 from modelserver.geometry.joint import FIXED, Joint, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
-from modelserver.geometry.parts import (
-    Body,
-    BodyFrame,
-    Constraint,
-    Shape,
-    Sigma,
-    apply_mimic_defaults,
-    resolve_mimics,
-    suggest_frame,
-)
 from modelserver.geometry.topology import MAX_SIGMAS, LoopMisclosure, Topology, compute_misclosure, full_name
 from modelserver.transforms.pose import Pose
 
@@ -55,13 +45,13 @@ MAX_SUGGESTIONS = 100
 
 
 MAX_POSITION = 1e9
-"""Meters or radians; a default position beyond would cost the precision of millimeters."""
+"""Meters or radians; beyond it the rounding of sums exceeds a micrometer."""
 
 
 MAX_ANGLE = 2.0 * math.tau
 """Radians; an angle beyond two turns is probably one in degrees."""
 
-LocatedConstraint = tuple[Constraint, Location]
+LocatedConstraint = tuple[parts.Constraint, Location]
 """A constraint and its source location."""
 
 NO_LOCATION: Final = Location()
@@ -76,19 +66,19 @@ class BodyBuilder:
     description: str = ""
     pose: Pose | None = None
     inertia: tuple[tuple[float, ...], ...] | None = None
-    frames: list[tuple[BodyFrame, Location]] = field(default_factory=list)
-    visuals: tuple[Shape, ...] = ()
-    collisions: tuple[Shape, ...] = ()
+    frames: list[tuple[parts.BodyFrame, Location]] = field(default_factory=list)
+    visuals: tuple[parts.Shape, ...] = ()
+    collisions: tuple[parts.Shape, ...] = ()
 
     def add_frame(
         self,
         name: str,
         pose: Pose | None = None,
         description: str = "",
-        sigma: Sigma | None = None,
+        sigma: parts.Sigma | None = None,
         source: Location = NO_LOCATION,
     ) -> BodyBuilder:
-        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
+        self.frames.append((parts.BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
         return self
 
 
@@ -108,7 +98,7 @@ class ModelBuilder:
     unreadable_joints: set[str] = field(default_factory=set)
     unresolved_ends: list[tuple[str, str, str, Location]] = field(default_factory=list)
     bodies: list[BodyBuilder] = field(default_factory=list)
-    constraints: list[tuple[Constraint, Location]] = field(default_factory=list)
+    constraints: list[tuple[parts.Constraint, Location]] = field(default_factory=list)
 
     @classmethod
     def from_model(cls, model: Model, strict: bool = False) -> ModelBuilder:
@@ -121,7 +111,6 @@ class ModelBuilder:
 
     @property
     def is_empty(self) -> bool:
-        """Whether neither a body nor a constraint was added."""
         return not self.bodies and not self.constraints
 
     def add_body(
@@ -137,7 +126,7 @@ class ModelBuilder:
         self.bodies.append(body)
         return body
 
-    def copy_body(self, body: Body, source: Location = NO_LOCATION) -> BodyBuilder:
+    def copy_body(self, body: parts.Body, source: Location = NO_LOCATION) -> BodyBuilder:
         """Add a copy of a body, e.g. `camera.with_name("RearCamera")`; return its builder."""
         draft = self.add_body(body.name, body.description, body.pose, body.inertia, source)
         draft.frames.extend((frame, source) for frame in body)
@@ -151,7 +140,7 @@ class ModelBuilder:
         to: str,
         pose: Pose | None = None,
         description: str = "",
-        sigma: Sigma | None = None,
+        sigma: parts.Sigma | None = None,
         joint: Joint = FIXED,
         source: Location = NO_LOCATION,
     ) -> ModelBuilder:
@@ -159,11 +148,11 @@ class ModelBuilder:
 
         `pose` is the pose of `to` in `from_`, for a movable joint with all coordinates 0.
         """
-        constraint = Constraint(name, from_, to, pose or Pose.identity(), description, sigma, joint)
+        constraint = parts.Constraint(name, from_, to, pose or Pose.identity(), description, sigma, joint)
         self.constraints.append((constraint, source))
         return self
 
-    def remove_constraints(self, frame: str | BodyFrame, constraint: str = "") -> tuple[str, ...]:
+    def remove_constraints(self, frame: str | parts.BodyFrame, constraint: str = "") -> tuple[str, ...]:
         """Remove the constraints at a frame, or the one of that name; return the names of those removed.
 
         `build` then applies the rules again: bodies no longer joined to the root are orphans, reported in the model's
@@ -212,7 +201,6 @@ class ModelBuilder:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """The names of all constraints, also of those with errors."""
         return tuple(constraint.name for constraint, _ in self.constraints)
 
     def build(self, repair: bool = False) -> Model:
@@ -276,9 +264,8 @@ class _ModelReview:
             return True
         return False
 
-    def check_bodies(self) -> dict[str, Body]:
-        """Return the bodies by name, each with its well-formed frames."""
-        valid: dict[str, Body] = {}
+    def check_bodies(self) -> dict[str, parts.Body]:
+        valid: dict[str, parts.Body] = {}
         fix = "rename one; to duplicate a device, give the copy a name of its own"
         for draft in self.draft.bodies:
             label = f"body {quote(draft.name)}"
@@ -295,12 +282,12 @@ class _ModelReview:
                 if self.repair:
                     del self.locations[draft.name]
                     continue
-            body = Body(draft.name, frames, draft.description, draft.pose, None, draft.visuals, draft.collisions)
+            body = parts.Body(draft.name, frames, draft.description, draft.pose, None, draft.visuals, draft.collisions)
             try:
                 body = replace(body, inertia=draft.inertia)
             except ValueError as error:
                 self.report(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
-            if fault := body.find_inertia_error():
+            if (rigid := body.rigid_inertia) is not None and (fault := rigid.find_error()):
                 self.report(
                     f"{label}: {fault}", draft.source, "look for a wrong sign or digit, or leave the inertia out"
                 )
@@ -317,7 +304,7 @@ class _ModelReview:
             self.add_problem(Severity.NOTE, message, self.locations[only], fix)
         return valid
 
-    def _check_frames(self, draft: BodyBuilder) -> tuple[BodyFrame, ...]:
+    def _check_frames(self, draft: BodyBuilder) -> tuple[parts.BodyFrame, ...]:
         seen: dict[str, Location] = {}
         return tuple(
             frame
@@ -327,7 +314,7 @@ class _ModelReview:
             )
         )
 
-    def check_constraints(self, bodies: dict[str, Body]) -> tuple[LocatedConstraint, ...]:
+    def check_constraints(self, bodies: dict[str, parts.Body]) -> tuple[LocatedConstraint, ...]:
         """Return the well-formed constraints: both ends exist and differ; in strict mode, one for each frame."""
         valid: list[LocatedConstraint] = []
         by_name: dict[str, Location] = {}
@@ -364,7 +351,7 @@ class _ModelReview:
             self._check_end(f"constraint {quote(name)}", sense, end, bodies, source)
         return tuple(valid)
 
-    def _check_end(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Location) -> bool:
+    def _check_end(self, label: str, sense: str, end: str, bodies: dict[str, parts.Body], source: Location) -> bool:
         listed = format_names([*bodies][: MAX_LISTED + 1])
         fix = f"write it as Body:Frame; bodies are: {listed}" if bodies else "write it as Body:Frame"
         try:
@@ -420,8 +407,8 @@ class _ModelReview:
         sources = {constraint.name: source for constraint, source in placed}
         is_valid: dict[str, bool] = {}
         for constraint, source in placed:
-            chain: dict[str, Constraint] = {}
-            each: Constraint | None = constraint
+            chain: dict[str, parts.Constraint] = {}
+            each: parts.Constraint | None = constraint
             while each is not None and each.joint.mimic is not None and each.name not in chain | is_valid:
                 chain[each.name] = each
                 each = joints.get(each.joint.mimic.joint)
@@ -456,7 +443,7 @@ class _ModelReview:
         self.report(message, source, "remove the mimic of one of them")
 
     def _report_leader(
-        self, constraint: Constraint, joints: Mapping[str, Constraint], sources: Mapping[str, Location]
+        self, constraint: parts.Constraint, joints: Mapping[str, parts.Constraint], sources: Mapping[str, Location]
     ) -> bool:
         """Report that a joint follows one that cannot be followed; return whether the fault is its own."""
         assert constraint.joint.mimic is not None
@@ -476,18 +463,18 @@ class _ModelReview:
         self.report(message, sources[constraint.name], fix, near)
         return True
 
-    def _report_follower(self, constraint: Constraint, source: Location) -> None:
+    def _report_follower(self, constraint: parts.Constraint, source: Location) -> None:
         """Report a follower of a dropped joint; without `repair` nothing is dropped, and the first report is enough."""
         if self.repair and constraint.joint.mimic is not None:
             message = f"constraint {quote(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
             self.report(f"{message}, which was removed", source, "fix that one")
 
-    def _warn(self, constraint: Constraint, message: str, source: Location, fix: str) -> None:
+    def _warn(self, constraint: parts.Constraint, message: str, source: Location, fix: str) -> None:
         self.add_problem(Severity.WARNING, f"constraint {quote(constraint.name)}: {message}", source, fix)
 
     def _apply_defaults(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
         self._check_degrees(placed)
-        applied = apply_mimic_defaults(constraint for constraint, _ in placed)
+        applied = parts.apply_mimic_defaults(constraint for constraint, _ in placed)
         for (stated, source), each in zip(placed, applied, strict=True):
             joint, mimic = each.joint, each.joint.mimic
             if mimic is None:
@@ -528,7 +515,7 @@ class _ModelReview:
     def _drop_out_of_range(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
         """Return those whose default positions are in range; report the others."""
         joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
-        drives = resolve_mimics(joints.values())
+        drives = parts.resolve_mimics(joints.values())
         valid = []
         for constraint, source in placed:
             if constraint.joint.mimic is not None:
@@ -545,13 +532,13 @@ class _ModelReview:
             valid.append((constraint, source))
         return valid
 
-    def _suggest_end(self, end: str, bodies: dict[str, Body]) -> Suggestion:
+    def _suggest_end(self, end: str, bodies: dict[str, parts.Body]) -> Suggestion:
         """Return a suggestion for an end of a constraint that does not exist.
 
         None where several constraints name the missing body and none the suggested one: then the latter is misspelled.
         """
         self.suggestion_count += 1
-        if self.suggestion_count > MAX_SUGGESTIONS or not (near := suggest_frame(end, bodies)):
+        if self.suggestion_count > MAX_SUGGESTIONS or not (near := parts.suggest_frame(end, bodies)):
             return Suggestion()
         wrong, _, _ = end.partition(":")
         right, _, _ = near.partition(":")
@@ -561,8 +548,8 @@ class _ModelReview:
         return Suggestion.of(end, near)
 
     def check_connections(
-        self, bodies: dict[str, Body], placed: tuple[LocatedConstraint, ...]
-    ) -> tuple[dict[str, Body], tuple[Constraint, ...]]:
+        self, bodies: dict[str, parts.Body], placed: tuple[LocatedConstraint, ...]
+    ) -> tuple[dict[str, parts.Body], tuple[parts.Constraint, ...]]:
         """Report orphans and loops; return what is left: with repair, only what is traceable to the root."""
         constraints = tuple(constraint for constraint, _ in placed)
         if self.has_errors or not bodies:
@@ -578,8 +565,9 @@ class _ModelReview:
                 fix = f"add a constraint that joins it to {root[0]} or to what is mounted there"
                 self.add_problem(Severity.WARNING, message, self.locations[body], fix)
         closures = tuple(topology.find_loop_closures())
+        full_frames = {each.full_name: each for body in bodies.values() for each in body} if closures else {}
         for closing in closures:
-            found = compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
+            found = compute_misclosure(closing.path, lambda full: full_frames[full])
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
             self.add_problem(
                 Severity.WARNING if bad else Severity.NOTE,
@@ -606,11 +594,6 @@ class _ModelReview:
             bodies = {name: body for name, body in bodies.items() if name in valid}
             constraints = tuple(each for each in constraints if names.split(each.from_)[0] in valid)
         return bodies, constraints
-
-
-def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
-    body, frame = names.split(name)
-    return bodies[body].frame(frame)
 
 
 def _describe_misclosure(found: LoopMisclosure) -> str:

@@ -160,13 +160,8 @@ class Joint:
         """Position assumed until one is received: the default, else 0, else the limit next to 0."""
         if self.default:
             return self.default
-        rest = [0.0] * self.count
-        for number in range(self.count):
-            if self.lower:
-                rest[number] = max(rest[number], self.lower[number])
-            if self.upper:
-                rest[number] = min(rest[number], self.upper[number])
-        return tuple(rest)
+        lower, upper = self.lower or (-math.inf,) * self.count, self.upper or (math.inf,) * self.count
+        return tuple([min(max(0.0, low), high) for low, high in zip(lower, upper, strict=True)])
 
     def is_out_of_limits(self, position: Sequence[float]) -> bool:
         """Return whether a coordinate is beyond its limits by more than rounding."""

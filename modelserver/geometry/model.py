@@ -6,23 +6,13 @@ import hashlib
 import json
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple
 from enum import StrEnum
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
-from modelserver.errors import (
-    Location,
-    MalformedRequestError,
-    NotConnectedError,
-    Problem,
-    Severity,
-    UnknownBodyError,
-    UnknownFrameError,
-    find_nearest_names,
-    quote,
-)
+from modelserver import errors
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates, Joint, Mimic
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
@@ -33,6 +23,8 @@ from modelserver.plugins import load_object
 from modelserver.transforms import chain
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
+
+T = TypeVar("T")
 
 CACHE_SIZE = 16384
 """Transformations cached, about 1 kB each; the oldest is dropped when full."""
@@ -64,7 +56,7 @@ class Model:
         constraints: tuple[Constraint, ...],
         name: str = "",
         description: str = "",
-        problems: tuple[Problem, ...] = (),
+        problems: tuple[errors.Problem, ...] = (),
     ):
         self.bodies = bodies
         self.constraints = constraints
@@ -76,6 +68,8 @@ class Model:
         _check_unique("constraint", [each.name for each in constraints])
         self._bodies = {body.name: body for body in bodies}
         self._topology = Topology(bodies, constraints)
+        self.assemblies = self._topology.assemblies
+        """Groups of bodies joined by constraints; the root's comes first, the others are orphans."""
         # An OrderedDict drops its oldest in constant time; a dict passes over all entries dropped before.
         self._transformations: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
         self._paths: OrderedDict[tuple[str, str], KinematicPath] = OrderedDict()
@@ -93,16 +87,13 @@ class Model:
     def root(self) -> Body:
         return self.bodies[0]
 
-    @property
-    def assemblies(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of bodies joined by constraints; the root's comes first, the others are orphans."""
-        return self._topology.assemblies
-
     def body(self, name: str) -> Body:
         """Return the body of that name. Raises UnknownBodyError with the nearest names."""
         found = self._bodies.get(name)
         if found is None:
-            raise UnknownBodyError(f"the model has no body {quote(name)}", find_nearest_names(name, self._bodies))
+            raise errors.UnknownBodyError(
+                f"the model has no body {errors.quote(name)}", errors.find_nearest_names(name, self._bodies)
+            )
         return found
 
     def frame(self, name: str) -> BodyFrame:
@@ -136,12 +127,12 @@ class Model:
         name, known = full_name(frame), [each.name for each in self.constraints_of(frame)]
         if constraint:
             there = f"it has {format_names(known)}" if known else "it has none"
-            near = find_nearest_names(constraint, known)
-            raise NotConnectedError(f"frame {name} has no constraint {quote(constraint)}; {there}", near)
+            near = errors.find_nearest_names(constraint, known)
+            raise errors.NotConnectedError(f"frame {name} has no constraint {errors.quote(constraint)}; {there}", near)
         if not found:
-            raise NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
+            raise errors.NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
         several = f"{len(found)} constraints, {format_names(known)}"
-        raise MalformedRequestError(f"frame {name} has {several}; name the one to cross")
+        raise errors.MalformedRequestError(f"frame {name} has {several}; name the one to cross")
 
     def spanning_tree(self, body: str) -> tuple[Crossing, ...]:
         """Return the constraints that lead from a body to all that is joined to it, breadth-first.
@@ -157,7 +148,7 @@ class Model:
         """
         return load_object("modelserver.dynamics", "Dynamics")(self, base, root, **options)
 
-    def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
+    def verify(self, frame: str | BodyFrame) -> tuple[errors.Problem, ...]:
         """Return the problems of a frame, none where it is valid (the report's verifyConstraint).
 
         A frame value that differs from the model's is an error, an orphaned body a warning, several constraints a note:
@@ -165,22 +156,21 @@ class Model:
         """
         known = [each.name for each in self.constraints_of(frame)]
         name = full_name(frame)
-        body, root = name.partition(":")[0], self.root.name
+        body, root, source = name.partition(":")[0], self.root.name, errors.Location(element=f"frame {name}")
         problems = []
         if not isinstance(frame, str) and self.frame(name) != frame:
             message = "the model's frame of this name differs from this one"
             fix = "take the frame from this model, or build a model with this frame in it"
-            problems.append((Severity.ERROR, message, fix))
+            problems.append(errors.Problem(errors.Severity.ERROR, message, source, fix))
         if body not in self.assemblies[0]:
             message = f"body {body} is an orphan: no constraints lead to the root body {root}"
             fix = f"add a constraint that joins it to {root} or to what is mounted there"
-            problems.append((Severity.WARNING, message, fix))
+            problems.append(errors.Problem(errors.Severity.WARNING, message, source, fix))
         if len(known) > 1:
             message = f"the frame has {len(known)} constraints, {format_names(known)}; a strict model allows one"
             fix = "give each constraint a frame of its own, if the file has to load with strict"
-            problems.append((Severity.NOTE, message, fix))
-        source = Location(element=f"frame {name}")
-        return tuple([Problem(severity, message, source, fix) for severity, message, fix in problems])
+            problems.append(errors.Problem(errors.Severity.NOTE, message, source, fix))
+        return tuple(problems)
 
     def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
         """Return whether no joint lies between two frames: the report's pose type, static or dynamic.
@@ -297,17 +287,17 @@ class Model:
         try:
             body_name, frame_name = names.split(names.complete(name))
         except ValueError as error:
-            raise UnknownFrameError(str(error), find_nearest_names(name, everything)) from None
+            raise errors.UnknownFrameError(str(error), errors.find_nearest_names(name, everything)) from None
         found = self._bodies.get(body_name)
         if found is None:
             near = [
                 names.join(body, frame_name) if self._bodies[body].has_frame(frame_name) else body
-                for body in find_nearest_names(body_name, self._bodies)
+                for body in errors.find_nearest_names(body_name, self._bodies)
             ]
             if frame_name == names.ORIGIN:  # perhaps what is given is a frame without its body
                 of_bodies = [names.join(body.name, body_name) for body in self.bodies if body.has_frame(body_name)]
-                near += of_bodies[: names.MAX_LISTED] or find_nearest_names(body_name, everything)
-            raise UnknownBodyError(f"the model has no body {quote(body_name)}", dict.fromkeys(near))
+                near += of_bodies[: names.MAX_LISTED] or errors.find_nearest_names(body_name, everything)
+            raise errors.UnknownBodyError(f"the model has no body {errors.quote(body_name)}", dict.fromkeys(near))
         return found, found.frame(frame_name)
 
     def _get_end_nodes(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:
@@ -329,8 +319,12 @@ class Model:
         if interest.group is reference.group and interest.assembly not in self._assemblies_with_loops:
             return self._compute_rigid(frame_of_interest, frame_of_reference, interest, reference)
         path = self.get_kinematic_path(frame_of_interest, frame_of_reference)
-        covariance = partial(self._default_covariance, path)
-        return self._cache(frame_of_interest, frame_of_reference, path.compute_pose(path.default_positions), covariance)
+        positions = path.default_positions
+
+        def compute_covariance() -> tuple[float, ...] | None:
+            return path.compute_covariance(positions, [self._get_joint_sigma(joint.name) for joint in path.joints])
+
+        return self._cache(frame_of_interest, frame_of_reference, path.compute_pose(positions), compute_covariance)
 
     def _compute_rigid(
         self, frame_of_interest: str, frame_of_reference: str, interest: FrameNode, reference: FrameNode
@@ -353,17 +347,12 @@ class Model:
         self._transformations[frame_of_interest, frame_of_reference] = answer
         return answer
 
-    def _default_covariance(self, path: KinematicPath) -> tuple[float, ...] | None:
-        return path.compute_covariance(
-            path.default_positions, [self._get_joint_sigma(joint.name) for joint in path.joints]
-        )
-
-    def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
+    def _not_connected(self, body_I: str, body_R: str) -> errors.NotConnectedError:
         def assembly(body: str) -> str:
             mates = next(each for each in self._topology.assemblies if body in each)
             return ", ".join(mates[:6]) + (", ..." if len(mates) > 6 else "")
 
-        return NotConnectedError(
+        return errors.NotConnectedError(
             f"no constraints lead from {body_R} to {body_I}: {body_R} is joined with [{assembly(body_R)}], "
             f"{body_I} with [{assembly(body_I)}]"
         )
@@ -398,7 +387,7 @@ def _check_unique(what: str, given: list[str]) -> None:
     """Raise ValueError for a name that is given twice (report 4.2, 4.4)."""
     if len(set(given)) < len(given):
         twice = next(name for name in given if given.count(name) > 1)
-        raise ValueError(f"the {what} name {quote(twice)} is given twice; names are unique in a model")
+        raise ValueError(f"the {what} name {errors.quote(twice)} is given twice; names are unique in a model")
 
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
@@ -427,3 +416,60 @@ def _get_content(value: Pose | Sigma | Joint | Mimic) -> object:
         return astuple(value)
     numbers = (value.axis, value.lower, value.upper, value.rate_limit, value.default, value.sigma)
     return (value.type, numbers, value.mimic) if value.is_movable else value.type
+
+
+# --- what changes from one model to another ---------------------------------------------------------------------------
+
+MIN_METERS = 1e-9
+MIN_RADIANS = 1e-9
+"""A pose that moved by less is equal within the rounding of a file."""
+
+
+def describe_changes(old: Model, new: Model) -> tuple[str, ...]:
+    """Return what is added, removed or changed, a line each; empty where both models give the same answers."""
+    bodies = [{each.name: each for each in model.bodies} for model in (old, new)]
+    lines = _list_additions("body", *bodies)
+    for name, before, after in _pair(*bodies):
+        frames = [{names.join(name, each.name): each for each in body} for body in (before, after)]
+        lines += _list_additions("frame", *frames)
+        for full, was, now in _pair(*frames):
+            lines += _compare_poses(f"frame {full}", was.pose, now.pose)
+            if was.sigma != now.sigma:
+                lines.append(f"frame {full} states another sigma")
+        if before.inertia != after.inertia:
+            lines.append(f"body {name} has another inertia")
+    constraints = [{each.name: each for each in model.constraints} for model in (old, new)]
+    lines += _list_additions("constraint", *constraints)
+    for name, first, second in _pair(*constraints):
+        if (first.from_, first.to) != (second.from_, second.to):
+            lines.append(
+                f"constraint {name} joins {second.from_} and {second.to}, it joined {first.from_} and {first.to}"
+            )
+        lines += _compare_poses(f"constraint {name}", first.pose, second.pose)
+        if first.sigma != second.sigma:
+            lines.append(f"constraint {name} states another sigma")
+        if first.joint != second.joint:
+            is_other = first.joint.type != second.joint.type
+            how = f"is {second.joint.type}, it was {first.joint.type}" if is_other else "has other numbers"
+            lines.append(f"the joint of constraint {name} {how}")
+    if old.root.name != new.root.name:
+        lines.append(f"the root body is {new.root.name}, it was {old.root.name}")
+    if not lines and old.revision != new.revision:
+        lines.append("descriptions or the order of what is listed")
+    return tuple(lines)
+
+
+def _list_additions(what: str, was: dict[str, T], now: dict[str, T]) -> list[str]:
+    lines = [f"{what} {name} is removed" for name in was if name not in now]
+    return lines + [f"{what} {name} is new" for name in now if name not in was]
+
+
+def _pair(was: dict[str, T], now: dict[str, T]) -> Iterator[tuple[str, T, T]]:
+    return ((name, was[name], each) for name, each in now.items() if name in was)
+
+
+def _compare_poses(what: str, old: Pose, new: Pose) -> list[str]:
+    meters, radians = old.distance(new)
+    if meters < MIN_METERS and radians < MIN_RADIANS:
+        return []
+    return [f"{what} moves by {meters * 1e3:.4g} mm and {math.degrees(radians):.4g} deg"]

@@ -54,17 +54,14 @@ def split(name: str) -> tuple[str, str]:
 
 def find_problem(name: str) -> str:
     """Return why a name of a body, frame or constraint is not allowed, "" if it is."""
-    if not name:
-        return "the name is empty"
-    if ":" in name:
-        return "a name has no colon: it divides body and frame in Body:Frame"
-    if len(name) > MAX_LENGTH:
-        return f"a name has at most {MAX_LENGTH} characters"
-    if any(character.isspace() for character in name):
-        return "a name has no white space"
-    if not name.isprintable():
-        return "a name has only printable characters"
-    return ""
+    faults = (
+        (not name, "the name is empty"),
+        (":" in name, "a name has no colon: it divides body and frame in Body:Frame"),
+        (len(name) > MAX_LENGTH, f"a name has at most {MAX_LENGTH} characters"),
+        (name.split() != [name], "a name has no white space"),
+        (not name.isprintable(), "a name has only printable characters"),
+    )
+    return next((text for is_wrong, text in faults if is_wrong), "")
 
 
 def find_body_problem(name: str) -> str:
@@ -77,7 +74,6 @@ MAX_LISTED = 12
 
 
 def format_first_location(place: Location) -> str:
-    """Return the location of the first of two definitions, for a message about the second."""
     return f" (first at {place})" if str(place) else ""
 
 

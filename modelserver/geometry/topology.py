@@ -145,14 +145,12 @@ class Topology:
 
     def find_shortest_path(self, body: str, target: str) -> tuple[Crossing, ...] | None:
         """Return the crossings of a shortest path from one body to another, None where there is none."""
-        if body == target:
-            return ()
         reached: dict[str, Crossing] = {}
-        for crossing in self.traverse_breadth_first(body):
+        for crossing in self.traverse_breadth_first(body) if body != target else ():
             reached[crossing.far_body] = crossing
             if crossing.far_body == target:
                 return tuple(reversed(_climb(reached, target)))
-        return None
+        return () if body == target else None
 
     def find_path_depth_first(self, body: str, frame: str, target: str) -> tuple[Crossing, ...] | None:
         """Return the path that the report's search finds (4.6.2), None where there is none.
@@ -362,7 +360,6 @@ class LoopMisclosure(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """Whether it closes within rounding."""
         return self.meters < EXACT_TOLERANCE and self.radians < EXACT_TOLERANCE
 
 

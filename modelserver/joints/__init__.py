@@ -83,7 +83,6 @@ class JointHistory:
         return tuple(self._coordinates)
 
     def coordinate(self, name: str) -> Coordinate:
-        """Return the coordinate of a name. Raises KeyError."""
         return self._coordinates[name]
 
     def update(self, sample: JointsSample, now: int) -> tuple[JointHistory, tuple[str, ...]]:
@@ -157,9 +156,8 @@ class JointHistory:
             is_older = known is not None and known.last >= utime
             if joint.position != joint.position or is_older or self._find_problem(joint):
                 continue
-            extended = self._get_track(joint.name, tracks).insert(utime, self._get_values(joint))
-            extended.source = sample.header.source
-            tracks[joint.name] = extended
+            track = tracks[joint.name] = self._get_track(joint.name, tracks).insert(utime, self._get_values(joint))
+            track.source = sample.header.source
         return self if tracks == self.tracks else self._replace_tracks(tracks)
 
     def _get_values(self, joint: JointSample) -> ReadingValues:

@@ -203,7 +203,6 @@ class JointTrack:
         return twin
 
     def is_too_old(self, utime: int) -> bool:
-        """Return whether a reading of this time is too old to be stored."""
         if not self._count:
             return False
         return self.last - utime > self._horizon or (self._count >= MAX_READINGS and utime < self.first)
@@ -286,10 +285,6 @@ class JointTrack:
             end = len(self._blocks[number].times)
         return number, bisect_right(self._blocks[number].times, utime, 0 if number else self._start, end) - 1
 
-    def _after(self, number: int, index: int) -> tuple[int, int]:
-        """Return block and index of the next reading."""
-        return (number, index + 1) if index + 1 < self._get_length(number) else (number + 1, 0)
-
     @property
     def newest(self) -> Reading:
         """The newest reading. Only when not empty."""
@@ -366,18 +361,14 @@ class JointTrack:
             raise TooNewError(
                 self._describe_span(utime, "after") + f"; joints are predicted {PREDICTION_LIMIT_S:g} s at most"
             )
-        rate = newest.rate
+        rate, rate_sigma0 = newest.rate, newest.rate_sigma
         limit = rate_limit if math.isfinite(rate_limit) and rate_limit > 0.0 else NAN
-        rate_sigma0 = newest.rate_sigma
         if rate != rate:
-            rate = self._slope() if slope is None else slope
-            if limit == limit:
-                # a rate of nan stays nan
-                rate = min(max(rate, -limit), limit) if rate == rate else rate
-            if rate != rate:
-                rate, rate_sigma0 = 0.0, limit
-            else:
-                rate_sigma0 = 0.1 * abs(rate)
+            rate, rate_sigma0 = self._slope() if slope is None else slope, NAN
+            if limit == limit and rate == rate:
+                rate = min(max(rate, -limit), limit)
+        if rate != rate:
+            rate, rate_sigma0 = 0.0, limit
         elif rate_sigma0 != rate_sigma0:
             rate_sigma0 = 0.1 * abs(rate)
         change = limit if limit == limit else max(2.0 * abs(rate), MIN_ACCELERATION)
@@ -408,7 +399,7 @@ class JointTrack:
         if self._count < 2:
             return None
         number, index = self._before(min(max(utime - 1, self.first), self.last - 1))
-        later, after = self._after(number, index)
+        later, after = (number, index + 1) if index + 1 < self._get_length(number) else (number + 1, 0)
         block, other = self._blocks[number], self._blocks[later]
         return ReadingPair(block.times[index], block.at(index), other.times[after], other.at(after))
 

@@ -7,5 +7,4 @@ of this package.
 """
 
 from modelserver.messages.events import *
-from modelserver.messages.generated import *
 from modelserver.messages.values import *

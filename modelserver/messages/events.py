@@ -2,53 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.earth import Origin
-from modelserver.messages.generated import (
-    AbsolutePoseSample,
-    Acknowledgement,
-    DynamicsReply,
-    ExplanationReply,
-    GetBodyFrameList,
-    GetBodyList,
-    GetDynamics,
-    GetExplanation,
-    GetHistory,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    GetTransformations,
-    GpsSample,
-    Health,
-    HistoryReply,
-    ImuSample,
-    JointsSample,
-    MeasurementSample,
-    Mode,
-    MotionReply,
-    NameListReply,
-    NavigationState,
-    Phase,
-    PublishDecisions,
-    RangeSample,
-    RelativePoseSample,
-    ReloadModel,
-    ReloadReply,
-    ReplyHeader,
-    RequestHeader,
-    SetFrame,
-    SetHTransform,
-    SetStateVector,
-    StateVectorReply,
-    SwitchMode,
-    TransformReply,
-    VehicleStatusSample,
-    WheelsSample,
-)
+from modelserver.messages.generated import *
 from modelserver.messages.values import NAN, PersistedState, PoseAnswer, PoseBatch
 
 Sample: TypeAlias = (
@@ -86,24 +45,6 @@ Request: TypeAlias = (
     | SetHTransform
 )
 
-CHANNEL_OF: Final[Mapping[type, str]] = {
-    GetTransformation: "PLATFORM_GET_TRANSFORMATION",
-    GetBodyList: "PLATFORM_GET_BODY_LIST",
-    GetBodyFrameList: "PLATFORM_GET_BODY_FRAME_LIST",
-    GetStateVector: "POSE_GET_STATE_VECTOR",
-    GetHTransform: "POSE_GET_H_TRANSFORM",
-    GetHistory: "POSE_GET_HISTORY",
-    GetTransformations: "PLATFORM_GET_TRANSFORMATIONS",
-    GetMotion: "PLATFORM_GET_MOTION",
-    GetExplanation: "PLATFORM_GET_EXPLANATION",
-    GetDynamics: "PLATFORM_GET_DYNAMICS",
-    ReloadModel: "PLATFORM_RELOAD_MODEL",
-    SetFrame: "PLATFORM_SET_FRAME",
-    SetStateVector: "POSE_SET_STATE_VECTOR",
-    SetHTransform: "POSE_SET_H_TRANSFORM",
-}
-"""The channel of each request type, without the vehicle's prefix."""
-
 
 class PoseBatchReply(NamedTuple):
     """One part of the answer to GetTransformations: pair number `pair`, from instant number `first` on.
@@ -131,6 +72,29 @@ Reply: TypeAlias = (
     | ReloadReply
     | Acknowledgement
 )
+
+_REQUESTS: Final[tuple[tuple[type[Request], str, Callable[[ReplyHeader], Reply]], ...]] = (
+    (GetTransformation, "PLATFORM_GET_TRANSFORMATION", TransformReply),
+    (GetBodyList, "PLATFORM_GET_BODY_LIST", NameListReply),
+    (GetBodyFrameList, "PLATFORM_GET_BODY_FRAME_LIST", NameListReply),
+    (GetStateVector, "POSE_GET_STATE_VECTOR", StateVectorReply),
+    (GetHTransform, "POSE_GET_H_TRANSFORM", TransformReply),
+    (GetHistory, "POSE_GET_HISTORY", HistoryReply),
+    (GetTransformations, "PLATFORM_GET_TRANSFORMATIONS", PoseBatchReply),
+    (GetMotion, "PLATFORM_GET_MOTION", MotionReply),
+    (GetExplanation, "PLATFORM_GET_EXPLANATION", ExplanationReply),
+    (GetDynamics, "PLATFORM_GET_DYNAMICS", DynamicsReply),
+    (ReloadModel, "PLATFORM_RELOAD_MODEL", ReloadReply),
+    (SetFrame, "PLATFORM_SET_FRAME", ReloadReply),
+    (SetStateVector, "POSE_SET_STATE_VECTOR", Acknowledgement),
+    (SetHTransform, "POSE_SET_H_TRANSFORM", Acknowledgement),
+)
+
+CHANNEL_OF: Final[Mapping[type, str]] = {kind: channel for kind, channel, _ in _REQUESTS}
+"""The channel of each request type, without the vehicle's prefix."""
+
+REPLY_OF: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {kind: reply for kind, _, reply in _REQUESTS}
+"""The reply type of each request type."""
 
 
 class SensorFinding(NamedTuple):

@@ -17,12 +17,13 @@ probability `limit_risk`. A relation within the vehicle has its own covariance a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from modelserver import messages
 from modelserver.errors import LimitError, QueryError, Status
 from modelserver.estimation.filter.protection_levels import (
     LEVEL_RISK,
@@ -34,46 +35,6 @@ from modelserver.estimation.filter.protection_levels import (
 from modelserver.estimation.history import History
 from modelserver.geometry import names
 from modelserver.geometry.parts import Body, BodyFrame
-from modelserver.messages import (
-    MAX_REQUEST_INSTANTS,
-    MET,
-    NAN,
-    Acknowledgement,
-    DynamicsReply,
-    Estimate,
-    ExplanationReply,
-    GetBodyFrameList,
-    GetBodyList,
-    GetDynamics,
-    GetExplanation,
-    GetHistory,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    GetTransformations,
-    HistoryReply,
-    Invalid,
-    MotionReply,
-    NameListReply,
-    PoseAnswer,
-    PoseBatch,
-    PoseBatchReply,
-    PoseDemand,
-    ReloadModel,
-    ReloadReply,
-    Reply,
-    ReplyHeader,
-    Request,
-    RequestHeader,
-    SetFrame,
-    SetHTransform,
-    SetStateVector,
-    StateVectorReply,
-    TimeQuery,
-    TransformReply,
-    Unmet,
-)
 from modelserver.query.batch import lookup_batch
 from modelserver.query.dynamics import compute_dynamics
 from modelserver.query.path import compute_motion, explain, find_provenance, lookup_path
@@ -84,135 +45,140 @@ class DeferredAnswer(NamedTuple):
     """A long answer that the server loop computes in steps and sends to the reply channel."""
 
     view: PlatformView
-    request: Request
+    request: messages.Request
     utime: int
 
-    def work(self) -> Steps[list[Reply]]:
+    def work(self) -> Steps[list[messages.Reply]]:
         """Compute the messages of the reply in steps; on a QueryError it is one error reply."""
         view, request, utime = self
         try:
             return (yield from _answer_in_steps(view, request, utime))
         except QueryError as error:
-            return [
-                make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
-            ]
+            return _explain_error(view, request, error, utime)
 
 
 _FRAME_FIELDS: Final[Mapping[type, tuple[str, ...]]] = {
-    GetTransformation: ("frame_of_interest", "frame_of_reference"),
-    GetMotion: ("frame_of_interest", "frame_of_reference", "expressed_in"),
-    GetExplanation: ("frame_of_interest", "frame_of_reference"),
-    GetTransformations: ("fixed_frame",),
-    GetDynamics: ("frame",),
+    messages.GetTransformation: ("frame_of_interest", "frame_of_reference"),
+    messages.GetMotion: ("frame_of_interest", "frame_of_reference", "expressed_in"),
+    messages.GetExplanation: ("frame_of_interest", "frame_of_reference"),
+    messages.GetTransformations: ("fixed_frame",),
+    messages.GetDynamics: ("frame",),
 }
 
 
-def complete_names(request: Request) -> Request:
+def complete_names(request: messages.Request) -> messages.Request:
     """Return a request with the full names of its frames, as `names.complete` does."""
     full: Any = request
     for field in _FRAME_FIELDS.get(type(request), ()):
         given = getattr(request, field)
         if ":" not in given:
             full = full._replace(**{field: names.complete(given)})
-    if isinstance(request, GetTransformations):
+    if isinstance(request, messages.GetTransformations):
         pairs = tuple([(names.complete(interest), names.complete(reference)) for interest, reference in request.pairs])
         full = full._replace(pairs=pairs)
     return full  # type: ignore[no-any-return]
 
 
-def effort_of(request: Request) -> float:
+def effort_of(request: messages.Request) -> float:
     """Return the computing effort of a request in units of a typical one (about 0.1 ms), from the request alone."""
-    if isinstance(request, GetTransformations):
+    if isinstance(request, messages.GetTransformations):
         return len(request.pairs) * (PAIR_EFFORT + INSTANT_EFFORT * len(request.at))
-    if isinstance(request, GetHistory):
+    if isinstance(request, messages.GetHistory):
         poses = (request.end_utime - request.start_utime) * 1e-6 * request.rate_hz
         # more than the limit, or non-finite: the reply is an error
         return 1.0 + POSE_EFFORT * poses if 0.0 < poses <= HISTORY_LIMIT else 1.0
-    if isinstance(request, GetDynamics):
+    if isinstance(request, messages.GetDynamics):
         return DYNAMICS_EFFORT
-    if isinstance(request, GetExplanation):
+    if isinstance(request, messages.GetExplanation):
         return EXPLANATION_EFFORT
     return DEMAND_EFFORT if any(getattr(request, "demand", ())) else 1.0
 
 
-def is_deferred(request: Request) -> bool:
-    """Return whether the answer to a request may take long, so that it is computed in steps."""
-    return type(request) in _DEFERRED_ANSWERS and effort_of(request) > DEFERRED_EFFORT
+def is_deferred(request: messages.Request) -> bool:
+    return type(request) in _LONG and effort_of(request) > DEFERRED_EFFORT
 
 
-def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Reply]:
+def compute_answer(view: PlatformView, request: messages.Request, utime: int) -> list[messages.Reply]:
     """Compute the messages of the reply to a request at `utime`; most types have one. Raises QueryError."""
-    header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
+    header = messages.ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
     match request:
-        case GetTransformation():  # the hot path
+        case messages.GetTransformation():  # the hot path
             interest, reference, time = request.frame_of_interest, request.frame_of_reference, request.time
             answer = view.transformation(interest, reference, time, utime)
-            return [TransformReply(header, answer, *check_demand(view, answer, request.demand, time, utime))]
-        case GetStateVector(_, time, demand):
+            return [messages.TransformReply(header, answer, *check_demand(view, answer, request.demand, time, utime))]
+        case messages.GetStateVector(_, time, demand):
             answer = view.transformation(view.base_frame, names.WORLD_UTM, time, utime)
-            return [StateVectorReply(header, answer, *check_demand(view, answer, demand, time, utime))]
-        case GetHTransform(_, inverse, time, demand):
+            return [messages.StateVectorReply(header, answer, *check_demand(view, answer, demand, time, utime))]
+        case messages.GetHTransform(_, inverse, time, demand):
             ends = (names.WORLD_UTM, view.base_frame) if inverse else (view.base_frame, names.WORLD_UTM)
             answer = view.transformation(*ends, time, utime)
-            return [TransformReply(header, answer, *check_demand(view, answer, demand, time, utime))]
-        case GetMotion(_, interest, reference, expressed_in, time):
-            return [MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, utime))]
-        case GetExplanation(_, interest, reference, time):
-            return [ExplanationReply(header, explain(view, interest, reference, time, utime))]
-        case GetBodyList():
+            return [messages.TransformReply(header, answer, *check_demand(view, answer, demand, time, utime))]
+        case messages.GetMotion(_, interest, reference, expressed_in, time):
+            return [messages.MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, utime))]
+        case messages.GetExplanation(_, interest, reference, time):
+            return [messages.ExplanationReply(header, explain(view, interest, reference, time, utime))]
+        case messages.GetBodyList():
             return [_list_names(header, view.model.bodies)]
-        case GetBodyFrameList(_, body):
+        case messages.GetBodyFrameList(_, body):
             return [_list_names(header, view.model.body(body).frames)]
     return complete(_answer_in_steps(view, request, utime))
 
 
-def _list_names(header: ReplyHeader, parts: Sequence[Body | BodyFrame]) -> NameListReply:
-    return NameListReply(header, tuple(each.name for each in parts), tuple(each.description for each in parts))
+def _list_names(header: messages.ReplyHeader, parts: Sequence[Body | BodyFrame]) -> messages.NameListReply:
+    return messages.NameListReply(header, tuple(each.name for each in parts), tuple(each.description for each in parts))
 
 
-def _answer_in_steps(view: PlatformView, request: Request, utime: int) -> Steps[list[Reply]]:
-    header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
-    return (yield from _DEFERRED_ANSWERS[type(request)](view, request, header))
+def _answer_in_steps(view: PlatformView, request: messages.Request, utime: int) -> Steps[list[messages.Reply]]:
+    header = messages.ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
+    match request:
+        case messages.GetHistory(_, start, end, rate_hz):
+            return [messages.HistoryReply(header, (yield from view.vehicle_history(start, end, rate_hz)))]
+        case messages.GetDynamics():
+            return [messages.DynamicsReply(header, (yield from compute_dynamics(view, request, utime)))]
+        case messages.GetTransformations():
+            return (yield from _get_transformations(view, request, header))
+    raise TypeError(f"{type(request).__name__} has no answer by the view")
 
 
-def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Reply]:
+def compute_replies(view: PlatformView, request: messages.Request, utime: int) -> list[messages.Reply]:
     """Compute the messages of the reply to a request at `utime`; on a QueryError it is one error reply."""
     try:
         return compute_answer(view, request, utime)
     except QueryError as error:
-        return [make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
+        return _explain_error(view, request, error, utime)
+
+
+def _explain_error(
+    view: PlatformView, request: messages.Request, error: QueryError, utime: int
+) -> list[messages.Reply]:
+    return [make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
 
 
 def make_error_reply(
     view: PlatformView,
-    kind: type[Request],
-    header: RequestHeader,
+    kind: type[messages.Request],
+    header: messages.RequestHeader,
     status: Status,
     message: str,
     utime: int,
     nearest: tuple[str, ...] = (),
-) -> Reply:
-    return _REPLY_TYPES[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
+) -> messages.Reply:
+    return messages.REPLY_OF[kind](
+        messages.ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision)
+    )
 
 
-def _get_history(view: PlatformView, request: GetHistory, header: ReplyHeader) -> Steps[list[Reply]]:
-    span = (request.start_utime, request.end_utime, request.rate_hz)
-    return [HistoryReply(header, (yield from view.vehicle_history(*span)))]
-
-
-def _get_dynamics(view: PlatformView, request: GetDynamics, header: ReplyHeader) -> Steps[list[Reply]]:
-    return [DynamicsReply(header, (yield from compute_dynamics(view, request, header.utime)))]
-
-
-def _get_transformations(view: PlatformView, request: GetTransformations, header: ReplyHeader) -> Steps[list[Reply]]:
+def _get_transformations(
+    view: PlatformView, request: messages.GetTransformations, header: messages.ReplyHeader
+) -> Steps[list[messages.Reply]]:
     wanted = len(request.pairs) * len(request.at)
-    if wanted > MAX_REQUEST_INSTANTS:
+    if wanted > messages.MAX_REQUEST_INSTANTS:
         raise LimitError(
             f"{len(request.pairs)} pairs at {len(request.at)} instants are {wanted} poses; a request may have at most "
-            f"{MAX_REQUEST_INSTANTS}; split it into several requests"
+            f"{messages.MAX_REQUEST_INSTANTS}; split it into several requests"
         )
     utimes = np.array(request.at, dtype=np.int64)
-    parts: list[tuple[int, int, PoseBatch]] = []
+    parts: list[tuple[int, int, messages.PoseBatch]] = []
     for number, (interest, reference) in enumerate(request.pairs):
         poses = yield from lookup_batch(
             view,
@@ -229,7 +195,7 @@ def _get_transformations(view: PlatformView, request: GetTransformations, header
         parts += [(number, first, poses.slice_instants(first, first + most)) for first in starts]
         yield
     return [
-        PoseBatchReply(header, part, len(parts), number, first, poses)
+        messages.PoseBatchReply(header, part, len(parts), number, first, poses)
         for part, (number, first, poses) in enumerate(parts)
     ]
 
@@ -250,39 +216,18 @@ demand, of dynamics."""
 DEFERRED_EFFORT: Final = 11.0
 """Effort beyond which an answer is deferred: about a millisecond."""
 
-_DEFERRED_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Steps[list[Reply]]]]] = {
-    GetHistory: _get_history,
-    GetTransformations: _get_transformations,
-    GetDynamics: _get_dynamics,
-}
-
-_REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
-    GetTransformation: TransformReply,
-    GetBodyList: NameListReply,
-    GetBodyFrameList: NameListReply,
-    GetStateVector: StateVectorReply,
-    GetHTransform: TransformReply,
-    GetHistory: HistoryReply,
-    GetTransformations: PoseBatchReply,
-    GetMotion: MotionReply,
-    GetExplanation: ExplanationReply,
-    GetDynamics: DynamicsReply,
-    ReloadModel: ReloadReply,
-    SetFrame: ReloadReply,
-    SetStateVector: Acknowledgement,
-    SetHTransform: Acknowledgement,
-}
+_LONG: Final = frozenset((messages.GetHistory, messages.GetTransformations, messages.GetDynamics))
 
 
 # --- demands ----------------------------------------------------------------------------------------------------------
 
 
 def check_demand(
-    view: PlatformView, answer: PoseAnswer, demand: PoseDemand, time: TimeQuery, now: int
-) -> tuple[Unmet, str]:
+    view: PlatformView, answer: messages.PoseAnswer, demand: messages.PoseDemand, time: messages.TimeQuery, now: int
+) -> tuple[messages.Unmet, str]:
     """Return what an answer of `view` at `now` lacks of a demand, with the reason. Raises as `transformation`."""
     if not any(demand):
-        return MET, ""
+        return messages.MET, ""
     ends = (answer.transformation.frame_of_interest, answer.transformation.frame_of_reference)
     steps = lookup_path(view, *ends, time, now).steps
     found = [data for step in steps if (data := find_provenance(view, step)) is not None]
@@ -297,7 +242,7 @@ def check_demand(
     return find_unmet(answer, demand, estimate.horizontal_allowance, estimate.limit_risk, age)
 
 
-def _enlarge(estimate: Estimate) -> Estimate:
+def _enlarge(estimate: messages.Estimate) -> messages.Estimate:
     """Return an estimate with the covariance that its levels are computed from, nan where they are not known."""
     if estimate.covariance is None:
         return estimate
@@ -312,8 +257,12 @@ def _enlarge(estimate: Estimate) -> Estimate:
 
 
 def find_unmet(
-    answer: PoseAnswer, demand: PoseDemand, allowance: float = 0.0, limit_risk: float = 0.0, age: float = 0.0
-) -> tuple[Unmet, str]:
+    answer: messages.PoseAnswer,
+    demand: messages.PoseDemand,
+    allowance: float = 0.0,
+    limit_risk: float = 0.0,
+    age: float = 0.0,
+) -> tuple[messages.Unmet, str]:
     """Return what an answer lacks of a demand, and what, by how much and what was asked for in words.
 
     Parameters
@@ -329,10 +278,10 @@ def find_unmet(
     age
         Of the newest data, seconds; infinite where there are none.
     """
-    unmet, reasons = MET, list[str]()
+    unmet, reasons = messages.MET, list[str]()
     most = 1.0 - demand.min_integrity if demand.min_integrity else LIMIT_RISK
     P = answer.transformation.covariance
-    sigma = heading_sigma = NAN
+    sigma = heading_sigma = messages.NAN
     if P is not None:
         sigma, heading_sigma = math.sqrt(compute_longest_variance(P)), math.sqrt(max(float(P[5, 5]), 0.0))
     limits = (demand.max_horizontal - allowance, demand.max_heading)
@@ -340,24 +289,24 @@ def find_unmet(
     k, k_heading = compute_factors(most)
     # the comparisons are false for nan
     if demand.max_horizontal and not risk <= most:
-        unmet |= Unmet.HORIZONTAL
+        unmet |= messages.Unmet.HORIZONTAL
         reasons.append(_describe_error("horizontal", allowance + k * sigma, demand.max_horizontal, "m", most))
     if demand.max_heading and not heading_risk <= most:
-        unmet |= Unmet.HEADING
+        unmet |= messages.Unmet.HEADING
         bound, limit = (math.degrees(min(each, math.pi)) for each in (k_heading * heading_sigma, demand.max_heading))
         reasons.append(_describe_error("heading", bound, limit, "deg", most))
     if demand.max_age and not age <= demand.max_age:
-        unmet |= Unmet.AGE
+        unmet |= messages.Unmet.AGE
         known = f"the newest data are {age:.4g} s old" if age < math.inf else "a joint on the path has no data"
         reasons.append(f"{known}, asked for: at most {demand.max_age:.4g} s")
     if demand.min_integrity:
-        invalid = Invalid(answer.transformation.invalid_reasons)
+        invalid = messages.Invalid(answer.transformation.invalid_reasons)
         has_limits = demand.max_horizontal or demand.max_heading
         if invalid:
-            unmet |= Unmet.NOT_VALID
+            unmet |= messages.Unmet.NOT_VALID
             reasons.append(f"the pose is not valid: {invalid.explain()}")
         elif not limit_risk <= (1.0 if has_limits else most):
-            unmet |= Unmet.NOT_VALID
+            unmet |= messages.Unmet.NOT_VALID
             known = "is not known" if math.isnan(limit_risk) else f"is {limit_risk:.2g}, asked for: at most {most:.2g}"
             reasons.append(f"the probability of an error beyond the configured limits {known}")
     return unmet, "; ".join(reasons)

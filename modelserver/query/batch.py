@@ -252,7 +252,6 @@ def odom_drift_factors(view: PlatformView, since: Estimate, rows: BatchState) ->
 
 
 def is_different_origin(a: Origin | None, b: Origin | None) -> bool:
-    """Return whether two origins differ."""
     # nearly always identical, which is ten times cheaper to test
     return a is not b and a != b
 

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from modelserver import messages
 from modelserver.dynamics import Dynamics, MassUncertainty, Stability, assess_stability
 from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import ForbiddenError, LimitError, ModelServerError, NoPoseError
@@ -23,15 +24,6 @@ from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
 from modelserver.geometry.topology import Edge, EdgeKind
-from modelserver.messages import (
-    DynamicsAnswer,
-    GetDynamics,
-    Invalid,
-    MotionAnswer,
-    Policy,
-    StabilityHealth,
-    TimeQuery,
-)
 from modelserver.query.path import compute_motion
 from modelserver.query.view import JointReadings, PlatformView, Steps
 from modelserver.transforms import so3
@@ -65,8 +57,8 @@ class MotionState(NamedTuple):
     v: Array
     a: Array
     sigma: Array
-    invalid: Invalid
-    motion: MotionAnswer | None = None
+    invalid: messages.Invalid
+    motion: messages.MotionAnswer | None = None
 
 
 @lru_cache(maxsize=4)
@@ -94,7 +86,7 @@ def check_dynamics(model: Model, base_frame: str, settings: DynamicsSettings) ->
         assess_stability(dynamics, dynamics.default_position, settings.contacts)
 
 
-def compute_dynamics(view: PlatformView, request: GetDynamics, now: int) -> Steps[DynamicsAnswer]:
+def compute_dynamics(view: PlatformView, request: messages.GetDynamics, now: int) -> Steps[messages.DynamicsAnswer]:
     """Return in steps the dynamics at a time. Raises a QueryError for each cause."""
     if view.dynamics is None:
         raise ForbiddenError(
@@ -124,7 +116,7 @@ def compute_dynamics(view: PlatformView, request: GetDynamics, now: int) -> Step
         equations = (*(tuple(each[shown].tolist()) for each in vectors), tuple(D.ravel().tolist()))
     position, rate, gravity_row, bias_row, mass_matrix = equations
     covariance = None if P is None or not np.isfinite(P).all() else tuple(P.ravel().tolist())
-    return DynamicsAnswer(
+    return messages.DynamicsAnswer(
         state.utime,
         state.invalid,
         frame,
@@ -141,13 +133,13 @@ def compute_dynamics(view: PlatformView, request: GetDynamics, now: int) -> Step
     )
 
 
-def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
+def compute_stability(view: PlatformView, now: int) -> messages.StabilityHealth:
     """Return the tip-over stability now; without a localizer as on level ground. Raises QueryError for each cause."""
     settings = view.dynamics
     if settings is None or not settings.contacts:
-        return StabilityHealth()
+        return messages.StabilityHealth()
     known = prepare(view.model, view.base_frame, settings)
-    latest = TimeQuery()
+    latest = messages.TimeQuery()
     tilt = acceleration = None
     if view.localizer is None:
         state = _lookup_fixed(view, known, latest, now)
@@ -175,7 +167,7 @@ def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
         acceleration_covariance=acceleration,
     )
     static, moving = found.static, found.dynamic
-    return StabilityHealth(
+    return messages.StabilityHealth(
         static.margin,
         static.sigma,
         math.nan if moving is None else moving.margin,
@@ -186,18 +178,18 @@ def compute_stability(view: PlatformView, now: int) -> StabilityHealth:
     )
 
 
-def find_stability(view: PlatformView, now: int) -> tuple[StabilityHealth, str]:
+def find_stability(view: PlatformView, now: int) -> tuple[messages.StabilityHealth, str]:
     """Return the tip-over stability now, and the warning about it; empty for none. An error becomes the warning."""
     try:
         found = compute_stability(view, now)
     except NoPoseError:
         # the report has the reason already
-        return StabilityHealth(), ""
+        return messages.StabilityHealth(), ""
     except ModelServerError as error:
-        return StabilityHealth(), f"the tip-over margin is not known: {error}"
+        return messages.StabilityHealth(), f"the tip-over margin is not known: {error}"
     except Exception as error:
         # a fault of the engine must not stop the ticks
-        return StabilityHealth(), f"the tip-over margin cannot be computed: {type(error).__name__}: {error}"
+        return messages.StabilityHealth(), f"the tip-over margin cannot be computed: {type(error).__name__}: {error}"
     for name, margin in (("static", found.margin), ("dynamic", found.dynamic_margin)):
         if margin < found.limit:
             text = "the vehicle tips" if margin < 0.0 else "it is close to tipping"
@@ -206,17 +198,17 @@ def find_stability(view: PlatformView, now: int) -> tuple[StabilityHealth, str]:
     return found, ""
 
 
-def _lookup_fixed(view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int) -> MotionState:
+def _lookup_fixed(view: PlatformView, known: VehicleDynamics, time: messages.TimeQuery, now: int) -> MotionState:
     utime, joints = view.lookup_joints(known.joints, time, now)
     return _collect(view, known, utime, joints)
 
 
 def _lookup_floating(
-    view: PlatformView, known: VehicleDynamics, time: TimeQuery, now: int, world: str = names.WORLD_ENU
+    view: PlatformView, known: VehicleDynamics, time: messages.TimeQuery, now: int, world: str = names.WORLD_ENU
 ) -> MotionState:
     estimate, joints = view.lookup_vehicle_and_joints(known.joints, time, now)
-    has_time = bool(time.at) and time.policy is not Policy.LATEST
-    at = TimeQuery(estimate.utime, time.policy if has_time else Policy.PREDICTED)
+    has_time = bool(time.at) and time.policy is not messages.Policy.LATEST
+    at = messages.TimeQuery(estimate.utime, time.policy if has_time else messages.Policy.PREDICTED)
     motion = compute_motion(view, view.base_frame, world, "", at, now)
     state = _collect(view, known, estimate.utime, joints)
     X = motion.pose.transformation.pose
@@ -227,7 +219,7 @@ def _lookup_floating(
     state.q[:6] = (*X.xyz, *phi)
     state.v[:6] = (*motion.velocity, *rate)
     state.a[:6] = (*motion.acceleration, *compute_turn_rate(phi, change))
-    invalid = state.invalid | Invalid(motion.pose.transformation.invalid_reasons) | estimate.invalid
+    invalid = state.invalid | messages.Invalid(motion.pose.transformation.invalid_reasons) | estimate.invalid
     return state._replace(invalid=invalid, motion=motion)
 
 
@@ -243,4 +235,4 @@ def _collect(view: PlatformView, known: VehicleDynamics, utime: int, joints: Joi
             for name, reading in zip(drive.names, readings, strict=True):
                 at = column[name]
                 q[at], v[at], sigma[at] = reading.position, reading.rate, reading.sigma
-    return MotionState(utime, q, v, a, sigma, joints.invalid | (view.invalid & Invalid.CLOCK_STEPPED))
+    return MotionState(utime, q, v, a, sigma, joints.invalid | (view.invalid & messages.Invalid.CLOCK_STEPPED))

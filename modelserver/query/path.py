@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from modelserver import messages
 from modelserver.errors import NoPoseError
 from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
@@ -23,19 +24,6 @@ from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.topology import Edge, EdgeKind
 from modelserver.joints import MAX_CLOCK_LEAD_S
 from modelserver.joints.track import MAX_GAP_S, Provenance, Reading
-from modelserver.messages import (
-    NAN,
-    NO_FLAGS,
-    VALID,
-    EdgeReport,
-    Estimate,
-    Explanation,
-    Invalid,
-    MotionAnswer,
-    Policy,
-    Quality,
-    TimeQuery,
-)
 from modelserver.query.view import (
     ODOM_INVALID,
     WORLD_FRAMES,
@@ -62,7 +50,7 @@ class PathStep(NamedTuple):
     factor: Array | None
     source: tuple[Hashable, ...]
     readings: tuple[Reading, ...] = ()
-    estimate: Estimate | None = None
+    estimate: messages.Estimate | None = None
 
     @property
     def link(self) -> ChainLink:
@@ -75,8 +63,8 @@ class PathState(NamedTuple):
 
     utime: int
     steps: tuple[PathStep, ...]
-    invalid: Invalid = VALID
-    quality: Quality = NO_FLAGS
+    invalid: messages.Invalid = messages.VALID
+    quality: messages.Quality = messages.NO_FLAGS
 
     @property
     def links(self) -> list[ChainLink]:
@@ -84,9 +72,9 @@ class PathState(NamedTuple):
 
 
 _PROVENANCE_OF_FLAG = (
-    (Quality.PREDICTED, Provenance.PREDICTED),
-    (Quality.HELD, Provenance.HELD),
-    (Quality.INTERPOLATED, Provenance.INTERPOLATED),
+    (messages.Quality.PREDICTED, Provenance.PREDICTED),
+    (messages.Quality.HELD, Provenance.HELD),
+    (messages.Quality.INTERPOLATED, Provenance.INTERPOLATED),
 )
 
 
@@ -101,7 +89,7 @@ def find_provenance(view: PlatformView, step: PathStep) -> tuple[Provenance, int
     return max(each.provenance for each in step.readings), min(each.stamp for each in step.readings)
 
 
-def lookup_path(view: PlatformView, interest: str, reference: str, time: TimeQuery, now: int) -> PathState:
+def lookup_path(view: PlatformView, interest: str, reference: str, time: messages.TimeQuery, now: int) -> PathState:
     """Return the path from one frame to another at a time. Raises QueryError as `PlatformView.transformation`."""
     of_world = [frame for frame in (interest, reference) if frame in WORLD_FRAMES]
     if not of_world:
@@ -134,7 +122,7 @@ def lookup_path(view: PlatformView, interest: str, reference: str, time: TimeQue
 
 def _build_path_state(utime: int, steps: list[PathStep], path: KinematicPath, joints: JointReadings) -> PathState:
     invalid = joints.invalid
-    quality = joints.quality | (Quality.LOOP if path.is_in_loop else NO_FLAGS)
+    quality = joints.quality | (messages.Quality.LOOP if path.is_in_loop else messages.NO_FLAGS)
     for step in steps:
         if step.estimate is not None:
             invalid |= step.estimate.invalid if is_absolute(step.edge.name) else step.estimate.invalid & ODOM_INVALID
@@ -142,7 +130,7 @@ def _build_path_state(utime: int, steps: list[PathStep], path: KinematicPath, jo
     return PathState(utime, tuple(steps), invalid, quality)
 
 
-def _vehicle_step(world: str, estimate: Estimate, forward: bool) -> PathStep:
+def _vehicle_step(world: str, estimate: messages.Estimate, forward: bool) -> PathStep:
     X_WB = get_vehicle_pose(world, estimate)
     numbers = estimate.odom_covariance if world == names.ODOM else estimate.covariance
     factor = None if numbers is None else chain.factor(np.array(numbers).reshape(6, 6))
@@ -171,8 +159,8 @@ _STEP = 1e-4
 
 
 def compute_motion(
-    view: PlatformView, interest: str, reference: str, expressed_in: str, time: TimeQuery, now: int = 0
-) -> MotionAnswer:
+    view: PlatformView, interest: str, reference: str, expressed_in: str, time: messages.TimeQuery, now: int = 0
+) -> messages.MotionAnswer:
     """Return the velocity and acceleration of `interest` relative to `reference`, as observed in `reference`.
 
     Vectors are along the axes of `expressed_in`, empty for the frame of reference. Raises QueryError as
@@ -183,7 +171,12 @@ def compute_motion(
     motions: list[RigidMotion] = []
     uncertain: list[ChainLink] = []
     for step in path.steps:
-        each, factor = _step_motion(view, step)
+        if step.estimate is not None:
+            each, factor = _vehicle_motion(view, step.X_FT, step.estimate)
+        elif step.edge.joint is not None:
+            each, factor = _joint_motion(view, step, step.edge.joint)
+        else:
+            each, factor = RigidMotion(step.X_FT), _EXACT
         motions.append(each)
         # the vehicle has one motion, in whichever world it is expressed
         source = step.source if step.estimate is None else (EdgeKind.VEHICLE,)
@@ -193,8 +186,8 @@ def compute_motion(
     R = so3.IDENTITY
     axes = expressed_in or reference
     if axes != reference:
-        has_time = bool(time.at) and time.policy is not Policy.LATEST
-        at = TimeQuery(path.utime, time.policy if has_time else Policy.PREDICTED)
+        has_time = bool(time.at) and time.policy is not messages.Policy.LATEST
+        at = messages.TimeQuery(path.utime, time.policy if has_time else messages.Policy.PREDICTED)
         turned = view.transformation(reference, axes, at, now)
         R = turned.transformation.pose.wxyz
         # an invalid rotation makes the vectors invalid
@@ -202,22 +195,18 @@ def compute_motion(
             transformation=answer.transformation.with_invalid_reasons(turned.transformation.invalid_reasons),
             quality=answer.quality | turned.quality,
         )
-    covariance = chain.covariance(uncertain)
-    if covariance is not None and axes != reference:
+    covariances = [chain.covariance(uncertain), second]
+    if axes != reference:
         turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
-        covariance = turn @ covariance @ turn.T
-    if second is not None and axes != reference:
-        turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
-        second = turn @ second @ turn.T
-    return MotionAnswer(
+        covariances = [None if P is None else turn @ P @ turn.T for P in covariances]
+    return messages.MotionAnswer(
         answer,
         axes,
         so3.rotate(R, moved.velocity),
         so3.rotate(R, moved.angular_velocity),
         so3.rotate(R, moved.acceleration),
         so3.rotate(R, moved.angular_acceleration),
-        None if covariance is None else tuple(covariance.ravel().tolist()),
-        None if second is None else tuple(second.ravel().tolist()),
+        *(None if P is None else tuple(P.ravel().tolist()) for P in covariances),
     )
 
 
@@ -256,7 +245,7 @@ def _get_acceleration_covariance(
     return np.asarray(J.T @ own @ J)
 
 
-def _get_vehicle_covariance(view: PlatformView, X_WB: Pose, estimate: Estimate) -> Array | None:
+def _get_vehicle_covariance(view: PlatformView, X_WB: Pose, estimate: messages.Estimate) -> Array | None:
     """Return the covariance of the vehicle's own accelerations along the world's axes; None where it is not known."""
     own, turning = estimate.motion, view.history.angular_acceleration(estimate.utime)
     if own is None or turning is None or math.isnan(own.acceleration_sigma + turning[1]):
@@ -269,21 +258,12 @@ def _get_vehicle_covariance(view: PlatformView, X_WB: Pose, estimate: Estimate) 
     return np.asarray(turn @ C @ turn.T)
 
 
-def _step_motion(view: PlatformView, step: PathStep) -> tuple[RigidMotion, Array | None]:
-    """Return the motion of a step's far end in its near end, and the factor of that velocity's covariance."""
-    if step.estimate is not None:
-        return _vehicle_motion(view, step.X_FT, step.estimate)
-    if step.edge.joint is None:
-        return RigidMotion(step.X_FT), _EXACT
-    return _joint_motion(view, step, step.edge.joint)
-
-
 def _joint_motion(view: PlatformView, step: PathStep, joint: Joint) -> tuple[RigidMotion, Array | None]:
     drive = view.model.drives[step.edge.name]
     position, rates, changes, sigmas = [], [], [], []
     for name, reading in zip(drive.names, step.readings, strict=True):
         track = view.joints.tracks.get(name)
-        rate, change = reading.rate, NAN
+        rate, change = reading.rate, messages.NAN
         if reading.provenance is Provenance.DEFAULT:
             rate = change = 0.0
         elif track is not None:
@@ -314,7 +294,7 @@ def _multiply_known(J: Array, rates: Array) -> Array:
     return np.asarray(np.where(J == 0.0, 0.0, J * rates).sum(axis=1))
 
 
-def _vehicle_motion(view: PlatformView, X_WB: Pose, estimate: Estimate) -> tuple[RigidMotion, Array | None]:
+def _vehicle_motion(view: PlatformView, X_WB: Pose, estimate: messages.Estimate) -> tuple[RigidMotion, Array | None]:
     own = estimate.motion
     if own is None:
         raise NoPoseError(
@@ -343,10 +323,10 @@ _EXACT = np.zeros((6, 1))
 
 # --- explanation ------------------------------------------------------------------------------------------------------
 
-_ZERO = np.zeros((6, 1))
 
-
-def explain(view: PlatformView, interest: str, reference: str, time: TimeQuery, now: int) -> Explanation:
+def explain(
+    view: PlatformView, interest: str, reference: str, time: messages.TimeQuery, now: int
+) -> messages.Explanation:
     """Return where a frame is in another, with each edge of the path.
 
     A share is that of the trace of the position's, and of the rotation's, covariance. An edge without a sigma has none,
@@ -355,34 +335,26 @@ def explain(view: PlatformView, interest: str, reference: str, time: TimeQuery, 
     answer = view.transformation(interest, reference, time, now)
     path = lookup_path(view, interest, reference, time, now)
     known = [
-        link._replace(factor=np.zeros((6, 1)) if link.factor is None else link.factor, source=(number,))
+        link._replace(factor=_EXACT if link.factor is None else link.factor, source=(number,))
         for number, link in enumerate(path.links)
     ]
     shares = chain.contributions(known) or {}
     traces = []
     for link in known:
         share = shares[link.source]
-        large_angle = shares.get((*link.source, chain.LARGE_ANGLE), _ZERO)
+        large_angle = shares.get((*link.source, chain.LARGE_ANGLE), _EXACT)
         traces.append((float(np.sum(share[:3] ** 2) + np.sum(large_angle**2)), float(np.sum(share[3:] ** 2))))
-    position, rotation = (sum(each[side] for each in traces) for side in (0, 1))
-    return Explanation(
-        answer,
-        tuple(
-            _build_edge_report(
-                view, step, (_share(trace[0], position, step), _share(trace[1], rotation, step)), time, now
-            )
-            for step, trace in zip(path.steps, traces, strict=True)
-        ),
+    of_edges = np.array(traces).reshape(-1, 2)
+    whole = of_edges.sum(axis=0)
+    of_edges /= np.where(whole > 0.0, whole, 1.0)
+    of_edges[[step.factor is None for step in path.steps]] = messages.NAN
+    edges = zip(path.steps, of_edges.tolist(), strict=True)
+    return messages.Explanation(
+        answer, tuple(_build_edge_report(view, step, share, time, now) for step, share in edges)
     )
 
 
-def _share(own: float, whole: float, step: PathStep) -> float:
-    if step.factor is None:
-        return NAN
-    return own / whole if whole > 0.0 else 0.0
-
-
-def _describe_warning(view: PlatformView, step: PathStep, time: TimeQuery, now: int) -> str:
+def _describe_warning(view: PlatformView, step: PathStep, time: messages.TimeQuery, now: int) -> str:
     """Return the warnings of a joint's position as text; see `lookup_joints` for the flags."""
     edge = step.edge
     assert edge.joint is not None
@@ -392,7 +364,7 @@ def _describe_warning(view: PlatformView, step: PathStep, time: TimeQuery, now: 
         stated = view.model.joints[leader].joint.default
         warnings.append("not received: at its default" if stated else "not received, and no default is stated")
     received = [each for each in step.readings if each.provenance is not Provenance.DEFAULT]
-    latest = now and (not time.at or time.policy is Policy.LATEST)
+    latest = now and (not time.at or time.policy is messages.Policy.LATEST)
     gap = max((max(each.gap, (now - each.stamp) * 1e-6 if latest else 0.0) for each in received), default=0.0)
     if gap > MAX_GAP_S:
         warnings.append(f"silent for {gap:.1f} s")
@@ -413,8 +385,8 @@ def _describe_source(view: PlatformView, leader: str, step: PathStep) -> str:
 
 
 def _build_edge_report(
-    view: PlatformView, step: PathStep, shares: tuple[float, float], time: TimeQuery, now: int
-) -> EdgeReport:
+    view: PlatformView, step: PathStep, shares: list[float], time: messages.TimeQuery, now: int
+) -> messages.EdgeReport:
     edge = step.edge
     X = step.X_FT if edge.forward else step.X_FT.inverse()
     provenance, stamp, source, warning = "fixed", 0, "", ""
@@ -425,22 +397,20 @@ def _build_edge_report(
     elif step.readings:
         source = _describe_source(view, view.model.drives[edge.name].leader, step)
         warning = _describe_warning(view, step, time, now)
-    constraint = None
-    if edge.kind in (EdgeKind.CONSTRAINT, EdgeKind.JOINT):
-        constraint = next(each for each in view.model.constraints if each.name == edge.name)
-    return EdgeReport(
+    ends = (edge.name.partition(":")[0], edge.name)
+    if edge.kind is EdgeKind.VEHICLE:
+        ends = (edge.name, view.rolling_frame)
+    elif edge.kind is not EdgeKind.FRAME:
+        ends = next((each.from_, each.to) for each in view.model.constraints if each.name == edge.name)
+    return messages.EdgeReport(
         kind=edge.kind.value,
         name=edge.name,
         forward=edge.forward,
-        ends=(constraint.from_, constraint.to)
-        if constraint is not None
-        else (edge.name, view.rolling_frame)
-        if edge.kind is EdgeKind.VEHICLE
-        else (edge.name.partition(":")[0], edge.name),
+        ends=ends,
         pose=X,
         provenance=provenance,
         stamp=stamp,
-        age=(now - stamp) * 1e-6 if stamp and now else NAN,
+        age=(now - stamp) * 1e-6 if stamp and now else messages.NAN,
         source=source,
         coordinates=tuple(reading.position for reading in step.readings),
         position_share=shares[0],

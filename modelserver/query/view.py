@@ -22,19 +22,8 @@ from typing import Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
+from modelserver import errors
 from modelserver.dynamics.stability import DynamicsSettings
-from modelserver.errors import (
-    LimitError,
-    MalformedRequestError,
-    NoPoseError,
-    NotConnectedError,
-    QueryError,
-    TooNewError,
-    TooOldError,
-    UnknownFrameError,
-    find_nearest_names,
-    quote,
-)
 from modelserver.estimation.history import History, Localizer, restamp
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates
@@ -150,7 +139,7 @@ def lookup_joints(
             track = tracks.get(name) if interpolates else None
             try:
                 found = () if track is None else (track.interpolate(utime),)
-            except (TooOldError, TooNewError):
+            except (errors.TooOldError, errors.TooNewError):
                 found = ()
             if not found:
                 found = (_reading(name, drive, model, joints, utime, policy),)
@@ -201,7 +190,7 @@ def _reading(name: str, drive: JointDrive, model: Model, joints: JointHistory, u
         if policy is Policy.PREDICTED and utime > track.last:
             return track.predict(utime, joints.coordinate(name).rate_limit)
         return track.interpolate(utime)
-    except (TooOldError, TooNewError) as error:
+    except (errors.TooOldError, errors.TooNewError) as error:
         raise type(error)(f"joint {name}: {error}") from None
 
 
@@ -245,9 +234,9 @@ def is_absolute(frame: str) -> bool:
 def check_not_reserved(frame: str) -> None:
     """Raise UnknownFrameError for a frame of the bodies World and Odom that does not exist."""
     if frame.partition(":")[0] in names.RESERVED_BODIES:
-        raise UnknownFrameError(
-            f"there is no frame {quote(frame)}; the world frames are {', '.join(sorted(WORLD_FRAMES))}",
-            find_nearest_names(frame, WORLD_FRAMES),
+        raise errors.UnknownFrameError(
+            f"there is no frame {errors.quote(frame)}; the world frames are {', '.join(sorted(WORLD_FRAMES))}",
+            errors.find_nearest_names(frame, WORLD_FRAMES),
         )
 
 
@@ -262,7 +251,7 @@ def get_vehicle_pose(world: str, estimate: Estimate) -> Pose:
     """Return the rolling frame's pose in a world frame. Raises NoPoseError."""
     pose = find_vehicle_pose(world, estimate)
     if pose is None:
-        raise NoPoseError(f"the vehicle's pose in {world} is not known yet: {estimate.invalid.explain()}")
+        raise errors.NoPoseError(f"the vehicle's pose in {world} is not known yet: {estimate.invalid.explain()}")
     return pose
 
 
@@ -324,7 +313,7 @@ class PlatformView(NamedTuple):
                 # constant in time: no stamp
                 return PoseAnswer(rigid)
             path = model.get_kinematic_path(frame_of_interest, frame_of_reference)
-        except QueryError:
+        except errors.QueryError:
             check_not_reserved(frame_of_interest)
             check_not_reserved(frame_of_reference)
             raise
@@ -355,8 +344,8 @@ class PlatformView(NamedTuple):
         check_not_reserved(frame)
         try:
             return self.model.get_kinematic_path(frame, self.rolling_frame)
-        except NotConnectedError as error:
-            raise NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
+        except errors.NotConnectedError as error:
+            raise errors.NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
 
     def lookup_joints(self, path: KinematicPath, time: TimeQuery, now: int) -> tuple[int, JointReadings]:
         """Return time and positions of the joints of a path; the latest time is one that all joints have reached."""
@@ -367,7 +356,7 @@ class PlatformView(NamedTuple):
         utime = min(track.last for _, track in tracks) if tracks else now
         try:
             return utime, lookup_joints(path, self.model, self.joints, utime, Policy.INTERPOLATED, now)
-        except TooOldError as error:
+        except errors.TooOldError as error:
             raise self._no_common_time_error(tracks, error) from None
 
     def lookup_vehicle_and_joints(
@@ -388,12 +377,14 @@ class PlatformView(NamedTuple):
                 if stale not in newest.invalid:
                     newest = replace(newest, invalid=newest.invalid | stale)
             return newest, lookup_joints(path, self.model, self.joints, newest.utime, Policy.INTERPOLATED, now)
-        except TooOldError as error:
+        except errors.TooOldError as error:
             raise self._no_common_time_error(tracks, error) from None
 
-    def _no_common_time_error(self, tracks: list[tuple[str, JointTrack]], error: TooOldError) -> TooOldError:
+    def _no_common_time_error(
+        self, tracks: list[tuple[str, JointTrack]], error: errors.TooOldError
+    ) -> errors.TooOldError:
         name, track = min(tracks, key=lambda each: each[1].last)
-        return TooOldError(
+        return errors.TooOldError(
             f"no time is covered by all joints and the vehicle: joint {name} was received last at {track.last}. "
             f"{error}. Query with a time and policy HELD, or check the driver of the joint"
         )
@@ -405,12 +396,12 @@ class PlatformView(NamedTuple):
         for too many poses, NoPoseError.
         """
         if not (rate_hz > 0.0 and rate_hz < 1e6):
-            raise MalformedRequestError(f"rate_hz is above 0 and below 1e6, got {rate_hz}")
+            raise errors.MalformedRequestError(f"rate_hz is above 0 and below 1e6, got {rate_hz}")
         if end_utime < start_utime:
-            raise MalformedRequestError(f"the range ends ({end_utime}) before it starts ({start_utime})")
+            raise errors.MalformedRequestError(f"the range ends ({end_utime}) before it starts ({start_utime})")
         count = int((end_utime - start_utime) * 1e-6 * rate_hz + 1e-9) + 1
         if count > HISTORY_LIMIT:
-            raise LimitError(
+            raise errors.LimitError(
                 f"{count} poses were requested; at most {HISTORY_LIMIT} are allowed in one reply. Split the request."
             )
         if self.localizer is None or not len(self.history):
@@ -443,7 +434,7 @@ class PlatformView(NamedTuple):
             return restamp(held, time.at, Quality.HELD, since)
         if time.policy is Policy.PREDICTED and time.at > self.history.last:
             if time.at > self.history.last + PREDICTION_LIMIT_S * 1e6:
-                raise TooNewError(
+                raise errors.TooNewError(
                     f"{time.at} is {(time.at - self.history.last) / 1e6:.3f} s after the newest sample "
                     f"({self.history.last}); poses are predicted {PREDICTION_LIMIT_S:g} s ahead at most"
                 )
@@ -464,7 +455,7 @@ class PlatformView(NamedTuple):
                 if ends
                 else None
             )
-        except QueryError:
+        except errors.QueryError:
             return True
         if len(ends) < 2 and (not len(self.history) or utime > self.history.last):
             return False
@@ -575,13 +566,13 @@ class PlatformView(NamedTuple):
             level,
         )
 
-    def no_pose_error(self) -> NoPoseError:
+    def no_pose_error(self) -> errors.NoPoseError:
         """Return the error that explains why there is no pose in the world."""
         if self.localizer is None:
-            return NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
+            return errors.NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
         # at time 0 every sample is of a later time, as after a step of the clock
         invalid = self.localizer.estimate(0).invalid & ~Invalid.CLOCK_STEPPED
-        return NoPoseError(f"the vehicle's pose is not known yet: {invalid.explain() or 'no sensor sample yet'}")
+        return errors.NoPoseError(f"the vehicle's pose is not known yet: {invalid.explain() or 'no sensor sample yet'}")
 
 
 _ZERO = np.zeros((6, 6))

@@ -2,7 +2,7 @@
 
 A bus has an inbox for samples, one for requests, `publish` and `wait`. Handlers run only while an inbox is drained.
 
-- Samples and requests have a receiver each (`wire.receiver`), so that a flood of requests cannot delay samples in a
+- Samples and requests have a receiver each (`wire.provider`), so that a flood of requests cannot delay samples in a
   shared queue.
 - Multicast membership survives a network interface that goes down and up again. LCM joins the group once; the kernel
   drops the membership with the interface. It delivers a group's packets to every socket bound to their port as long as
@@ -17,37 +17,32 @@ import contextlib
 import errno
 import logging
 import math
-import re
 import select
 import socket
-import struct
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
 from modelserver.server.clock import FakeClock
-from modelserver.wire.provider import open_lcm, resolve_url
-from modelserver.wire.receiver import MESSAGE_OVERHEAD_BYTES, Message, Receiver, Sender, open_receiver
+from modelserver.wire import provider
 
 log = logging.getLogger(__name__)
 
 RENEW_S: Final = 1.0
 """Period of renewing the membership: one system call."""
 
-_GROUP: Final = re.compile(r"udpm://(\d{1,3}(?:\.\d{1,3}){3})(?::\d+)?(?:\?.*)?\Z")
-
 
 class MulticastMembership:
     """Membership in the multicast group of an LCM URL; without effect for other providers."""
 
     def __init__(self, url: str):
-        found = _GROUP.match(url)
         self._request = b""
-        if found:
+        address = provider.parse_udp_address(url)
+        if address is not None and address.group in url:
             # the interface is that of the group's route, as for LCM
             with contextlib.suppress(OSError):  # no address: LCM reports it
-                self._request = struct.pack("=4s4s", socket.inet_aton(found[1]), socket.inet_aton("0.0.0.0"))
+                self._request = socket.inet_aton(address.group) + socket.inet_aton("0.0.0.0")
         self._socket: socket.socket | None = None
         self._joined = False
         self._has_warned = False
@@ -93,7 +88,7 @@ MAX_SAMPLE_BYTES: Final = 1 << 20
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Longest messages that are received: a message of 15 MB would cost several ticks before it is rejected."""
 
-Handler: TypeAlias = Callable[[str, bytes, Sender], None]
+Handler: TypeAlias = Callable[[str, bytes, provider.Sender], None]
 """Channel, data, and who has sent it."""
 
 Inboxes: TypeAlias = Literal["samples", "requests", "both"]
@@ -113,11 +108,11 @@ class ReceiverInbox:
     short, and all channels share it. Beyond these bytes they are dropped. 0: they wait in the receive buffer.
     """
 
-    def __init__(self, receiver: Receiver, queue_bytes: int = 0):
+    def __init__(self, receiver: provider.Receiver, queue_bytes: int = 0):
         self._receiver = receiver
         self._queue_bytes = queue_bytes
         self._handlers: dict[bytes, tuple[str, list[Handler]]] = {}
-        self._queue: deque[Message] = deque()
+        self._queue: deque[provider.Message] = deque()
         self._queued_bytes: dict[bytes, int] = {}
         self.fileno = receiver.fileno
         self.expected: int | None = None
@@ -125,7 +120,6 @@ class ReceiverInbox:
 
     @property
     def is_queueing(self) -> bool:
-        """Whether messages wait in the queue."""
         return bool(self._queue)
 
     def subscribe(self, channel: str, handler: Handler) -> None:
@@ -174,7 +168,7 @@ class ReceiverInbox:
         self._read_ahead()
         return limit
 
-    def _handle(self, message: Message | None) -> int:
+    def _handle(self, message: provider.Message | None) -> int:
         if message is None:
             return 0
         known = self._handlers.get(message[0])
@@ -184,9 +178,9 @@ class ReceiverInbox:
                 handler(channel, message[1], message[2])
         return 1
 
-    def _pop(self) -> Message:
+    def _pop(self) -> provider.Message:
         message = self._queue.popleft()
-        self._queued_bytes[message[0]] -= len(message[1]) + MESSAGE_OVERHEAD_BYTES
+        self._queued_bytes[message[0]] -= len(message[1]) + provider.MESSAGE_OVERHEAD_BYTES
         return message
 
     def _read_ahead(self) -> None:
@@ -195,7 +189,7 @@ class ReceiverInbox:
             message = self._receiver.receive()
             if message is None:
                 return
-            size = self._queued_bytes.get(message[0], 0) + len(message[1]) + MESSAGE_OVERHEAD_BYTES
+            size = self._queued_bytes.get(message[0], 0) + len(message[1]) + provider.MESSAGE_OVERHEAD_BYTES
             if size <= self._queue_bytes:
                 self._queued_bytes[message[0]] = size
                 self._queue.append(message)
@@ -205,10 +199,10 @@ class LcmBus:
     """Bus on LCM. Make it after forking, never before: liblcm may have a thread of its own."""
 
     def __init__(self, url: str = ""):
-        self.url = resolve_url(url)
-        self.publish = open_lcm(self.url).publish
-        self.sensors = ReceiverInbox(open_receiver(self.url, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
-        self.requests = ReceiverInbox(open_receiver(self.url, MAX_REQUEST_BYTES))
+        self.url = provider.resolve_url(url)
+        self.publish = provider.open_lcm(self.url).publish
+        self.sensors = ReceiverInbox(provider.open_receiver(self.url, MAX_SAMPLE_BYTES), SENSOR_QUEUE_BYTES)
+        self.requests = ReceiverInbox(provider.open_receiver(self.url, MAX_REQUEST_BYTES))
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)
@@ -252,14 +246,12 @@ class FakeInbox:
     def __init__(self, clock: FakeClock) -> None:
         self._clock = clock
         self._handlers: dict[str, list[Handler]] = {}
-        self._queue: deque[tuple[str, bytes, Sender]] = deque()
+        self._queue: deque[tuple[str, bytes, provider.Sender]] = deque()
 
     def subscribe(self, channel: str, handler: Handler) -> None:
-        """Call `handler` with every message of exactly `channel`."""
         self._handlers.setdefault(channel, []).append(handler)
 
-    def put(self, channel: str, data: bytes, sender: Sender = None) -> None:
-        """Queue a message for the subscribers of its channel."""
+    def put(self, channel: str, data: bytes, sender: provider.Sender = None) -> None:
         if channel in self._handlers:
             self._queue.append((channel, data, sender))
 
@@ -280,7 +272,6 @@ class FakeInbox:
 
     @property
     def pending(self) -> int:
-        """Messages that wait to be drained."""
         return len(self._queue)
 
 

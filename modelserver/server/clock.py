@@ -50,11 +50,9 @@ class FakeClock(Clock):
         self._monotonic_ns, self._utime_ns = now.monotonic_ns, now.utime * 1000
 
     def monotonic_ns(self) -> int:
-        """Return nanoseconds."""
         return self._monotonic_ns
 
     def utime(self) -> int:
-        """Return microseconds since the Unix epoch."""
         return self._utime_ns // 1000
 
     def now(self) -> Instant:

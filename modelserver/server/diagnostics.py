@@ -26,23 +26,17 @@ from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import BusError, WireError, quote
 from modelserver.messages import Gauges, Health
+from modelserver.server.log import RateLimiter
+from modelserver.wire import provider
 from modelserver.wire.channels import PROBE_CHANNEL, to_subscription_pattern
 from modelserver.wire.codec import decode
-from modelserver.wire.provider import (
-    RECEIVE_BUFFER_BYTES,
-    UdpAddress,
-    handle_message,
-    make_route_command,
-    open_lcm,
-    parse_udp_address,
-)
 
 if TYPE_CHECKING:
     import lcm
 
     from modelserver.server.bus import Inbox
     from modelserver.server.clock import Clock
-    from modelserver.wire.receiver import Sender
+    from modelserver.wire.provider import Sender
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +74,6 @@ class Diagnosis:
 
 
 def get_worst_level(findings: Iterable[Diagnosis]) -> DiagnosisLevel:
-    """Return the highest level among findings; OK without any."""
     return max((each.level for each in findings), default=DiagnosisLevel.OK)
 
 
@@ -136,7 +129,7 @@ class BusFacts:
     """
 
     url: str
-    address: UdpAddress | None
+    address: provider.UdpAddress | None
     interface: NetworkInterface | None = None
     interfaces: tuple[NetworkInterface, ...] = ()
     delivered: bool | None = None
@@ -157,14 +150,14 @@ def evaluate_bus(facts: BusFacts) -> tuple[Diagnosis, ...]:
     )
 
 
-def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
+def _check_route(facts: BusFacts, address: provider.UdpAddress) -> Diagnosis:
     subject = "multicast route"
     group, interface = address.group, facts.interface
     lo = next((each.name for each in facts.interfaces if each.loopback), "lo")
     outward = next((each.name for each in facts.interfaces if each.up and each.multicast and not each.loopback), "")
-    by_lo = f"sudo ip link set {lo} up multicast on && sudo {make_route_command(group, lo)}"
+    by_lo = f"sudo ip link set {lo} up multicast on && sudo {provider.make_route_command(group, lo)}"
     if interface is None:
-        command = by_lo if address.ttl == 0 or not outward else f"sudo {make_route_command(group, outward)}"
+        command = by_lo if address.ttl == 0 or not outward else f"sudo {provider.make_route_command(group, outward)}"
         why = "LCM cannot be joined, so nothing is received or published"
         return Diagnosis(ERROR, subject, f"there is none to {group}", why, command)
     if not interface.name:
@@ -176,12 +169,12 @@ def _check_route(facts: BusFacts, address: UdpAddress) -> Diagnosis:
     if address.ttl > 0 and interface.loopback:
         why = f"the URL has ttl={address.ttl}, but no other machine receives anything"
         flush = f"sudo ip route flush match {group} dev {lo}"
-        command = f"sudo {make_route_command(group, outward)}" if outward else flush
+        command = f"sudo {provider.make_route_command(group, outward)}" if outward else flush
         return Diagnosis(WARNING, subject, observed, why, command)
     return Diagnosis(OK, subject, observed)
 
 
-def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+def _check_delivery(facts: BusFacts, address: provider.UdpAddress) -> Iterator[Diagnosis]:
     subject = "own message"
     if facts.delivered is None:
         return
@@ -191,17 +184,19 @@ def _check_delivery(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]
         yield Diagnosis(ERROR, subject, "it does not come back", why, command)
     elif facts.delivered_large is False:
         why = "long replies (histories, lists) are split into packets, and some of them are lost"
-        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+        command = _sysctl_command("net.core.rmem_max", provider.RECEIVE_BUFFER_BYTES)
         yield Diagnosis(WARNING, subject, "a short one comes back, one of 100 kB does not", why, command)
     else:
         yield Diagnosis(OK, subject, "it comes back")
 
 
-def _check_buffers(facts: BusFacts, address: UdpAddress) -> Iterator[Diagnosis]:
+def _check_buffers(facts: BusFacts, address: provider.UdpAddress) -> Iterator[Diagnosis]:
     subject = "receive buffer"
-    if facts.buffer is not None and facts.buffer < RECEIVE_BUFFER_BYTES:
-        observed = f"{_format_mib(facts.buffer)} of {_format_mib(RECEIVE_BUFFER_BYTES)} requested (net.core.rmem_max)"
-        command = _sysctl_command("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
+    if facts.buffer is not None and facts.buffer < provider.RECEIVE_BUFFER_BYTES:
+        observed = (
+            f"{_format_mib(facts.buffer)} of {_format_mib(provider.RECEIVE_BUFFER_BYTES)} requested (net.core.rmem_max)"
+        )
+        command = _sysctl_command("net.core.rmem_max", provider.RECEIVE_BUFFER_BYTES)
         yield Diagnosis(WARNING, subject, observed, "messages are lost in bursts", command)
     elif facts.buffer is not None:
         yield Diagnosis(OK, subject, f"{_format_mib(facts.buffer)}, as requested")
@@ -232,7 +227,10 @@ def read_gauges(queued: int, statm: Path = STATM) -> Gauges:
 
 def read_resident_bytes(statm: Path = STATM) -> int:
     """Read the resident memory of this process, bytes; 0 if unknown."""
-    return (_read_int(statm, 1) or 0) * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return int(statm.read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
 
 
 _SIOCGIFFLAGS: Final = 0x8913
@@ -256,7 +254,7 @@ def read_bus_facts(
 
     `probe_delivery` sends own messages and returns whether a short and a long one come back.
     """
-    address = parse_udp_address(url)
+    address = provider.parse_udp_address(url)
     if address is None:
         return BusFacts(url, None)
     interfaces = tuple(list_interfaces())
@@ -275,7 +273,7 @@ def read_bus_facts(
         interfaces,
         delivered,
         delivered_large,
-        get_granted_buffer(address.buffer or RECEIVE_BUFFER_BYTES),
+        get_granted_buffer(address.buffer),
         count_dropped(address.port, proc),
     )
 
@@ -294,7 +292,7 @@ def list_interfaces() -> Iterator[NetworkInterface]:
             )
 
 
-def find_interface(address: UdpAddress, proc: Path = PROC) -> str | None:
+def find_interface(address: provider.UdpAddress, proc: Path = PROC) -> str | None:
     """Return the interface of the route to a group; empty if unknown, None without a route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -331,7 +329,7 @@ def get_granted_buffer(size: int) -> int:
 def count_dropped(port: int, proc: Path = PROC) -> int | None:
     """Count the packets that the sockets on a port have lost, at most; None if unknown.
 
-    The kernel counts packets that a socket filter drops (`wire.socket_filter`) as drops of the socket, too. Its count
+    The kernel counts packets that a socket filter drops (`wire.provider`) as drops of the socket, too. Its count
     of full buffers has only lost ones, but those of all ports.
     """
     try:
@@ -342,13 +340,6 @@ def count_dropped(port: int, proc: Path = PROC) -> int | None:
     rows = [line.split() for line in lines]
     dropped = sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
     return min(dropped, int(dict(zip(names, values, strict=True)).get("RcvbufErrors", dropped)))
-
-
-def _read_int(path: Path, word: int = 0) -> int | None:
-    try:
-        return int(path.read_bytes().split()[word])
-    except (OSError, ValueError, IndexError):
-        return None
 
 
 _TIMEX: Final = struct.Struct("@I4li")
@@ -377,37 +368,27 @@ LARGE_BYTES: Final = 100_000
 
 def probe_delivery(url: str, seconds: float = ECHO_TIMEOUT_S) -> tuple[bool, bool]:
     """Return whether a short and a long own message come back. Raises BusError."""
-    sender, receiver = open_lcm(url), open_lcm(url)
-    echoed: list[bool] = []
-    for size in (8, LARGE_BYTES):
-        echoed.append(_is_echoed(sender, receiver, secrets.token_bytes(size), seconds if all(echoed) else 0.0))
-    return echoed[0], echoed[1]
+    sender, receiver = provider.open_lcm(url), provider.open_lcm(url)
+    is_short_echoed = _is_echoed(sender, receiver, 8, seconds)
+    return is_short_echoed, is_short_echoed and _is_echoed(sender, receiver, LARGE_BYTES, seconds)
 
 
-def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, payload: bytes, seconds: float) -> bool:
-    matches: list[bool] = []
+def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, size: int, seconds: float) -> bool:
+    payload, matches = secrets.token_bytes(size), list[bool]()
     subscription = receiver.subscribe(
         to_subscription_pattern(PROBE_CHANNEL), lambda _, data: matches.append(data == payload)
     )
-    deadline = time.monotonic() + seconds
+    send_at = time.monotonic()
+    deadline = send_at + seconds
     try:
-        while time.monotonic() < deadline:
-            sender.publish(PROBE_CHANNEL, payload)
-            if _receive_until(receiver, min(RESEND_S, seconds), lambda: any(matches)):
-                return True
+        while not any(matches) and (now := time.monotonic()) < deadline:
+            if now >= send_at:
+                sender.publish(PROBE_CHANNEL, payload)
+                send_at = now + RESEND_S
+            provider.handle_message(receiver, int((min(send_at, deadline) - now) * 1e3) + 1)
     finally:
         receiver.unsubscribe(subscription)
-    return False
-
-
-def _receive_until(receiver: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + seconds
-    while not until():
-        left = deadline - time.monotonic()
-        if left <= 0.0:
-            return False
-        handle_message(receiver, int(left * 1e3) + 1)
-    return True
+    return any(matches)
 
 
 SERVERS_SUBJECT: Final = "servers"
@@ -430,21 +411,15 @@ class DuplicateServerMonitor:
         self._set_warning = set_warning
         self._clock = clock
         self._received_ns = 0
-        self._window_ns = 0
-        self._reports = 0
+        self._limiter = RateLimiter(MAX_REPORTS_PER_S)
         self._warning = ""
 
     def subscribe(self, inbox: Inbox, prefix: str) -> None:
-        """Subscribe to the channel of the own health reports."""
         inbox.subscribe(f"{prefix}MODELSERVER_HEALTH", self.on_health)
 
     def on_health(self, channel: str, data: bytes, sender: Sender = None) -> None:
-        """Process a health report, the own one or another server's."""
         now = self._clock.monotonic_ns()
-        if now - self._window_ns >= 1_000_000_000:
-            self._window_ns, self._reports = now, 0
-        self._reports += 1
-        if self._reports > MAX_REPORTS_PER_S:
+        if not self._limiter.try_acquire(channel, now):
             return
         try:
             health: Health = decode("health_t", data)

@@ -13,43 +13,49 @@ gets no reply. A replay attack fails by its time stamp and counter.
 A flood of messages that are not used (undecodable bytes, a second publisher, unsigned commands) must not displace the
 vehicle's data in the journal, nor load the core. So `RejectionCounter` limits both by rate: `MAX_PER_SECOND` messages
 of a channel are recorded and counted one by one, the others are counted together once a second.
+
+Duplicate publisher (`PublisherConflictDetector`, pure of clocks; one mutable detector per channel):
+
+A channel has one publisher, named by header.source and counting its messages in header.seq. A conflict (a driver that
+was started twice, a recording played onto the live bus, a stranger) shows as
+
+- another source, or another sender's address, while the first one still publishes: a conflict at once;
+- outliers of the sequence: a seq far off the last one, or one already received with another utime. A single outlier may
+  be a restarted driver, a log that starts again, or a stray message. If the old sequence stays silent after it, the new
+  one owns the channel (restart). If the old sequence continues between outliers more than `MAX_OUTLIERS` times, two
+  publishers have the same source.
+
+Not a conflict: the same seq with the same utime (duplicate), a slightly lower seq not received yet (reordering), a
+slightly higher one (loss). A source with a constant seq does not count; a counting one beside it is a conflict. The
+first publisher keeps the channel until it has been silent for `PUBLISHER_TIMEOUT_NS`, and against its own source for
+`RESTART_GAP_INTERVALS` of its intervals. Two exceptions: a source named in the vehicle file takes the channel from one
+that is not; and a first one that is slower than any sensor loses it to a steady one (`CONTEST_NS`).
+
+Limits: without addresses, two publishers of the same source that count in step within the reordering window look like
+one. A stranger with the source of the sensor, that is first and as fast as one, keeps the channel.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Container, Hashable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
+from modelserver import messages
 from modelserver.core import COMMANDS as SIGNED_KINDS
 from modelserver.core import Instant
-from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
 from modelserver.errors import WireError, quote
-from modelserver.messages import (
-    CHANNEL_OF,
-    Denied,
-    Envelope,
-    Event,
-    HealthWarning,
-    JointsSample,
-    Rejected,
-    RelativePoseSample,
-    Request,
-    Sample,
-    SignedCommand,
-    SwitchMode,
-)
 from modelserver.named_tuples import new_tuple
 from modelserver.server.journal import JournalQueue
-from modelserver.server.log import RateLimitedLog
+from modelserver.server.log import SECOND_NS, RateLimitedLog, RateLimiter
 from modelserver.signing import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode, encode, read_request_header
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 _HEADER: Final = struct.Struct(">8sq24xqi")
 """Start of every sensor message: fingerprint, header.utime, header.seq, length of header.source, which follows.
@@ -65,9 +71,9 @@ class SensorChannel:
     type_name: str
     latency_us: int = 0
 
-    def decode(self, data: bytes) -> Sample | SwitchMode:
+    def decode(self, data: bytes) -> messages.Sample | messages.SwitchMode:
         """Decode a sample or a mode command. Raises WireError."""
-        value: Sample | SwitchMode = decode(self.type_name, data)
+        value: messages.Sample | messages.SwitchMode = decode(self.type_name, data)
         return subtract_latency(value, self.latency_us) if self.latency_us else value
 
 
@@ -85,10 +91,12 @@ def peek_sample_id(data: bytes, fingerprint: bytes) -> SampleId | None:
     return new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
 
 
-def subtract_latency(sample: Sample | SwitchMode, microseconds: int) -> Sample | SwitchMode:
+def subtract_latency(
+    sample: messages.Sample | messages.SwitchMode, microseconds: int
+) -> messages.Sample | messages.SwitchMode:
     """Subtract a latency from the measurement times of a sample; its host_utime stays."""
     header = replace(sample.header, utime=max(1, sample.header.utime - microseconds))
-    if isinstance(sample, RelativePoseSample):
+    if isinstance(sample, messages.RelativePoseSample):
         return replace(sample, header=header, since_utime=max(1, sample.since_utime - microseconds))
     return replace(sample, header=header)
 
@@ -99,26 +107,6 @@ MAX_PER_SECOND: Final = 8
 MAX_RECORDED_BYTES: Final = 512
 """Bytes that the journal records of a message that is not used."""
 
-SECOND_NS: Final = 1_000_000_000
-
-
-class RateLimiter:
-    """Limits events by name: `per_second` in each window of a second, which starts with the first event."""
-
-    def __init__(self, per_second: int = MAX_PER_SECOND):
-        self._per_second = per_second
-        self._windows: dict[Hashable, tuple[int, int]] = {}
-
-    def try_acquire(self, name: Hashable, now_ns: int) -> bool:
-        """Count an event at an instant (monotonic, ns); return whether it is within the limit."""
-        begin, used = self._windows.get(name, (now_ns, 0))
-        if now_ns - begin >= SECOND_NS:
-            begin, used = now_ns, 0
-        if used >= self._per_second:
-            return False
-        self._windows[name] = (begin, used + 1)
-        return True
-
 
 class RejectionCounter:
     """Counts rejected messages and records some of them, within rate limits. `step` passes an event to the core.
@@ -126,10 +114,10 @@ class RejectionCounter:
     Channels and reasons are the server's own, so memory is bounded.
     """
 
-    def __init__(self, step: Callable[[Rejected, Instant], None], journal: JournalQueue):
+    def __init__(self, step: Callable[[messages.Rejected, Instant], None], journal: JournalQueue):
         self._step = step
         self._journal = journal
-        self._records, self._events = RateLimiter(), RateLimiter()
+        self._records, self._events = RateLimiter(MAX_PER_SECOND), RateLimiter(MAX_PER_SECOND)
         self._waiting: dict[tuple[str, str], int] = {}
         self._flushed_ns = 0
 
@@ -142,7 +130,7 @@ class RejectionCounter:
         """Count a message in the core, at once or with the next `flush`; return whether at once."""
         key = (channel, reason)
         if self._events.try_acquire(key, now.monotonic_ns):
-            self._step(Rejected(channel, reason), now)
+            self._step(messages.Rejected(channel, reason), now)
             return True
         self._waiting[key] = self._waiting.get(key, 0) + 1
         return False
@@ -158,7 +146,165 @@ class RejectionCounter:
             return
         waiting, self._waiting, self._flushed_ns = self._waiting, {}, now.monotonic_ns
         for (channel, reason), count in waiting.items():
-            self._step(Rejected(channel, reason, count), now)
+            self._step(messages.Rejected(channel, reason, count), now)
+
+
+PUBLISHER_TIMEOUT_NS: Final = 3_000_000_000
+"""A publisher that is silent for so long has left: three times the period of the slowest sensor."""
+
+REORDER_WINDOW: Final = 64
+"""How far below the last seq a message may be out of sequence; so many headers are stored. A power of two."""
+
+LOSS_WINDOW: Final = 4096
+"""How far above the last seq a message may be after losses: more than the fastest sensor sends in the timeout."""
+
+CONFLICT_TIMEOUT_NS: Final = 10_000_000_000
+"""A conflict without another sample for so long has ended."""
+
+RESTART_GAP_NS: Final = 200_000_000
+RESTART_GAP_INTERVALS: Final = 5
+"""A sequence that is silent for so long, and for so many of its intervals, is replaced by another of its source."""
+
+MAX_OUTLIERS: Final = 2
+"""Outliers within `PUBLISHER_TIMEOUT_NS` between which the sequence may continue; more are another publisher's."""
+
+MAX_LOSS_FACTOR: Final = 8
+"""A seq that is ahead by more than this multiple of the messages expected in the elapsed time is an outlier."""
+
+SLOWEST_PERIOD_NS: Final = 1_500_000_000
+"""A longer gap has no sensor that works: receivers send once a second."""
+
+CONTEST_NS: Final = 5_000_000_000
+"""A publisher that has sent for so long without such a gap takes the channel from one with such gaps."""
+
+CONSTANT_SEQ_SAMPLES: Final = 3
+"""After so many samples with a constant seq a source does not count."""
+
+
+class SampleId(NamedTuple):
+    """The header fields that identify a sample and its publisher; they can be read without decoding the message."""
+
+    utime: int
+    source: str
+    seq: int
+
+
+_MASK: Final = REORDER_WINDOW - 1
+_NO_SAMPLE: Final = messages.SensorHeader(0, seq=-1 << 64)
+
+
+class PublisherConflictDetector:
+    """Detects a second publisher on one channel. Mutable: a new value per sample would cost more than the detection."""
+
+    __slots__ = (
+        "_continued", "_interval_ns", "_is_counting", "_last", "_last_ns", "_names", "_outlier_ns", "_outliers",
+        "_received", "_repeats", "_second", "_second_ns", "_second_since_ns", "_sender", "_slow_ns", "conflict_ns",
+        "other_source", "source",
+    )  # fmt: skip
+
+    def __init__(self, names: Container[str] = ()) -> None:
+        """`names`: the sources that the vehicle file names."""
+        self._names = names
+        self._sender: object = None
+        self._second: object = None
+        self._second_ns = self._second_since_ns = 0
+        self._slow_ns = -CONTEST_NS
+        self.source = ""
+        """Source that owns the channel."""
+        self.other_source = ""
+        """Source of the last conflicting sample; empty without one."""
+        self.conflict_ns = 0
+        """Receipt of the last conflicting sample, monotonic nanoseconds."""
+        self._received: list[messages.SensorHeader | SampleId] = []
+        self._last = self._last_ns = self._interval_ns = self._outlier_ns = self._repeats = self._outliers = 0
+        self._is_counting = self._continued = False
+        self._restart(_NO_SAMPLE, -PUBLISHER_TIMEOUT_NS - 1, None)
+
+    def is_conflicting(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object = None) -> bool:
+        """Process a sample; return whether it is from a second publisher. `sender`: its address, where it is known."""
+        seq = header.seq
+        ahead = seq - self._last
+        passed = now_ns - self._last_ns
+        if passed > PUBLISHER_TIMEOUT_NS:
+            self._restart(header, now_ns, sender)
+            return False
+        if header.source != self.source or sender != self._sender:
+            return self._check_other(header, now_ns, sender)
+        if passed > SLOWEST_PERIOD_NS:
+            self._slow_ns = now_ns
+        if 0 < ahead <= LOSS_WINDOW and self._repeats < CONSTANT_SEQ_SAMPLES:
+            if ahead > REORDER_WINDOW and ahead * self._interval_ns > MAX_LOSS_FACTOR * passed:
+                return self._check_outlier(header, now_ns)
+            self._is_counting = True
+        elif -REORDER_WINDOW < ahead <= 0 and self._is_counting:
+            known = self._received[seq & _MASK]
+            if known.seq == seq:
+                return known.utime != header.utime and self._check_outlier(header, now_ns)
+            # out of sequence: the last one stays the last
+            self._received[seq & _MASK] = header
+            return False
+        elif ahead:
+            return self._check_outlier(header, now_ns)
+        else:
+            self._repeats += 1
+        self._last = seq
+        self._last_ns = now_ns
+        self._interval_ns += (passed - self._interval_ns) >> 3
+        self._continued = True
+        self._received[seq & _MASK] = header
+        return False
+
+    def _check_outlier(self, header: messages.SensorHeader | SampleId, now_ns: int) -> bool:
+        """Process a sample that does not continue the sequence; return whether it is from a second publisher."""
+        if self._may_be_restarted(now_ns):
+            self._restart(header, now_ns, self._sender)
+            return False
+        if now_ns - self._outlier_ns > PUBLISHER_TIMEOUT_NS:
+            self._outliers = 0
+        # sooner than the next sample of any driver, restarted or not
+        early = 2 * (now_ns - max(self._last_ns, self._outlier_ns)) < self._interval_ns
+        self._outlier_ns = now_ns
+        if self._continued or early:
+            self._outliers += 1
+            self._continued = False
+        return self._outliers > MAX_OUTLIERS and self._set_conflict(header.source, now_ns)
+
+    def _check_other(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object) -> bool:
+        """Process a sample of another publisher; return whether it stays the second one."""
+        is_restarted = header.source == self.source and self._may_be_restarted(now_ns)
+        is_named = header.source in self._names and self.source not in self._names
+        if is_restarted or is_named or self._wins_contest((header.source, sender), now_ns):
+            if not is_restarted:
+                self._set_conflict(self.source, now_ns)
+            self._restart(header, now_ns, sender)
+            return False
+        return self._set_conflict(header.source, now_ns)
+
+    def _may_be_restarted(self, now_ns: int) -> bool:
+        return now_ns - self._last_ns > max(RESTART_GAP_NS, RESTART_GAP_INTERVALS * self._interval_ns)
+
+    def _wins_contest(self, second: object, now_ns: int) -> bool:
+        """Return whether a second publisher is steady where the first one is not."""
+        if second != self._second or now_ns - self._second_ns > SLOWEST_PERIOD_NS:
+            if self._second is not None and now_ns - self._second_ns <= SLOWEST_PERIOD_NS:
+                return False  # a third one
+            self._second, self._second_since_ns = second, now_ns
+        self._second_ns = now_ns
+        if now_ns - self._last_ns > SLOWEST_PERIOD_NS:
+            self._slow_ns = now_ns
+        return now_ns - self._second_since_ns >= CONTEST_NS and now_ns - self._slow_ns < CONTEST_NS
+
+    def _set_conflict(self, source: str, now_ns: int) -> bool:
+        self.other_source, self.conflict_ns = source, now_ns
+        return True
+
+    def _restart(self, header: messages.SensorHeader | SampleId, now_ns: int, sender: object) -> None:
+        self._sender, self._second, self._slow_ns = sender, None, now_ns - CONTEST_NS
+        self.source, self._last, self._last_ns = header.source, header.seq, now_ns
+        self._is_counting, self._repeats, self._outliers, self._continued = False, 0, 0, True
+        self._interval_ns = self._outlier_ns = 0
+        self._received = [_NO_SAMPLE] * REORDER_WINDOW
+        self._received[header.seq & _MASK] = header
 
 
 MAX_JOINTS: Final = 4096
@@ -187,7 +333,7 @@ class PublisherConflictMonitor:
 
     def __init__(
         self,
-        step: Callable[[Event, Instant], None],
+        step: Callable[[messages.Event, Instant], None],
         count: Callable[[str, str, Instant], object],
         log: RateLimitedLog,
         rule: str,
@@ -202,7 +348,6 @@ class PublisherConflictMonitor:
         self._active: dict[str, PublisherConflictDetector] = {}
 
     def make_detector(self, channel: str) -> PublisherConflictDetector:
-        """Return a detector for a channel, which prefers the sources that the vehicle file names for it."""
         return PublisherConflictDetector(self._names.get(channel, ()))
 
     def is_ignored(
@@ -231,7 +376,7 @@ class PublisherConflictMonitor:
 
         Returns the message without the joints that another publisher has; empty if it has them all. Raises WireError.
         """
-        sample: JointsSample = decode("joints_t", data)
+        sample: messages.JointsSample = decode("joints_t", data)
         joints = tuple([each for each in sample.joints if self._has_joint(channel, each.name, sample_id, now, sender)])
         if len(joints) == len(sample.joints):
             return data
@@ -254,7 +399,7 @@ class PublisherConflictMonitor:
             return
         self._active[subject] = detector
         text = self._format_warning(subject, detector, (now.utime - sample_id.utime) * 1e-6)
-        self._step(HealthWarning(f"channel {subject}", text), now)
+        self._step(messages.HealthWarning(f"channel {subject}", text), now)
         self._log.warning(f"{channel}:publisher_conflict", "%s", text)
 
     def clear_expired(self, now: Instant) -> None:
@@ -262,7 +407,7 @@ class PublisherConflictMonitor:
         for subject, detector in list(self._active.items()):
             if now.monotonic_ns - detector.conflict_ns > CONFLICT_TIMEOUT_NS:
                 del self._active[subject]
-                self._step(HealthWarning(f"channel {subject}"), now)
+                self._step(messages.HealthWarning(f"channel {subject}"), now)
 
     def _format_warning(self, subject: str, detector: PublisherConflictDetector, age: float) -> str:
         first, second = quote(detector.source, 40), quote(detector.other_source, 40)
@@ -274,7 +419,7 @@ class PublisherConflictMonitor:
         return f"{who} publish on {subject} at once, and {done}{old}: stop one of them"
 
 
-COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in SIGNED_KINDS}
+COMMANDS: Final[Mapping[str, type[messages.Request]]] = {messages.CHANNEL_OF[kind]: kind for kind in SIGNED_KINDS}
 """Request types that must be signed, by channel."""
 
 MODE_TYPE: Final = "localization_mode_t"
@@ -291,27 +436,27 @@ class CommandVerifier:
         self._started_ns = started_ns
         self._freshness = Freshness()
 
-    def verify(self, data: bytes, now: Instant) -> SignedCommand | Denied:
+    def verify(self, data: bytes, now: Instant) -> messages.SignedCommand | messages.Denied:
         """Return the command in an envelope, or why it is denied. Raises WireError if `data` is no envelope."""
-        envelope: Envelope = decode("signed_t", data)
+        envelope: messages.Envelope = decode("signed_t", data)
         key = self._keys.get(envelope.key_name)
         if key is None:
-            return Denied(f"{self._prefix}{SIGNED}", "unknown_key")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "unknown_key")
         if not has_valid_signature(key, self._prefix, envelope):
-            return Denied(f"{self._prefix}{SIGNED}", "bad_signature")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "bad_signature")
         # from here on the sender knows the key
         kind = COMMANDS.get(envelope.channel)
         if kind is None and (not self._mode_channel or envelope.channel != self._mode_channel):
-            return Denied(f"{self._prefix}{SIGNED}", "channel")
+            return messages.Denied(f"{self._prefix}{SIGNED}", "channel")
         source = f"{self._prefix}{envelope.channel}"
         header = read_request_header(envelope.payload) if kind is not None else None
         uptime_us = (now.monotonic_ns - self._started_ns) // 1000
         check = check_freshness(self._freshness, envelope, now.utime, uptime_us, self._window_us)
         self._freshness = check.freshness
         if check.reason:
-            return Denied(source, check.reason, check.message, kind, header)
+            return messages.Denied(source, check.reason, check.message, kind, header)
         try:
             command = decode(MODE_TYPE if kind is None else BY_NAME[envelope.channel].type_name, envelope.payload)
         except WireError as error:
-            return Denied(source, error.reason, str(error), kind, header, is_malformed=True)
-        return SignedCommand(command, envelope.sender)
+            return messages.Denied(source, error.reason, str(error), kind, header, is_malformed=True)
+        return messages.SignedCommand(command, envelope.sender)

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import TYPE_CHECKING, Final, TextIO
 
 if TYPE_CHECKING:
@@ -56,6 +56,27 @@ class RateLimitedLog:
         if trace:
             text += "".join(f"\n    {escape_text(line)}" for line in traceback.format_exc().splitlines())
         self._logger.log(level, "%s", text, stacklevel=3)
+
+
+SECOND_NS: Final = 1_000_000_000
+
+
+class RateLimiter:
+    """Limits events by name: `per_second` in each window of a second, which starts with the first event."""
+
+    def __init__(self, per_second: int):
+        self._per_second = per_second
+        self._windows: dict[Hashable, tuple[int, int]] = {}
+
+    def try_acquire(self, name: Hashable, now_ns: int) -> bool:
+        """Count an event at an instant (monotonic, ns); return whether it is within the limit."""
+        begin, used = self._windows.get(name, (now_ns, 0))
+        if now_ns - begin >= SECOND_NS:
+            begin, used = now_ns, 0
+        if used >= self._per_second:
+            return False
+        self._windows[name] = (begin, used + 1)
+        return True
 
 
 def escape_lines(text: str) -> str:

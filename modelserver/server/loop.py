@@ -47,7 +47,7 @@ from modelserver.server.requests import LATE_TICK_NS, RequestHandler
 from modelserver.wire.codec import encode, fingerprint_of, split_snapshot
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 if TYPE_CHECKING:
     from modelserver.server.vehicle import Vehicle

@@ -24,7 +24,7 @@ from modelserver import errors
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import CoreState, ModelLoaded
 from modelserver.geometry import Model
-from modelserver.geometry.difference import describe_changes
+from modelserver.geometry.model import describe_changes
 from modelserver.messages import Lifetime, LoadModel, ReloadModel, SetFrame
 from modelserver.server.added_frames import add_frames, change_frames
 from modelserver.server.persistence import AddedFramesStore
@@ -95,10 +95,7 @@ class GeometryReader:
         )
         thread.start()
 
-        def poll(state: CoreState) -> ModelLoaded | None:
-            return self._finish(command, found[0], state) if found else None
-
-        return poll
+        return lambda state: self._finish(command, found[0], state) if found else None
 
     def encode_snapshot(self, model: Model) -> bytes:
         """Return the snapshot of a geometry, which is encoded already if it was read again."""
@@ -106,7 +103,6 @@ class GeometryReader:
         return data if known is model else self._of_file.encode_snapshot(model)
 
     def close(self) -> None:
-        """End a reading in progress."""
         if self._process is not None:
             self._process.kill()
 

@@ -51,7 +51,7 @@ from modelserver.server.log import RateLimitedLog, escape_text
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
 from modelserver.wire.codec import CACHED_TYPE, StaticReplyCache, decode, encode, read_request_header
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 BURST_S: Final = 0.25
 """Burst of a client: what its rate permits in so many seconds."""

@@ -84,18 +84,14 @@ class Notifier:
         self._send, self._watchdog_ns, self._monotonic_ns = send, watchdog, monotonic_ns
         self._ping_due_ns = 0
         self._status, self._status_due_ns = "", 0
+        self.is_active = send is not None
+        """Whether there is a service manager."""
         self.is_ready = False
         """Whether READY was sent."""
 
     @classmethod
     def from_environment(cls) -> Notifier:
-        """Make the notifier that the environment of this process asks for."""
         return cls(open_manager_socket(), get_watchdog_ns())
-
-    @property
-    def is_active(self) -> bool:
-        """Whether there is a service manager."""
-        return self._send is not None
 
     def send(self, *lines: str) -> None:
         if self._send is not None:
@@ -137,7 +133,6 @@ class Notifier:
         self._status_due_ns = 0
 
     def notify_stopping(self) -> None:
-        """Report that the service stops."""
         self.send("STOPPING=1", "STATUS=stopping")
 
     def _set_status(self, status: str) -> None:
@@ -146,7 +141,6 @@ class Notifier:
 
 
 def _truncate(text: str) -> str:
-    """Escape and truncate a text to a status line."""
     text = escape_text(text)
     return text if len(text) <= MAX_STATUS_LENGTH else f"{text[: MAX_STATUS_LENGTH - 3]}..."
 

@@ -15,64 +15,20 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
+from modelserver import messages
 from modelserver.earth.geodesy import Geodesy
 from modelserver.geometry.model import Model
-from modelserver.messages import (
-    AbsolutePoseSample,
-    GpsSample,
-    ImuSample,
-    Origin,
-    RangeSample,
-    RelativePoseSample,
-    VehicleStatusSample,
-    WheelsSample,
-)
-from modelserver.simulation.gps import GpsModel, simulate_fixes
-from modelserver.simulation.imu import ImuModel, MagnetometerModel, TriadModel, simulate_imu
-from modelserver.simulation.noise import Run, Timing
-from modelserver.simulation.trajectory import (
-    DrivePhase,
-    MotionModel,
-    Trajectory,
-    TrajectoryMotion,
-    city,
-    figure_eight,
-    stationary,
-    straight,
-)
-from modelserver.simulation.wheels import EncoderModel, StatusModel, WheelsModel, simulate_status, simulate_wheels
+from modelserver.simulation.sensors import *
+from modelserver.simulation.trajectory import *
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3, conjugate, rotate
-
-__all__ = [
-    "DrivePhase",
-    "EncoderModel",
-    "Event",
-    "GpsModel",
-    "ImuModel",
-    "MagnetometerModel",
-    "MotionModel",
-    "Simulation",
-    "StatusModel",
-    "Timing",
-    "Trajectory",
-    "TrajectoryMotion",
-    "TriadModel",
-    "Truth",
-    "WheelsModel",
-    "city",
-    "figure_eight",
-    "stationary",
-    "straight",
-]
 
 START_UTIME = 1_750_000_000_000_000
 """Default start of a simulation: a whole second in June 2025."""
 
-Event = (
-    GpsSample | ImuSample | WheelsSample | VehicleStatusSample | AbsolutePoseSample | RelativePoseSample | RangeSample
-)
+Event: TypeAlias = messages.Sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +70,7 @@ class Simulation:
         model: Model,
         base_frame: str,
         trajectory: Trajectory,
-        origin: Origin,
+        origin: messages.Origin,
         *,
         gps_frame: str | None = None,
         imu_frame: str | None = None,

@@ -87,7 +87,6 @@ class TrajectoryMotion(NamedTuple):
     attitude: Attitude | None = None
 
     def orientation(self) -> Quaternion:
-        """Return the quaternion that rotates the vehicle's axes to east, north, up."""
         if self.attitude is not None:
             return self.attitude.wxyz
         half = self.yaw / 2.0
@@ -170,25 +169,17 @@ class Trajectory:
         """Of the phases so far: each follows from the one before it, and a device needs only those until now."""
 
     def at(self, t: float) -> TrajectoryMotion:
-        """Return the motion `t` seconds after the start."""
         piece, u = self._locate(t)
         return piece.at(u)
-
-    def higher_rates(self, t: float) -> Vector3:
-        """Return first and second rate of curvature (1/m/s, 1/m/s2) and jerk (m/s3, second rate of speed)."""
-        piece, u = self._locate(t)
-        return (
-            _evaluate(piece.curvature_rate, u),
-            _evaluate(piece.curvature_rate_rate, u),
-            _evaluate(piece.jerk, u),
-        )
 
     def _locate(self, t: float) -> tuple[_Piece, float]:
         """Return the phase at an instant, and the share of its duration that is over."""
         t = min(max(t, 0.0), self.duration)
         index = max(bisect_right(self._starts, t) - 1, 0)
         while len(self._pieces) <= index:
-            self._pieces.append(self._pieces[-1].continue_with(self._phases[len(self._pieces)]))
+            # from the values at u = 1
+            last, phase = self._pieces[-1], self._phases[len(self._pieces)]
+            self._pieces.append(_Piece(phase, last.last, last.knots[-1], sum(last.yaw), sum(last.distance)))
         return self._pieces[index], (t - self._starts[index]) / self._pieces[index].duration
 
 
@@ -213,17 +204,12 @@ class _Piece:
         self.speed, self.curvature = _ramp(before[0], phase.speed), _ramp(before[1], phase.curvature)
         self.yaw_rate = _trim(polynomial.polymul(self.speed, self.curvature))
         self.speed_rate, self.curvature_rate = derive(self.speed), derive(self.curvature)
-        self.jerk, self.curvature_rate_rate = derive(self.speed_rate), derive(self.curvature_rate)
         self.yaw_acceleration = derive(self.yaw_rate)
         self.yaw, self.distance = integrate(self.yaw_rate, yaw), integrate(self.speed, distance)
         steps = max(1, math.ceil(duration / _KNOT_SECONDS))
         self.knots = [start]
         for step in range(steps):
             self.knots.append(self._integrate(self.knots[-1], step / steps, 1.0 / steps))
-
-    def continue_with(self, phase: DrivePhase) -> _Piece:
-        # values at u = 1
-        return _Piece(phase, self.last, self.knots[-1], sum(self.yaw), sum(self.distance))
 
     def _integrate(self, start: tuple[float, float], u: float, share: float) -> tuple[float, float]:
         """Return the position reached from `start`, at share `u`, after a further share of the duration."""
@@ -329,24 +315,16 @@ def figure_eight(
     hold = _LOOP_ANGLE / (speed * curvature) - ramp
     if hold <= 0:
         raise ValueError(f"a loop of {radius:g} m at {speed:g} m/s is shorter than {ramp:g} s of steering")
-    # length of the straights for which the tangents at both ends of a loop meet in the crossing
-    probe = Trajectory(
-        (
-            DrivePhase(ramp, speed),
-            DrivePhase(ramp, curvature=curvature),
-            DrivePhase(hold),
-            DrivePhase(ramp, curvature=0.0),
-            DrivePhase(1.0, 0.0),
-        )
-    )
-    (x0, _, _), (x1, _, _) = probe.at(ramp).position, probe.at(3 * ramp + hold).position
-    half = (x0 - x1) / (1.0 + math.cos(_LOOP_ANGLE)) / speed
-    if half <= 0:
-        raise ValueError(f"ramp {ramp:g} s is too long for a loop of {radius:g} m at {speed:g} m/s")
 
     def loop(side: float) -> tuple[DrivePhase, ...]:
         return (DrivePhase(ramp, curvature=side * curvature), DrivePhase(hold), DrivePhase(ramp, curvature=0.0))
 
+    # length of the straights for which the tangents at both ends of a loop meet in the crossing
+    probe = Trajectory((DrivePhase(ramp, speed), *loop(1.0), DrivePhase(1.0, 0.0)))
+    (x0, _, _), (x1, _, _) = probe.at(ramp).position, probe.at(3 * ramp + hold).position
+    half = (x0 - x1) / (1.0 + math.cos(_LOOP_ANGLE)) / speed
+    if half <= 0:
+        raise ValueError(f"ramp {ramp:g} s is too long for a loop of {radius:g} m at {speed:g} m/s")
     lap = [DrivePhase(half), *loop(1.0), DrivePhase(2.0 * half), *loop(-1.0), DrivePhase(half)]
     halt = [DrivePhase(ramp, 0.0), DrivePhase(max(stop, 1.0))]
     if stop > 0 or reverse > 0:

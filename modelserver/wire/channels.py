@@ -42,7 +42,6 @@ class Channel:
 
 
 def _channels(use: ChannelUse, *rows: tuple[str, str, str, str]) -> tuple[Channel, ...]:
-    """Return channels of one purpose, from name, message type, rate and description."""
     return tuple(Channel(name, type_name, use, rate, about) for name, type_name, rate, about in rows)
 
 

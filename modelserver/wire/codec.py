@@ -32,7 +32,6 @@ _BY_VALUE: Final[Mapping[type, Codec]] = {codec.value: codec for codec in revers
 
 
 def get_type_names() -> tuple[str, ...]:
-    """Return the names of the wire types that can be decoded."""
     return tuple(_BY_TYPE_NAME)
 
 
@@ -42,7 +41,6 @@ def get_type_name(value_type: type) -> str:
 
 
 def fingerprint_of(type_name: str) -> bytes:
-    """Return the eight bytes that a message of a wire type begins with."""
     return _BY_TYPE_NAME[type_name].fingerprint
 
 

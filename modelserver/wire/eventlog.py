@@ -12,7 +12,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self, TypeAlias
 
 from modelserver.errors import RecordingError
@@ -134,7 +133,7 @@ class LogFile:
             raise RecordingError(f"{self.path}: not an LCM event log: no event in {self.size} bytes")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def _close(self) -> None:
@@ -142,17 +141,15 @@ class LogFile:
             self._data.close()
         self._data = b""
 
-    def __iter__(self) -> Iterator[LogEvent]:
-        return self.read_from(0)
-
-    def read_from(self, offset: int) -> Iterator[LogEvent]:
-        """Yield the events from an offset on, such as the `end` of one."""
+    def read_from(self, offset: int = 0) -> Iterator[LogEvent]:
         self.damage.clear()
         for each in scan(self._data, offset):
             if isinstance(each, LogEvent):
                 yield each
             else:
                 self.damage.append(each)
+
+    __iter__ = read_from
 
     @property
     def is_corrupt(self) -> bool:

@@ -1,8 +1,9 @@
 """Parts of messages between Python and wire: texts, numbers, poses, and their checks; the generated codec uses them.
 
-nan stands on the wire for what is None in Python. A check raises WireError `malformed`; data that end too early raise
-WireError `truncated` or struct.error. The values of pose_transform_t and pose_vector_t are transformations. The arrays
-of get_transformations_reply_t are on the wire as they are in memory.
+nan stands on the wire for what is None in Python. A check returns its value, or raises WireError `malformed`; data that
+end too early raise WireError `truncated` or struct.error. `pack_*` return bytes without the fingerprint, `unpack_*` and
+`read_*` the value that begins at `at` and where it ends, `skip_*` only that. The values of pose_transform_t and
+pose_vector_t are transformations. The arrays of get_transformations_reply_t are on the wire as they are in memory.
 """
 
 from __future__ import annotations
@@ -112,7 +113,6 @@ def read_partial(values: V) -> V | None:
 
 
 def check_finite(values: Sequence[float], what: str) -> tuple[float, ...]:
-    """Return numbers. Raises WireError where one is nan or infinite."""
     if not all(map(math.isfinite, values)):
         raise WireError("malformed", f"{what} has a number that is not finite")
     return tuple(values)
@@ -136,14 +136,12 @@ def check_unit_quaternion(values: Sequence[float], what: str) -> Quaternion:
 
 
 def check_name(value: str, what: str, most: int = MAX_NAME) -> str:
-    """Return a name. Raises WireError for an endless one."""
     if len(value) > most:
         raise WireError("malformed", f"{what} {quote(value, 40)} is longer than {most} characters")
     return value
 
 
 def read_enum(kind: type[E], value: int, what: str) -> E:
-    """Return the member of an enumeration. Raises WireError for a number it does not have."""
     found: E | None = _list_members(kind).get(value)
     if found is None:
         raise WireError("malformed", f"{what} {value} is not one of {[int(each) for each in kind]}")
@@ -157,14 +155,12 @@ def _list_members(kind: type[IntEnum]) -> Mapping[int, Any]:
 
 
 def read_word(words: Sequence[str], value: int, what: str) -> str:
-    """Return the word of a number. Raises WireError for a number that has none."""
     if not 0 <= value < len(words):
         raise WireError("malformed", f"{what} {value} is not one of 0 to {len(words) - 1}")
     return words[value]
 
 
 def check_utime(value: int, what: str = "utime") -> int:
-    """Return a time. Raises WireError for one that cannot be."""
     if not 0 <= value < MAX_UTIME:
         raise WireError("malformed", f"{what} {value} is no time in microseconds since 1970")
     return value
@@ -206,7 +202,6 @@ def read_text(data: bytes, at: int) -> tuple[str, int]:
 
 
 def check_end(data: bytes, end: int) -> None:
-    """Raise WireError where a message does not end where its bytes do."""
     if end != len(data):
         raise WireError("malformed", f"{len(data) - end} bytes too many at the end of a message")
 
@@ -215,13 +210,11 @@ def check_end(data: bytes, end: int) -> None:
 
 
 def check_count(count: int, what: str, most: int = 1 << 31, least: int = 0) -> None:
-    """Raise WireError for a count outside its range."""
     if not least <= count <= most:
         raise WireError("malformed", f"{what} is {least} to {most}, got {count}")
 
 
 def check_outgoing(count: int, most: int, what: str) -> None:
-    """Raise ValueError for more entries than a message may have."""
     if count > most:
         raise ValueError(f"{what}: {count} entries in one message; at most {most} can be sent")
 
@@ -249,7 +242,6 @@ def read_numbers(code: str, data: bytes, at: int, count: int) -> tuple[tuple[Any
 
 
 def read_bytes(data: bytes, at: int, count: int) -> tuple[bytes, int]:
-    """Return `count` bytes from `at` on, and their end. Raises WireError."""
     if at + count > len(data):
         raise WireError("truncated", f"{len(data)} bytes end within {count} bytes of payload")
     return data[at : at + count], at + count
@@ -305,14 +297,12 @@ def skip_nothing(data: bytes, at: int, nothing: bytes) -> int:
 
 
 def check_sample_utime(value: int, what: str) -> int:
-    """Return the time of a sample. Raises WireError for none."""
     if value <= 0:
         raise WireError("malformed", f"{what} {value} is no time: a sample or command needs one")
     return check_utime(value, what)
 
 
 def check_instants(values: Sequence[int], what: str) -> tuple[int, ...]:
-    """Return times. Raises WireError where one cannot be."""
     if values:
         check_utime(min(values), what)
         check_utime(max(values), what)
@@ -320,7 +310,6 @@ def check_instants(values: Sequence[int], what: str) -> tuple[int, ...]:
 
 
 def check_not_negative(value: int, what: str) -> int:
-    """Return a number that is not negative. Raises WireError for a negative one."""
     if value < 0:
         raise WireError("malformed", f"{what} {value} is negative")
     return value
@@ -341,21 +330,18 @@ def check_demand(value: float, what: str, most: float = math.inf) -> float:
 
 
 def check_positive(value: float, what: str) -> float:
-    """Return a finite number above zero. Raises WireError for another."""
     if not (math.isfinite(value) and value > 0.0):
         raise WireError("malformed", f"{what} {value:g} is not positive and finite")
     return value
 
 
 def check_number(value: float, what: str) -> float:
-    """Return a finite number. Raises WireError for another."""
     if not math.isfinite(value):
         raise WireError("malformed", f"{what} {value} is not finite")
     return value
 
 
 def verify_relative_pose(sample: RelativePoseSample) -> RelativePoseSample:
-    """Return a sample whose earlier instant is before its own. Raises WireError."""
     if not 0 < sample.since_utime < sample.header.utime:
         raise WireError(
             "malformed", f"since_utime {sample.since_utime} is no time before the sample's own, {sample.header.utime}"
@@ -364,7 +350,6 @@ def verify_relative_pose(sample: RelativePoseSample) -> RelativePoseSample:
 
 
 def verify_model_snapshot(part: SnapshotPart) -> SnapshotPart:
-    """Return a part whose number is one of its parts. Raises WireError."""
     if not 0 <= part.part < part.parts <= MAX_SNAPSHOT_PARTS:
         raise WireError("malformed", f"part {part.part} of {part.parts} cannot be")
     return part
@@ -399,7 +384,6 @@ NO_POSE_VECTOR: Final = _POSE_HEAD + bytes(_STATE_VECTOR.size) + _POSE_END
 
 
 def pack_pose_transform(answer: PoseAnswer) -> bytes:
-    """Return the bytes of a pose_transform_t without its fingerprint."""
     pose = answer.transformation.pose
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(pose._q)
     x, y, z = pose._p
@@ -407,13 +391,11 @@ def pack_pose_transform(answer: PoseAnswer) -> bytes:
 
 
 def pack_pose_vector(answer: PoseAnswer) -> bytes:
-    """Return the bytes of a pose_vector_t without its fingerprint."""
     pose = answer.transformation.pose
     return _pack_pose(_STATE_VECTOR.pack(*pose._p, *pose._q), answer)
 
 
 def unpack_pose_transform(data: bytes, at: int) -> tuple[PoseAnswer, int]:
-    """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
     utime, interest, reference, at = _read_pose_head(data, at)
     return read_transform_numbers(data, at, utime, interest, reference)
 
@@ -443,7 +425,6 @@ def read_transform_numbers(data: bytes, at: int, utime: int, interest: str, refe
 
 
 def unpack_pose_vector(data: bytes, at: int) -> tuple[PoseAnswer, int]:
-    """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
     utime, interest, reference, at = _read_pose_head(data, at)
     x, y, z, *rest = _VECTOR.unpack_from(data, at)
     q, rest = rest[:4], rest[4:]
@@ -454,16 +435,6 @@ def unpack_pose_vector(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     except ValueError as error:
         raise WireError("malformed", str(error)) from None
     return _make_answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, rest)
-
-
-def skip_pose_transform(data: bytes, at: int) -> int:
-    """Return where the pose_transform_t that begins at `at` ends, whatever is in it. Raises WireError, struct.error."""
-    return _find_pose_end(data, at, _MATRIX.size)
-
-
-def skip_pose_vector(data: bytes, at: int) -> int:
-    """Return where the pose_vector_t that begins at `at` ends, whatever is in it. Raises WireError, struct.error."""
-    return _find_pose_end(data, at, _STATE_VECTOR.size)
 
 
 def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
@@ -491,7 +462,6 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
 
 
 def _read_pose_head(data: bytes, at: int) -> tuple[int, str, str, int]:
-    """Return time and names that a pose begins with, and where they end."""
     (utime,) = UTIME.unpack_from(data, at)
     interest, at = read_text(data, at + 8)
     reference, at = read_text(data, at)
@@ -503,6 +473,10 @@ def _find_pose_end(data: bytes, at: int, size: int) -> int:
     at = _read_pose_head(data, at)[3] + size + _NUMBERS.size
     _REST.unpack_from(data, at)
     return read_text(data, at + _REST.size)[1]
+
+
+skip_pose_transform = partial(_find_pose_end, size=_MATRIX.size)
+skip_pose_vector = partial(_find_pose_end, size=_STATE_VECTOR.size)
 
 
 def _make_answer(
@@ -525,7 +499,6 @@ def _unpack_covariance(data: bytes, at: int) -> tuple[float, ...]:
 
 
 def pack_reply_header(header: ReplyHeader) -> bytes:
-    """Return the bytes of a reply_header_t without its fingerprint."""
     if not header.message and not header.nearest:
         head = _REPLY_HEAD.pack(header.request_id, header.utime, header.status)
         return b"%b%b%b" % (head, PLAIN, pack_text(header.model_revision))
@@ -539,7 +512,6 @@ def pack_reply_header(header: ReplyHeader) -> bytes:
 
 
 def unpack_reply_header(data: bytes, at: int) -> tuple[ReplyHeader, int]:
-    """Return the reply_header_t that begins at `at`, and its end. Raises WireError, struct.error."""
     request_id, utime, status = _REPLY_HEAD.unpack_from(data, at)
     at += _REPLY_HEAD.size
     if status == 0 and data[at : at + len(PLAIN)] == PLAIN:
@@ -560,7 +532,6 @@ _PLACE = struct.Struct(">iiii3dbbqi")
 
 
 def pack_get_transformations_reply(reply: PoseBatchReply) -> bytes:
-    """Return the bytes of a get_transformations_reply_t without the fingerprint."""
     poses = reply.poses
     origin = None if poses is None else poses.origin
     count = 0 if poses is None else len(poses.utimes)

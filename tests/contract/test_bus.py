@@ -15,7 +15,7 @@ from modelserver.errors import BusError
 from modelserver.server.bus import SENSOR_QUEUE_BYTES, Bus, FakeBus, Inbox, LcmBus, ReceiverInbox
 from modelserver.server.clock import Clock, FakeClock
 from modelserver.wire.channels import CHANNELS
-from modelserver.wire.receiver import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, Message, Sender
+from modelserver.wire.provider import MAX_QUEUED, MESSAGE_OVERHEAD_BYTES, Message, Sender
 
 ODD_CHANNELS = ["A.B", "A*", "A+", "(A)", "[A]", "A|B", "A-B", "^A$", "A{2}", "A?", "A\\B", "A/B", "#A", "A B", "."]
 
@@ -61,7 +61,7 @@ def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iter
     with reserved_url() as url:
         if request.param == "lcm":
             # as for other providers
-            monkeypatch.setattr("modelserver.wire.receiver.parse_udp_address", lambda url: None)
+            monkeypatch.setattr("modelserver.wire.provider.parse_udp_address", lambda url: None)
         bus = LcmBus(url)
         rig = Rig(bus, Clock())
         rig.subscribe("LAST")

@@ -117,4 +117,4 @@ def test_given_any_bytes_then_nothing_but_a_recording_error_comes_of_them(data: 
     read(data)
     framed = struct.pack(">I", len(data)) + data
     with contextlib.suppress(RecordingError):
-        journal_state.decode_event(framed)
+        journal_state.decode_value(framed)

@@ -8,7 +8,7 @@ from support_spatial import poses
 from support_urdf import inertias
 
 from modelserver.geometry import Body
-from modelserver.geometry.inertia import RigidInertia, from_spatial_inertia
+from modelserver.geometry.parts import RigidInertia, from_spatial_inertia
 from modelserver.transforms import Pose, so3
 
 BOX = ((2.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 4.0))

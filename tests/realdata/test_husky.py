@@ -13,7 +13,7 @@ from support_recordings import HUSKY
 
 from benchmarks import protocols
 from modelserver.config.vehicle_file import load_config
-from modelserver.server.offline import OfflineRun
+from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile

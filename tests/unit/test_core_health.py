@@ -15,8 +15,7 @@ from support_moving import rover
 from support_samples import ORIGIN, START, ScriptedLocalizer, cart, gps, imu, instant_at, start_core
 
 from modelserver import core
-from modelserver.core import CoreState, ExpectedSensor, ModelLoaded, step
-from modelserver.core.health import percentile
+from modelserver.core import CoreState, ExpectedSensor, ModelLoaded, percentile, step
 from modelserver.core.state import CHANGE_PERIOD_NS, MIN_SILENCE_S
 from modelserver.messages import (
     Decision,

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_samples import START
 
-from modelserver.core.publisher_conflict import (
+from modelserver.messages import SensorHeader
+from modelserver.server.ingress import (
     LOSS_WINDOW,
     PUBLISHER_TIMEOUT_NS,
     REORDER_WINDOW,
     PublisherConflictDetector,
 )
-from modelserver.messages import SensorHeader
 
 MS = 1_000_000
 """Nanoseconds in a millisecond."""

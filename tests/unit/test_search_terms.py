@@ -60,7 +60,7 @@ TERMS = {
     "left Jacobian": "modelserver/transforms/so3.py",
     "adjoint": "modelserver/transforms/chain.py",
     "quantization": "tools/mstools/calibration/allan.py",
-    "misalignment": "modelserver/simulation/imu.py",
+    "misalignment": "modelserver/simulation/sensors.py",
     # PX4 EKF2
     "out-of-sequence": f"{FILTER}/localizer.py",
     "delayed measurement": f"{FILTER}/localizer.py",
@@ -70,8 +70,8 @@ TERMS = {
     "position reset": f"{FILTER}/gnss_step.py",
     "covariance inflation": f"{FILTER}/warm_start.py",
     "warm start": f"{FILTER}/warm_start.py",
-    "sensor timeout": "modelserver/core/health.py",
-    "wheel slip": "modelserver/simulation/wheels.py",
+    "sensor timeout": "modelserver/core/__init__.py",
+    "wheel slip": "modelserver/simulation/sensors.py",
     # tf2
     "time travel": "modelserver/query/view.py",
     "lookup": "modelserver/query/path.py",
@@ -84,8 +84,8 @@ TERMS = {
     "slerp": "modelserver/transforms/so3.py",
     "spanning tree": "modelserver/geometry/topology.py",
     "loop closure": "modelserver/geometry/topology.py",
-    "inertia tensor": "modelserver/geometry/inertia.py",
-    "parallel axis": "modelserver/geometry/inertia.py",
+    "inertia tensor": "modelserver/geometry/parts.py",
+    "parallel axis": "modelserver/geometry/parts.py",
     "twist": "modelserver/geometry/kinematic_path.py",
     # robot_localization
     "map frame": "modelserver/query/view.py",
@@ -97,7 +97,7 @@ TERMS = {
     # service and drivers
     "rate limit": "modelserver/server/ingress.py",
     "round robin": "modelserver/server/requests.py",
-    "duplicate publisher": "modelserver/core/publisher_conflict.py",
+    "duplicate publisher": "modelserver/server/ingress.py",
     "backoff": "drivers/msdrivers/runner.py",
     "dead-man": "drivers/msdrivers/devices/vehicle.py",
     "watchdog": "modelserver/server/supervision.py",

@@ -47,7 +47,7 @@ from modelserver.estimation.filter.state import Aligned
 from modelserver.estimation.history import Localizer
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import GpsSample
-from modelserver.server.offline import OfflineRun, TrackRow
+from modelserver.server.recordings import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile

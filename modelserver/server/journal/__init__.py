@@ -76,10 +76,8 @@ class JournalQueue:
     def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
         """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
         self._last = now
-        if received is None:
-            self._put(RecordKind.EVENT, now, "", b"", event)
-        else:
-            self._put(RecordKind.REQUEST, now, received[0], received[1], event)
+        kind = RecordKind.EVENT if received is None else RecordKind.REQUEST
+        self._put(kind, now, *(received or ("", b"")), event)
 
     def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
         """Record a received message that the core does not process, and what is done with it instead."""
@@ -90,7 +88,6 @@ class JournalQueue:
         self._put(RecordKind.PUBLISHED, self._last, channel, data)
 
     def poll_warnings(self) -> Sequence[HealthWarning]:
-        """Return the warnings about the journal since the last call, usually none."""
         return [self._warnings.popleft() for _ in range(len(self._warnings))]
 
     def _put(self, kind: RecordKind, now: Instant, channel: str, data: bytes, event: object = None) -> None:
@@ -107,7 +104,6 @@ class JournalQueue:
     # --- called by the writer's thread ---
 
     def pop(self, max_count: int) -> list[JournalEntry]:
-        """Remove and return the oldest records."""
         entries = self._entries
         popped = [entries.popleft() for _ in range(min(max_count, len(entries)))]
         self._popped_bytes += sum(len(entry.data) for entry in popped)

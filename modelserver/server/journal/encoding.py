@@ -42,10 +42,9 @@ import msgspec
 import numpy as np
 
 from modelserver.config.vehicle_file import VehicleConfig
-from modelserver.core import CoreState, ModelLoaded
+from modelserver.core import CoreState
 from modelserver.errors import RecordingError
 from modelserver.estimation.filter.measurements import REGISTRY
-from modelserver.messages import Event
 
 HISTORY_S: Final = 2.0
 """Seconds of the pose history that are written; all of it would be fifty times as much."""
@@ -113,7 +112,8 @@ def _get_layout(cls: type) -> _Layout:
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
         hints |= inspect.get_annotations(base)
-    slots = [slot for base in cls.__mro__ for slot in _to_tuple(base.__dict__.get("__slots__", ()))]
+    named = [vars(base).get("__slots__", ()) for base in cls.__mro__]
+    slots = [slot for each in named for slot in ((each,) if isinstance(each, str) else each)]
     build: Callable[[list[Any]], Any] = getattr(cls, "_make", lambda values: cls(*values))
     is_constructed = False
     if issubclass(cls, tuple) and hasattr(cls, "_fields"):
@@ -131,10 +131,6 @@ def _get_layout(cls: type) -> _Layout:
     text = "\n".join(f"{name}: {_format_hint(hints[name])}" for name in fields)
     get = attrgetter(*fields) if len(fields) > 1 else lambda value: [getattr(value, name) for name in fields]
     return _Layout(cls, text, fields, get, build, is_constructed)
-
-
-def _to_tuple(slots: str | Sequence[str]) -> Sequence[str]:
-    return (slots,) if isinstance(slots, str) else slots
 
 
 def _format_hint(hint: Any) -> str:
@@ -238,7 +234,6 @@ class _Writer:
         return number
 
     def _flush(self) -> None:
-        """Write the tokens as a block."""
         tokens = self._tokens
         if not tokens:
             return
@@ -261,7 +256,6 @@ def _split_token(token: Any) -> tuple[Any, ...]:
 
 
 def _list_installed() -> frozenset[str]:
-    """Return the packages of the installed measurements."""
     return frozenset(each.__module__.partition(".")[0] for each in REGISTRY.values()) - {"modelserver"}
 
 
@@ -487,13 +481,3 @@ def decode_run(data: bytes) -> RunState:
     if type(found) is not tuple or list(map(type, found)) != [VehicleConfig, CoreState]:
         raise RecordingError("it is no state of a run")
     return RunState(*found)
-
-
-def encode_event(event: Event | ModelLoaded, pause: Callable[[], object] = lambda: None) -> bytes:
-    """Encode an internal event. Raises EncodingError."""
-    return encode_value(event, pause, is_described=False)
-
-
-def decode_event(data: bytes) -> Any:
-    """Decode an internal event. Raises RecordingError."""
-    return decode_value(data)

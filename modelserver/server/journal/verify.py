@@ -19,6 +19,7 @@ from __future__ import annotations
 import hmac
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
@@ -34,20 +35,7 @@ from modelserver.messages import HealthWarning, Rejected
 from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
 from modelserver.server.ingress import SensorChannel
-from modelserver.server.journal import encoding
-from modelserver.server.journal.writer import (
-    INFORMATIVE_FACTS,
-    NEWEST_NAME,
-    SEGMENT_NAME,
-    NewestMarker,
-    collect_facts,
-    find_key,
-    get_number,
-    list_segments,
-    open_mapped,
-    read_newest,
-    seal_segment,
-)
+from modelserver.server.journal import encoding, writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.requests import REQUEST_TYPES
 from modelserver.server.vehicle import Vehicle
@@ -61,11 +49,13 @@ from modelserver.wire.journal import JournalRecord, RecordKind
 def files_of(path: Path) -> list[Path]:
     """Return the segments of a journal: those of a directory, or the one file. Raises RecordingError, OSError."""
     if path.is_dir():
-        found = list_segments(path)
+        found = writer.list_segments(path)
     else:
-        with open_mapped(path) as data:
+        with writer.open_mapped(path) as data:
             # a damaged segment is one
-            found = [path] if data.find(journal.MAGIC) >= 0 or (SEGMENT_NAME.fullmatch(path.name) and data) else []
+            found = (
+                [path] if data.find(journal.MAGIC) >= 0 or (writer.SEGMENT_NAME.fullmatch(path.name) and data) else []
+            )
     if not found:
         raise RecordingError(
             f"{path}: is no journal, which is a folder of files journal-*.lcm (/var/lib/modelserver/journal-NAME); to "
@@ -150,7 +140,7 @@ class ReplayLoop(Loop):
         now = Instant(record.monotonic_ns, record.utime)
         self._fake_clock.set(now)
         if record.kind is RecordKind.EVENT:
-            self._replay_event(encoding.decode_event(record.data), now)
+            self._replay_event(encoding.decode_value(record.data), now)
         elif record.kind is RecordKind.SAMPLE:
             channel = self._replayed_channels.get(record.channel)
             if channel is None:
@@ -208,8 +198,8 @@ def list_differences(then: Mapping[str, Any]) -> list[str]:
 
     An unknown processor counts as equal: a unit with a restricted /proc cannot read it.
     """
-    now = collect_facts()
-    changed = [key for key in now if key not in INFORMATIVE_FACTS and then.get(key) != now[key]]
+    now = writer.collect_facts()
+    changed = [key for key in now if key not in writer.INFORMATIVE_FACTS and then.get(key) != now[key]]
     if not (then.get("processor") and now["processor"]):
         changed = [key for key in changed if key != "processor"]
     return [f"{key} was {then.get(key)}, is {now[key]}" for key in changed]
@@ -241,7 +231,7 @@ class ChainVerifier:
     def begin(self, path: Path, facts: dict[str, Any]) -> None:
         """Check the position of a segment in the chain, by its head."""
         number, previous = facts["number"], str(facts["previous"])
-        if get_number(path) not in (None, number):
+        if writer.get_number(path) not in (None, number):
             self._report(f"is segment {number} by its own head: renamed, or put in place of another", True)
         first = self._places.setdefault(number, path)
         before = self._before
@@ -276,11 +266,11 @@ class ChainVerifier:
             if name or not end.mac:
                 return
         try:
-            key = find_key(name, self._keys)
+            key = writer.find_key(name, self._keys)
         except RecordingError as error:
             self._report(f"cannot be verified: {error}", True)
             return
-        if not hmac.compare_digest(seal_segment(key, end.digest), end.mac):
+        if not hmac.compare_digest(writer.seal_segment(key, end.digest), end.mac):
             self._report("its seal is wrong: it was not written with the key", True)
             return
         self.genuine += key is not None
@@ -288,11 +278,11 @@ class ChainVerifier:
     def skip(self, path: Path) -> None:
         """Skip a segment with an unreadable head, which counts as not closed."""
         self.unsealed.append(path)
-        number = get_number(path)
+        number = writer.get_number(path)
         if self._before is not None and number is not None:
             self._before = _Link(path, number, "")
 
-    def finish(self, newest: NewestMarker | None) -> None:
+    def finish(self, newest: writer.NewestMarker | None) -> None:
         """Check that the last segment is the one in `newest`; None: not known."""
         before = self._before
         if newest is None or before is None:
@@ -304,7 +294,7 @@ class ChainVerifier:
         elif newest.number < before.number:
             # a stop between creating a segment and updating the marker is normal
             if newest.number != before.number - 1 or before.seal:
-                self._report(f"the file {NEWEST_NAME} is older than {name}: restored", True)
+                self._report(f"the file {writer.NEWEST_NAME} is older than {name}: restored", True)
         elif newest.seal and newest.seal != before.seal:
             why = "was replaced" if before.seal else "was cut off after it was closed"
             self._report(f"{name}, the last segment, {why}", True)
@@ -400,7 +390,6 @@ class VerificationReport:
 
     @property
     def result(self) -> VerificationResult:
-        """The result."""
         if not self.is_reproduced:
             return VerificationResult.DIFFERS
         return VerificationResult.AUTHENTIC if self.is_authentic else VerificationResult.REPRODUCED
@@ -459,7 +448,7 @@ class _Verifier:
         end: journal.SegmentEnd | None = None
         report, before = self.report, self.report.bytes
         facts: dict[str, Any] | None = None
-        with open_mapped(path) as data:
+        with writer.open_mapped(path) as data:
             size = len(data)
             report.bytes += size
             for item in journal.read_segment(data):
@@ -546,8 +535,7 @@ class _Verifier:
                 report.skipped[record.channel] += 1
             return
         if record.kind is RecordKind.PUBLISHED:
-            if self._group is None:
-                self._group = _Group(self._path, record, [])
+            self._group = self._group or _Group(self._path, record, [])
             self._group.recorded.append(record)
             return
         report.handled += 1
@@ -565,20 +553,16 @@ class _Verifier:
             self._add_finding(f"at byte {record.at}: {error}", is_damage=True)
             self._stop()
             return
-        if self._group is None:
-            self._group = _Group(self._path, record, published)
-        else:
-            self._group.replayed += published
+        self._group = self._group or _Group(self._path, record, [])
+        self._group.replayed += published
 
     @staticmethod
     def _is_interleaved(record: JournalRecord) -> bool:
         """Return whether a record may come between outputs of one step: a publishing or persisting error."""
-        if record.kind is not RecordKind.EVENT:
-            return False
-        try:
-            return isinstance(encoding.decode_event(record.data), (Rejected, HealthWarning))
-        except RecordingError:
-            return False
+        with suppress(RecordingError):
+            is_event = record.kind is RecordKind.EVENT
+            return is_event and isinstance(encoding.decode_value(record.data), (Rejected, HealthWarning))
+        return False
 
     def _compare(self) -> None:
         """Compare the recorded and the replayed outputs of the group, and count them by channel."""
@@ -648,14 +632,14 @@ class _Verifier:
         if directory is None or report.difference is not None:
             return
         try:
-            newest = read_newest(directory, self._keys)
+            newest = writer.read_newest(directory, self._keys)
         except RecordingError as error:
             self._add_finding(str(error), is_damage=True)
             return
         self._chain.finish(newest)
         report.is_complete = newest is not None
         if newest is None:
-            self._add_finding(f"the file {NEWEST_NAME} is missing, so segments after it may be missing too")
+            self._add_finding(f"the file {writer.NEWEST_NAME} is missing, so segments after it may be missing too")
 
     def _add_finding(self, text: str, is_damage: bool = False) -> None:
         self.report.findings.append(JournalFinding(self._path, text, is_damage))

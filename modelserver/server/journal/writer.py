@@ -40,18 +40,10 @@ from modelserver.core import Instant
 from modelserver.errors import RecordingError
 from modelserver.files import open_regular, read_start
 from modelserver.messages import CHANNEL_OF
+from modelserver.server import persistence
 from modelserver.server.clock import Clock
 from modelserver.server.journal import JournalEntry, JournalQueue, SegmentStart, encoding
 from modelserver.server.log import escape_text, start_in_background
-from modelserver.server.persistence import (
-    FileLock,
-    create_directory,
-    describe_error,
-    get_state_directory,
-    sync_directory,
-    to_file_name,
-    write_atomically,
-)
 from modelserver.signing import Key
 from modelserver.version import __version__
 from modelserver.wire import journal
@@ -83,11 +75,9 @@ def collect_facts() -> Mapping[str, str]:
 
 
 def _read_version(name: str) -> str:
-    """Return the version of an installed package; empty for none."""
-    try:
+    with contextlib.suppress(PackageNotFoundError):
         return version(name)
-    except PackageNotFoundError:
-        return ""
+    return ""
 
 
 def _hash_source() -> str:
@@ -101,14 +91,11 @@ def _hash_source() -> str:
 
 
 def _read_processor() -> str:
-    try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                key, _, value = line.partition(":")
-                if key.strip() in ("model name", "Model", "CPU part"):
-                    return value.strip()
-    except OSError:
-        pass
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() in ("model name", "Model", "CPU part"):
+                return value.strip()
     return platform.processor()
 
 
@@ -118,12 +105,10 @@ LOCK_NAME: Final = "lock"
 
 
 def list_segments(directory: Path) -> list[Path]:
-    """List the segments in a directory, the oldest first. Raises OSError."""
     return sorted(path for path in directory.iterdir() if SEGMENT_NAME.fullmatch(path.name))
 
 
 def get_number(path: Path) -> int | None:
-    """Return the number in the name of a segment; None for another name."""
     match = SEGMENT_NAME.fullmatch(path.name)
     return int(match[1]) if match else None
 
@@ -180,11 +165,10 @@ class Ring:
         self.directory = directory
         self.max_bytes = max_bytes
         self.segment_bytes = segment_bytes
-        self._lock = FileLock(directory / LOCK_NAME)
+        self._lock = persistence.FileLock(directory / LOCK_NAME)
 
     def acquire(self) -> None:
-        """Acquire the directory for this writer."""
-        create_directory(self.directory)
+        persistence.create_directory(self.directory)
         self._lock.acquire()
 
     def create_segment(self, min_number: int = 0) -> Segment:
@@ -201,10 +185,9 @@ class Ring:
                 break
             path.unlink()
             excess -= size
-        newest = get_number(held[-1]) if held else None
-        number = max(0 if newest is None else newest + 1, min_number)
+        number = max([min_number, *((get_number(path) or 0) + 1 for path in held)])
         segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
-        sync_directory(self.directory)
+        persistence.sync_directory(self.directory)
         return segment
 
     def make_room(self) -> bool:
@@ -386,7 +369,6 @@ class JournalWriter:
         self.finish()
 
     def finish(self) -> None:
-        """Write the rest and close the segment."""
         with contextlib.suppress(Exception):
             self.run_once()
             self._end_segment()
@@ -414,28 +396,25 @@ class JournalWriter:
     def _write(self, entries: list[JournalEntry]) -> None:
         """Write entries: a batch for the records between two segment starts."""
         records: list[journal.JournalRecord] = []
-        for number, entry in enumerate(entries):
-            if isinstance(entry.event, SegmentStart):
+        for number, (kind, now, channel, data, event) in enumerate(entries):
+            if isinstance(event, SegmentStart):
                 try:
                     self._write_batch(records)
                     records = []
-                    self._begin_segment(entry.event, entry.now)
+                    self._begin_segment(event, now)
                 except Exception:
                     self._lost += len(entries) - number - 1
                     raise
-            elif self._segment is None:
+                continue
+            if self._segment is None:
                 self._lost += 1
-            else:
-                records.append(self._record(entry))
+                continue
+            if kind is journal.RecordKind.EVENT:
+                data = encoding.encode_value(event, self._pause, is_described=False)
+            elif kind is journal.RecordKind.REQUEST and type(event) not in CHANNEL_OF:
+                kind = journal.RecordKind.SAMPLE
+            records.append(journal.JournalRecord(kind, now.monotonic_ns, now.utime, channel, data))
         self._write_batch(records)
-
-    def _record(self, entry: JournalEntry) -> journal.JournalRecord:
-        kind, data = entry.kind, entry.data
-        if kind is journal.RecordKind.EVENT:
-            data = encoding.encode_event(entry.event, self._pause)
-        elif kind is journal.RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
-            kind = journal.RecordKind.SAMPLE
-        return journal.JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
 
     def _write_batch(self, records: list[journal.JournalRecord]) -> None:
         if not records or self._segment is None:
@@ -461,8 +440,7 @@ class JournalWriter:
             facts |= self._facts
             facts["key"] = "" if self._key is None else self._key.name
             facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
-            self._previous = ""
-            self._segment, self._batch = segment, 0
+            self._previous, self._segment, self._batch = "", segment, 0
             segment.append(journal.encode_head(facts, now.utime))
             segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
@@ -483,12 +461,11 @@ class JournalWriter:
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
-                end = journal.SegmentEnd(
-                    True, segment.digest.digest(), seal_segment(self._key, segment.digest.digest())
-                )
-                segment.append(journal.encode_end(end.digest, self._clock.utime(), end.mac))
+                digest = segment.digest.digest()
+                mac = seal_segment(self._key, digest)
+                segment.append(journal.encode_end(digest, self._clock.utime(), mac))
                 segment.sync()
-                self._previous = end.seal.hex()
+                self._previous = (mac or digest).hex()
                 self._write_newest(segment.number)
             finally:
                 segment.close()
@@ -506,7 +483,7 @@ class JournalWriter:
 
     def _write_newest(self, number: int) -> None:
         newest = NewestMarker(self._run_number, number, self._previous)
-        write_atomically(self._ring.directory / NEWEST_NAME, newest.encode(self._key))
+        persistence.write_atomically(self._ring.directory / NEWEST_NAME, newest.encode(self._key))
 
     def _fail(self, error: OSError) -> None:
         """Stop writing until the next attempt; meanwhile records are dropped and counted."""
@@ -526,7 +503,7 @@ class JournalWriter:
 
     def _describe_error(self, error: OSError) -> str:
         directory = self._ring.directory
-        why = describe_error(error, directory, "journal.directory")
+        why = persistence.describe_error(error, directory, "journal.directory")
         place = escape_text(str(directory))
         return f"nothing is recorded: the journal cannot be written in {place}: {why}. It retries every {RETRY_S:g} s"
 
@@ -555,14 +532,11 @@ def get_journal_directory(config: VehicleConfig, systemd_directory: str | None =
     systemd_directory = os.environ.get("STATE_DIRECTORY", "") if systemd_directory is None else systemd_directory
     if settings.megabytes is None and not systemd_directory:
         return None
-    base = get_state_directory(config.state_directory or systemd_directory.split(":")[0])
-    if base is None:
-        return None
-    return base / f"journal-{to_file_name(config.vehicle)}"
+    base = persistence.get_state_directory(config.state_directory or systemd_directory.split(":")[0])
+    return None if base is None else base / f"journal-{persistence.to_file_name(config.vehicle)}"
 
 
 def get_max_bytes(config: VehicleConfig) -> int:
-    """Return the size limit of a vehicle's journal, bytes."""
     return (config.journal.megabytes or DEFAULT_MEGABYTES) << 20
 
 

@@ -10,8 +10,7 @@ from support_gx1 import START_UTIME, Line, angle_between, stationary_samples
 from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import DrivePhase, ImuModel, Trajectory
-from modelserver.simulation.imu import MagnetometerModel, simulate_imu
-from modelserver.simulation.noise import Run
+from modelserver.simulation.sensors import MagnetometerModel, Run, simulate_imu
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from msdrivers.devices import gx1 as requests

@@ -27,11 +27,12 @@ from support_vehicle_bus import (
     wheels_settings,
 )
 
+from benchmarks.rough_simulation import make_noise_free_wheels
 from modelserver import load_model
 from modelserver.earth.geodesy import origin_at
 from modelserver.errors import ConfigError
 from modelserver.messages import Direction, WheelsSample
-from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
+from modelserver.simulation import Simulation, Timing, Trajectory, figure_eight
 from msdrivers.devices.can import SignalMap, parse_dbc
 from msdrivers.devices.wheels import CountMap, DirectionMap, SpeedMap, WheelMap, WheelsDriver, WheelsSettings
 from msdrivers.emulate import FaultInjector, InjectedFault
@@ -443,7 +444,7 @@ def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_o
         origin_at(50.27, -111.18, 700.0),
         rolling_frame="Raptor:RearAxleCenter",
         wheel_frames={name: f"Raptor:{name.title().replace('_', '')}WheelContact" for name in BOTH},
-        wheels_model=WheelsModel.noise_free(Timing(100.0), frozenset(BOTH)),
+        wheels_model=make_noise_free_wheels(Timing(100.0), frozenset(BOTH)),
     )
     truths = [sample for sample in run.events(40.0) if isinstance(sample, WheelsSample)]
     wire = Wire(

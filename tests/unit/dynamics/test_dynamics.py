@@ -16,7 +16,7 @@ from modelserver import load_model
 from modelserver.dynamics import Dynamics, MassUncertainty
 from modelserver.errors import LimitError, MalformedRequestError, UnknownFrameError
 from modelserver.geometry import Joint, JointType, Mimic, Model, ModelBuilder, Sigma
-from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.parts import RigidInertia
 from modelserver.transforms import Pose, so3
 from modelserver.transforms.pose import compute_turn_motion, compute_turn_rate
 

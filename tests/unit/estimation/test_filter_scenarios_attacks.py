@@ -21,13 +21,14 @@ from support_filter import (
     simulation,
 )
 
+from benchmarks.rough_simulation import EncoderModel
 from modelserver.estimation.filter import fusion, heading_alignment, heading_step
 from modelserver.estimation.filter.eskf import ATTITUDE
 from modelserver.estimation.filter.heading_alignment import Rotation
 from modelserver.estimation.filter.localizer import FilterLocalizer, Timeline
 from modelserver.estimation.filter.state import Aligned, Leveling, Setup
 from modelserver.messages import GpsSample, ImuSample, Invalid, Mode, Phase, Verdict, WheelSample, WheelsSample
-from modelserver.simulation import START_UTIME, DrivePhase, EncoderModel, Event, WheelsModel, figure_eight, stationary
+from modelserver.simulation import START_UTIME, DrivePhase, Event, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
 
 pytestmark = pytest.mark.slow

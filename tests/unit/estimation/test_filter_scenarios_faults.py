@@ -12,6 +12,7 @@ import pytest
 import support_stream_faults as faults
 from support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
 
+from benchmarks.rough_simulation import EncoderModel
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.state import Setup
@@ -20,7 +21,6 @@ from modelserver.messages import ImuSample, Invalid, Phase, Verdict, WheelsSampl
 from modelserver.simulation import (
     START_UTIME,
     DrivePhase,
-    EncoderModel,
     Event,
     MagnetometerModel,
     WheelsModel,

@@ -11,7 +11,7 @@ import pytest
 from support_filter import IMU, MOUNT, PLAIN_GPS, drive, rig, simulation
 from support_maneuvers import reverse_eight
 
-from benchmarks.rough_simulation import SideSlip, Terrain
+from benchmarks.rough_simulation import SideSlip, Terrain, make_noise_free_gps, make_noise_free_wheels
 from modelserver.messages import ImuSample, Invalid, Quality, Verdict
 from modelserver.simulation import START_UTIME, Event, GpsModel, Timing, WheelsModel, figure_eight, stationary
 from modelserver.transforms import so3
@@ -118,7 +118,7 @@ def test_given_a_drive_in_reverse_from_the_start_when_an_eight_is_driven_then_he
 def test_given_the_body_turned_by_half_a_turn_on_the_same_drive_then_the_poses_are_the_same():
     phases = figure_eight(speed=2.0, radius=6.0)
     seconds = sum(phase.duration for phase in phases)
-    exact = {"gps_model": GpsModel.noise_free(), "wheels_model": WheelsModel.noise_free(Timing(10.0))}
+    exact = {"gps_model": make_noise_free_gps(), "wheels_model": make_noise_free_wheels(Timing(10.0))}
 
     ahead = drive(simulation(phases, **exact), seconds)
     turned = drive(simulation(phases, rig(math.pi), **exact), seconds, on=rig(math.pi))

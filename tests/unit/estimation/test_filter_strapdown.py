@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, SITE, model, rig, some_nav
 
-from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave
+from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave, make_noise_free_imu
 from modelserver.estimation.filter import eskf, fusion
 from modelserver.estimation.filter.eskf import STRAPDOWN, ZERO, Earth, NavState, ProcessNoise
 from modelserver.estimation.filter.hypothesis_bank import DeadReckoning
 from modelserver.estimation.filter.sensor_monitors import ImuMonitor, StationaryDetector
 from modelserver.estimation.filter.state import Aligned, Common, MotionConstraints, Setup
 from modelserver.messages import ImuSample
-from modelserver.simulation import START_UTIME, ImuModel, Timing, Trajectory, figure_eight
+from modelserver.simulation import START_UTIME, Timing, Trajectory, figure_eight
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import cross
 
@@ -38,7 +38,7 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_position_i
     terrain = Terrain(0.05, -0.03, (Wave(0.8, 30.0, 0.4), Wave(0.3, 17.0, -1.0, 1.0)))
     simulation = RoughSimulation(
         model(), "Cart:Base", Trajectory(figure_eight(3.0, 8.0, stationary=1.0, ramp=2.0, laps=3), yaw=0.7), ORIGIN,
-        imu_frame=IMU, imu_model=ImuModel.noise_free(Timing(200.0)), terrain=terrain,
+        imu_frame=IMU, imu_model=make_noise_free_imu(Timing(200.0)), terrain=terrain,
     )  # fmt: skip
     samples = [each for each in simulation.events(61.0) if isinstance(each, ImuSample)]
     mount, earth = MOUNTS.X_base_imu.wxyz, earth_here()

@@ -8,7 +8,7 @@ from support_formats import YAML, line_of, only_problem, problems_of, read
 
 from modelserver.errors import Severity
 from modelserver.geometry import Sigma
-from modelserver.geometry.inertia import RigidInertia
+from modelserver.geometry.parts import RigidInertia
 from modelserver.transforms import Pose
 
 MAST = "Mast: {xyz: [0.2, 0, 1.1], rpy_deg: [0, -10, 0]}"

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from modelserver.geometry import Joint, JointType, ModelBuilder, Sigma
-from modelserver.geometry.difference import describe_changes
-from modelserver.geometry.model import Model
+from modelserver.geometry.model import Model, describe_changes
 from modelserver.transforms import Pose
 
 NOD = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0))

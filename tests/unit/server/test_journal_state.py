@@ -145,13 +145,13 @@ POSE = Transformation("Cart:Base", "World:UTM", Pose.from_rpy((1.0, 2.0, 3.0), 0
     ],
 )
 def test_given_an_event_of_the_services_own_when_read_back_then_it_is_the_same(event: object) -> None:
-    data = journal_state.encode_event(event)  # type: ignore[arg-type]
-    back = journal_state.decode_event(data)
+    data = journal_state.encode_value(event, is_described=False)
+    back = journal_state.decode_value(data)
     assert repr(back) == repr(event)
-    assert journal_state.encode_event(back) == data
+    assert journal_state.encode_value(back, is_described=False) == data
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"3", b"\0\0\0\1\x90", b"\0\0\0\2\x91\x00", b'["Tick", 1]'])
 def test_given_bytes_that_are_no_event_then_that_is_reported(data: bytes) -> None:
     with pytest.raises(RecordingError):
-        journal_state.decode_event(data)
+        journal_state.decode_value(data)

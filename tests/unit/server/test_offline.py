@@ -31,8 +31,7 @@ from modelserver.messages import (
     Verdict,
 )
 from modelserver.server.ingress import SensorChannel
-from modelserver.server.offline import CSV_HEADER, OfflineRun, TrackRow
-from modelserver.server.recordings import LOOKED_AT
+from modelserver.server.recordings import CSV_HEADER, LOOKED_AT, OfflineRun, TrackRow
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent

@@ -8,14 +8,13 @@ import pytest
 from support_samples import START, ScriptedLocalizer, imu, start_core, write_vehicle
 
 from modelserver.config.vehicle_file import load_config
-from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS
 from modelserver.messages import Health, JointSample, JointsSample, SensorHeader
 from modelserver.server.bus import FakeBus
 from modelserver.server.clock import FakeClock
-from modelserver.server.ingress import SensorChannel
+from modelserver.server.ingress import CONFLICT_TIMEOUT_NS, SensorChannel
 from modelserver.server.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 
 class Rig:

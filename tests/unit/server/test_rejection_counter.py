@@ -14,9 +14,10 @@ from support_samples import ME, imu
 from modelserver import core
 from modelserver.core import Instant
 from modelserver.messages import GetTransformations, Rejected
-from modelserver.server.ingress import MAX_PER_SECOND, MAX_RECORDED_BYTES, RateLimiter, RejectionCounter
+from modelserver.server.ingress import MAX_PER_SECOND, MAX_RECORDED_BYTES, RejectionCounter
 from modelserver.server.journal import JournalQueue
 from modelserver.server.journal.verify import verify
+from modelserver.server.log import RateLimiter
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import JournalRecord, RecordKind, read_segment
 

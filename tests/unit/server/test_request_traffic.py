@@ -27,7 +27,7 @@ from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.requests import CONTENTION_NS
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.receiver import Sender
+from modelserver.wire.provider import Sender
 
 pytestmark = pytest.mark.slow
 

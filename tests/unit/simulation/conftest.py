@@ -6,10 +6,17 @@ import math
 
 import pytest
 
-from benchmarks.rough_simulation import RoughSimulation, Terrain, Wave
+from benchmarks.rough_simulation import (
+    RoughSimulation,
+    Terrain,
+    Wave,
+    make_noise_free_gps,
+    make_noise_free_imu,
+    make_noise_free_wheels,
+)
 from modelserver.earth.geodesy import origin_at
 from modelserver.geometry import Model, ModelBuilder
-from modelserver.simulation import GpsModel, ImuModel, Simulation, Trajectory, WheelsModel, figure_eight
+from modelserver.simulation import Simulation, Trajectory, figure_eight
 from modelserver.transforms.pose import Pose
 
 WHEELS = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
@@ -65,7 +72,7 @@ def simulate(car, origin, eight):
 def quiet() -> dict[str, object]:
     """The three sensors without noise."""
     return {
-        "gps_model": GpsModel.noise_free(),
-        "imu_model": ImuModel.noise_free(),
-        "wheels_model": WheelsModel.noise_free(),
+        "gps_model": make_noise_free_gps(),
+        "imu_model": make_noise_free_imu(),
+        "wheels_model": make_noise_free_wheels(),
     }

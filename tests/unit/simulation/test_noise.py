@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modelserver.simulation.noise import GaussMarkov, NoiseSource
+from modelserver.simulation.sensors import GaussMarkov, NoiseSource
 
 
 def test_prefetched_numbers_are_the_same():

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.rough_simulation import SideSlip
+from benchmarks.rough_simulation import SideSlip, make_noise_free_gps, make_noise_free_imu, make_noise_free_wheels
 from modelserver import earth
 from modelserver.earth.geodesy import Geodesy
-from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
+from modelserver.simulation import Timing
 from modelserver.transforms import so3
 
 SLIDING = SideSlip(cornering=0.02, random_sigma=0.1)
@@ -20,7 +20,7 @@ SLIDING = SideSlip(cornering=0.02, random_sigma=0.1)
 def test_integrating_the_inertial_unit_gives_the_drive_back(simulate, hills, car, origin):
     """Strapdown navigation by Runge-Kutta from the first instant on; see test_sensors for the source."""
     rate = 400.0
-    run = simulate(terrain=hills, side_slip=SLIDING, imu_model=ImuModel.noise_free(Timing(rate)), seed=3)
+    run = simulate(terrain=hills, side_slip=SLIDING, imu_model=make_noise_free_imu(Timing(rate)), seed=3)
     samples = list(run.events(run.trajectory.duration))
     latitude, _, height = Geodesy(origin).geodetic_from_enu((0.0, 0.0, 0.0))
     turning = so3.skew(earth.earth_rate(latitude))
@@ -68,7 +68,7 @@ def test_truth_is_whole(simulate, hills):
 
 
 def test_fixes_are_the_antenna_itself(simulate, hills, car, origin):
-    run = simulate(terrain=hills, side_slip=SLIDING, gps_model=GpsModel.noise_free(), second_gps_frame="Car:Second")
+    run = simulate(terrain=hills, side_slip=SLIDING, gps_model=make_noise_free_gps(), second_gps_frame="Car:Second")
     geodesy = Geodesy(origin)
     X_BA, X_BS = (car.get_transformation(frame, "Car:CG").position for frame in ("Car:Antenna", "Car:Second"))
     for fix in run.events(run.trajectory.duration):
@@ -88,7 +88,7 @@ def test_fixes_are_the_antenna_itself(simulate, hills, car, origin):
 def test_wheels_roll_what_their_contact_points_move_ahead(simulate, hills, car, slip):
     """A steered wheel moves along itself where nothing slides; the others see nothing of what is across."""
     steered = frozenset(("front_left", "front_right"))
-    run = simulate(terrain=hills, side_slip=slip, wheels_model=WheelsModel.noise_free(Timing(50.0), steered))
+    run = simulate(terrain=hills, side_slip=slip, wheels_model=make_noise_free_wheels(Timing(50.0), steered))
     frames = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
     levers = {name: car.get_transformation(frame, "Car:CG").position for name, frame in frames.items()}
     samples = list(run.events(run.trajectory.duration))

@@ -8,17 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.rough_simulation import (
+    EncoderModel,
+    TriadModel,
+    make_noise_free_gps,
+    make_noise_free_imu,
+    make_noise_free_wheels,
+)
 from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import Direction, OrientationReference, YawSource
 from modelserver.simulation import (
     DrivePhase,
-    EncoderModel,
     GpsModel,
     ImuModel,
     MagnetometerModel,
     Timing,
     Trajectory,
-    TriadModel,
     WheelsModel,
     straight,
 )
@@ -36,7 +41,7 @@ def enu(fix, origin):
 
 
 def test_an_unstated_latency_makes_old_fixes_look_new(simulate, origin):
-    quiet = GpsModel.noise_free()
+    quiet = make_noise_free_gps()
     prompt = list(simulate(gps_model=quiet).events(40.0))
     late = list(simulate(gps_model=replace(quiet, unstated_latency=0.5)).events(40.0))
     for old, new in zip(late[2:], prompt[:-2], strict=True):
@@ -83,7 +88,7 @@ def test_the_baseline_is_as_good_as_stated_and_only_there_with_two_antennas(simu
 
 # --- the inertial unit --------------------------------------------------------------------------------------
 
-QUIET = ImuModel.noise_free(earth_rotation=False)
+QUIET = make_noise_free_imu(earth_rotation=False)
 
 
 def vectors(run, seconds, name):
@@ -213,7 +218,7 @@ def wheel(run, name, seconds):
 
 
 def with_faults(**faults) -> WheelsModel:
-    return replace(WheelsModel.noise_free(), encoder=EncoderModel(**faults))
+    return replace(make_noise_free_wheels(), encoder=EncoderModel(**faults))
 
 
 def test_wheels_spin_in_bursts_each_for_itself(simulate):
@@ -233,7 +238,7 @@ def test_wheels_spin_in_bursts_each_for_itself(simulate):
 def test_a_stuck_encoder_and_one_that_counts_backward(simulate):
     model = with_faults(stuck=(("rear_left", 8.0),), swapped=frozenset(("front_right",)))
     run = simulate(RUN, wheels_model=model)
-    sound = simulate(RUN, wheels_model=WheelsModel.noise_free())
+    sound = simulate(RUN, wheels_model=make_noise_free_wheels())
     reached = None
     for sample, true in zip(run.events(25.0), sound.events(25.0), strict=True):
         each, right = ({wheel.name: wheel for wheel in both.wheels} for both in (sample, true))
@@ -251,8 +256,8 @@ def test_a_stuck_encoder_and_one_that_counts_backward(simulate):
 
 
 def test_wheels_can_have_unstated_latency(simulate):
-    prompt = wheel(simulate(wheels_model=WheelsModel.noise_free()), "rear_left", 20.0)
-    late = wheel(simulate(wheels_model=replace(WheelsModel.noise_free(), unstated_latency=0.2)), "rear_left", 20.0)
+    prompt = wheel(simulate(wheels_model=make_noise_free_wheels()), "rear_left", 20.0)
+    late = wheel(simulate(wheels_model=replace(make_noise_free_wheels(), unstated_latency=0.2)), "rear_left", 20.0)
     for old, new in zip(late[4:], prompt[:-4], strict=True):
         assert old.speed == pytest.approx(new.speed, abs=1e-9)
         assert old.travel == pytest.approx(new.travel, abs=1e-9)

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.rough_simulation import make_noise_free_gps, make_noise_free_imu, make_noise_free_wheels
 from modelserver import earth
 from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
@@ -32,7 +33,7 @@ from modelserver.simulation import (
     figure_eight,
     straight,
 )
-from modelserver.simulation.noise import Timing
+from modelserver.simulation.sensors import Timing
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
@@ -70,9 +71,9 @@ def simulation(trajectory: Trajectory = DRIVE, **more) -> Simulation:
         "imu_frame": "Imu:Sensor",
         "wheel_frames": WHEELS,
         "rolling_frame": "Car:RearAxle",
-        "gps_model": GpsModel.noise_free(),
-        "imu_model": ImuModel.noise_free(),
-        "wheels_model": WheelsModel.noise_free(),
+        "gps_model": make_noise_free_gps(),
+        "imu_model": make_noise_free_imu(),
+        "wheels_model": make_noise_free_wheels(),
     }
     return Simulation(CAR, "Car:CG", trajectory, ORIGIN, **(settings | more))
 
@@ -92,7 +93,7 @@ def test_integrating_the_inertial_unit_gives_the_drive_back():
     earth's rotation (P. Groves, "Principles of GNSS, inertial, and multisensor integrated navigation", 2013, 5.3).
     """
     rate = 200.0
-    run = simulation(imu_model=ImuModel.noise_free(Timing(rate)), gps_frame=None, wheel_frames=None)
+    run = simulation(imu_model=make_noise_free_imu(Timing(rate)), gps_frame=None, wheel_frames=None)
     samples = list(run.events(DRIVE.duration))
     latitude, _, height = Geodesy(ORIGIN).geodetic_from_enu((0.0, 0.0, 0.0))
     turning = so3.skew(earth.earth_rate(latitude))
@@ -146,7 +147,7 @@ def test_gravity_is_that_of_the_ellipsoid():
 )
 def test_its_own_orientation_is_the_truth_rotated_by_its_initial_yaw(reference, axes):
     offset = 2.0
-    imu = replace(ImuModel.noise_free(yaw_offset=offset, earth_rotation=False), reference=reference)
+    imu = replace(make_noise_free_imu(yaw_offset=offset, earth_rotation=False), reference=reference)
     run = simulation(imu_model=imu, gps_frame=None, wheel_frames=None)
     turned = Pose.from_rpy((0.0, 0.0, 0.0), yaw=offset).rotation
     for sample in list(run.events(DRIVE.duration))[::10]:
@@ -235,7 +236,7 @@ def test_the_error_of_fixes_is_time_correlated_and_as_large_as_stated():
 
 def test_a_delayed_velocity_is_that_of_its_instant():
     late = simulation(
-        imu_frame=None, wheel_frames=None, gps_model=replace(GpsModel.noise_free(), velocity_latency=0.25)
+        imu_frame=None, wheel_frames=None, gps_model=replace(make_noise_free_gps(), velocity_latency=0.25)
     )
     prompt = simulation(imu_frame=None, wheel_frames=None)
     for old, new in zip(list(late.events(60.0))[1:], list(prompt.events(60.0))[:-1], strict=True):
@@ -280,7 +281,7 @@ def test_the_vehicle_controller_measures_the_speed_and_the_angle_of_the_equivale
     run = simulation(
         gps_frame=None,
         imu_frame=None,
-        wheels_model=WheelsModel.noise_free(steered=steered),
+        wheels_model=make_noise_free_wheels(steered=steered),
         status_model=StatusModel(BASE, Timing(20.0), angle_sigma=0.0),
     )
     events = list(run.events(40.0))
@@ -301,7 +302,7 @@ def test_the_vehicle_controller_measures_the_speed_and_the_angle_of_the_equivale
 def test_unsteered_and_steered_wheels_follow_the_path_of_their_contact_points():
     """Against positions: a steered wheel rolls the length of its contact point's way."""
     steered = frozenset(("front_left", "front_right"))
-    run = simulation(gps_frame=None, imu_frame=None, wheels_model=WheelsModel.noise_free(steered=steered))
+    run = simulation(gps_frame=None, imu_frame=None, wheels_model=make_noise_free_wheels(steered=steered))
     fine = 500
     previous = None
     ways = dict.fromkeys(steered, 0.0)
@@ -323,7 +324,7 @@ def test_unsteered_and_steered_wheels_follow_the_path_of_their_contact_points():
 
 def test_steered_wheels_point_along_the_velocity_of_their_contact_point():
     steered = frozenset(("front_left", "front_right"))
-    run = simulation(gps_frame=None, imu_frame=None, wheels_model=WheelsModel.noise_free(steered=steered))
+    run = simulation(gps_frame=None, imu_frame=None, wheels_model=make_noise_free_wheels(steered=steered))
     for sample in run.events(DRIVE.duration):
         truth = run.truth(sample.header.utime)
         for wheel in sample.wheels:
@@ -355,7 +356,7 @@ def test_directions_are_those_of_the_drive():
 
 def test_slip_makes_wheels_turn_too_much_when_speeding_up_and_scale_errs_all_the_way():
     def last(**more):
-        model = replace(WheelsModel.noise_free(), **more)
+        model = replace(make_noise_free_wheels(), **more)
         run = simulation(Trajectory(straight()), gps_frame=None, imu_frame=None, wheels_model=model)
         return travels(list(run.events(6.0))[-1])["rear_left"]  # in the middle of the run-up
 

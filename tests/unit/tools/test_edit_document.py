@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from modelserver.formats import parse_content, parse_model
 from modelserver.geometry import Joint, JointType, Mimic, Model
-from modelserver.geometry.difference import describe_changes
+from modelserver.geometry.model import describe_changes
 from modelserver.transforms import Pose
 from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
 from mstools.edit.yaml_text import EditError, YamlText

@@ -572,13 +572,13 @@ def test_given_a_vehicle_of_new_then_it_is_installed_as_it_is(run: Callable[...,
 def test_given_the_installed_vehicle_file_then_relative_folders_are_the_units_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert vehicle_file.INSTALLED_FOLDER == install_steps.CONFIGURATION
-    assert install_steps.STATE[0] == vehicle_file.STATE_FOLDER
+    assert vehicle_file.files.INSTALLED_FOLDER == install_steps.CONFIGURATION
+    assert install_steps.STATE[0] == vehicle_file.files.STATE_FOLDER
     vehicle = write_state_folders(tmp_path / "etc", "state", "journal")
     beside = vehicle_file.load_config(vehicle)
     assert (beside.state_directory, beside.journal.directory) == (f"{tmp_path}/etc/state", f"{tmp_path}/etc/journal")
-    monkeypatch.setattr(vehicle_file, "INSTALLED_FOLDER", str(tmp_path / "etc"))
-    monkeypatch.setattr(vehicle_file, "STATE_FOLDER", "/var/lib/none")
+    monkeypatch.setattr(vehicle_file.files, "INSTALLED_FOLDER", str(tmp_path / "etc"))
+    monkeypatch.setattr(vehicle_file.files, "STATE_FOLDER", "/var/lib/none")
     installed = vehicle_file.load_config(vehicle)
     assert (installed.state_directory, installed.journal.directory) == ("/var/lib/none/state", "/var/lib/none/journal")
     assert Path(installed.geometry).parent == tmp_path / "etc"

@@ -15,9 +15,10 @@ import pytest
 from support_recordings import HUSKY, drive, write_log
 from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
+from benchmarks.rough_simulation import EncoderModel
 from modelserver.errors import ModelServerError
 from modelserver.extras import make_install_command
-from modelserver.simulation import EncoderModel, WheelsModel
+from modelserver.simulation import WheelsModel
 from mstools import cli
 from mstools.report import charts
 

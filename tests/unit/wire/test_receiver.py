@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from support_lcm import TIMEOUT_S, reserved_url
 
 from modelserver.errors import BusError
-from modelserver.wire import receiver as module
-from modelserver.wire.provider import UdpAddress, parse_udp_address, resolve_url
-from modelserver.wire.receiver import (
+from modelserver.wire import provider as module
+from modelserver.wire.provider import (
     MAX_IGNORED,
     MAX_PARTIAL,
     MAX_PARTIAL_BYTES,
@@ -28,8 +27,11 @@ from modelserver.wire.receiver import (
     Message,
     Receiver,
     Sender,
+    UdpAddress,
     UdpReceiver,
     open_receiver,
+    parse_udp_address,
+    resolve_url,
 )
 
 

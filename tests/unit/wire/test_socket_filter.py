@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from support_lcm import TIMEOUT_S
 
-from modelserver.wire.receiver import make_program, set_channel_filter
+from modelserver.wire.provider import make_program, set_channel_filter
 
 UDP_HEADER = bytes(8)
 NAMES = st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=20)

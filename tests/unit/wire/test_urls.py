@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.provider import EXAMPLE, find_url_problem, resolve_url
+from modelserver.wire.provider import find_url_problem, resolve_url
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,6 @@ def test_given_an_invalid_url_then_the_problem_names_what_to_write(url: str, wor
     "url",
     [
         DEFAULT_URL,
-        EXAMPLE,
         "udpm://",
         "udpm://?ttl=1",
         "udpm://239.255.76.67:7667",

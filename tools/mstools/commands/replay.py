@@ -36,7 +36,7 @@ from mstools.terminal.output import (
 
 if TYPE_CHECKING:
     from modelserver.server.journal.verify import Difference, VerificationReport
-    from modelserver.server.offline import OfflineRun, TrackRow
+    from modelserver.server.recordings import OfflineRun, TrackRow
 
 RATE_HZ = 50.0
 """Default rate of poses."""
@@ -219,7 +219,7 @@ def replay_offline(
     """Write the poses of a frame, the decisions and the report of a log to the given files."""
     # imported before the clock starts: the printed speed is that of the replay
     from modelserver.config.vehicle_file import load_config
-    from modelserver.server.offline import CSV_HEADER, OfflineRun
+    from modelserver.server.recordings import CSV_HEADER, OfflineRun
     from modelserver.server.vehicle import load_vehicle
 
     vehicle = load_vehicle(load_config(config), str(config))

@@ -12,8 +12,7 @@ import lcm
 import typer
 
 from modelserver.config.vehicle_file import load_config
-from modelserver.server.offline import serve
-from modelserver.server.recordings import StampAxis
+from modelserver.server.recordings import StampAxis, serve
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.eventlog import LogFile
 from mstools.terminal.output import escape, show_progress
