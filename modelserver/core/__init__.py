@@ -36,7 +36,38 @@ from typing import Any, Final, TypeAlias, get_args
 import numpy as np
 
 from modelserver import messages
-from modelserver.core.state import *
+from modelserver.core.state import (
+    CHANGE_PERIOD_NS,
+    DEGRADED,
+    LATE_LIMIT_S,
+    RUNNING,
+    SAMPLE_FUTURE_LIMIT_S,
+    START,
+    START_REPORT_NS,
+    STARTING,
+    AllOutputs,
+    CoreSettings,
+    CoreState,
+    ExpectedSensor,
+    HealthConditions,
+    Instant,
+    Outputs,
+    SourceTraffic,
+    StepResult,
+    TimedRequest,
+    WaitingRequest,
+    count_decision,
+    count_message,
+    count_rejection,
+    format_offset,
+    get_silence_limit,
+    handle_rejected,
+    handle_warning,
+    is_clock_off,
+    mark_received,
+    note_offset,
+    start,
+)
 from modelserver.earth.geodesy import compute_geodetic
 from modelserver.errors import Status
 from modelserver.estimation.filter.protection_levels import compute_longest_axis
@@ -751,3 +782,23 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreSta
     messages.HealthWarning: handle_warning,
     messages.Denied: handle_denied,
 }
+
+__all__ = [
+    "COMMANDS",
+    "DEGRADED",
+    "RUNNING",
+    "STARTING",
+    "AllOutputs",
+    "CoreSettings",
+    "CoreState",
+    "ExpectedSensor",
+    "Instant",
+    "ModelLoaded",
+    "get_state_to_persist",
+    "is_answerable",
+    "reply_error",
+    "reply_internal_error",
+    "reply_overloaded",
+    "start",
+    "step",
+]
