@@ -14,8 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -26,11 +25,11 @@ from urllib.parse import parse_qs, urlsplit
 
 import typer
 
-from modelserver.errors import ModelServerError, find_nearest_names, quote
+from modelserver.errors import ModelServerError, quote
 from modelserver.extras import SYSTEM_ENVIRONMENT, make_requirement, make_system_command
 from modelserver.files import INSTALLED_FOLDER, STATE_FOLDER
 from modelserver.wire.provider import group_of
-from mstools.terminal.output import ProblemCollector, escape, make_error
+from mstools.terminal.output import ProblemCollector, escape, make_error, suggest_name, write_beside
 
 CONFIGURATION: Final = INSTALLED_FOLDER
 VEHICLE: Final = f"{CONFIGURATION}/vehicle.yaml"
@@ -176,7 +175,6 @@ def path_in_root(root: str | Path, path: str) -> Path:
 
 
 def digest(content: bytes) -> str:
-    """Return the hash of a file's content."""
     return hashlib.sha256(content).hexdigest()
 
 
@@ -286,10 +284,8 @@ def _plan_reloads(facts: SystemFacts, changed: Iterable[str]) -> list[Step]:
     return steps
 
 
-def parent_folders(path: str) -> list[str]:
-    """Return the folders around a file, the outermost first."""
-    parts = path.split("/")[:-1]
-    return ["/".join(parts[:n]) for n in range(2, len(parts) + 1)]
+def parent_folders(path: str) -> set[str]:
+    return {str(folder) for folder in Path(path).parents} - {"/"}
 
 
 def _systemctl(facts: SystemFacts, what: str, verb: str, *units: str) -> RunProgram:
@@ -321,14 +317,6 @@ _UNIT_PATH: Final = re.compile(r"/[A-Za-z0-9/._+@-]+")
 
 _DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9#+.:=@_-]+")
 """Characters that udev allows in device names."""
-
-
-@dataclass(frozen=True, slots=True)
-class SerialDriver:
-    """A driver on a serial port: its name, and the port of the vehicle file."""
-
-    name: str
-    port: str
 
 
 def is_unit_state(folder: str) -> bool:
@@ -365,8 +353,7 @@ def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
     gathered = ProblemCollector()
     for name in names:
         if name not in known:
-            near = find_nearest_names(name, known)
-            offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
+            offer = suggest_name(name, known, f"it has: {', '.join(known) or 'none'}")
             gathered.add("--drivers", f"the vehicle file has no driver {quote(name, 40)}; {offer}")
         elif not INSTANCE_NAME.fullmatch(name):
             why = f"driver {quote(name, 40)} cannot be a unit name"
@@ -448,18 +435,17 @@ def render_units(
     return writes
 
 
-def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()) -> list[WriteFile]:
+def list_configuration(sources: Mapping[str, bytes], key: str = "") -> list[WriteFile]:
     """Return the vehicle's files. `sources` are by their paths relative to the vehicle file, which is vehicle.yaml.
 
-    Those in `secret` are readable by root only.
+    The one at `key` is readable by root only.
     """
-    writes = []
-    for path, content in sources.items():
-        what, mode = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle", 0o644
-        if path in secret:
-            what, mode = "the key of signed commands", 0o600
-        writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, what, mode=mode))
-    return writes
+    kinds = {"vehicle.yaml": ("the vehicle file", 0o644), key: ("the key of signed commands", 0o600)}
+    return [
+        WriteFile(f"{CONFIGURATION}/{path}", content, what, mode=mode)
+        for path, content in sources.items()
+        for what, mode in [kinds.get(path, ("of the vehicle", 0o644))]
+    ]
 
 
 def render_sysctl(wanted: int, facts: SystemFacts) -> list[WriteFile]:
@@ -503,21 +489,21 @@ def render_credential_drop_in(key_file: str) -> list[WriteFile]:
 
 
 def render_udev_rules(
-    drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: SystemFacts
+    ports: Mapping[str, str], given: Mapping[str, str], facts: SystemFacts
 ) -> tuple[list[WriteFile], list[str]]:
     """Return the udev rules that give each driver's device a name of its own, and notes on them.
 
-    `given` are names below /dev/serial/by-id by driver, as `check_serial` accepts them; they take precedence over the
-    found ones. Raises ModelServerError.
+    `ports` are the serial ports of the vehicle file by driver; `given` are names below /dev/serial/by-id by driver, as
+    `check_serial` accepts them, and take precedence over the found ones. Raises ModelServerError.
     """
     from msdrivers.links.serial_port import BOARD_UARTS
 
     lines, notes = [], []
-    for driver in drivers:
-        own = f"{DEVICE_FOLDER}{driver.name}"
-        device = given.get(driver.name, "") or (driver.port if driver.port.startswith(BY_ID) else "")
-        device = device or next((name for name, port in sorted(facts.by_id.items()) if port == driver.port), "")
-        link = f'SYMLINK+="modelserver/{driver.name}"'
+    for name, port in ports.items():
+        own = f"{DEVICE_FOLDER}{name}"
+        device = given.get(name, "") or (port if port.startswith(BY_ID) else "")
+        device = device or next((by_id for by_id, target in sorted(facts.by_id.items()) if target == port), "")
+        link = f'SYMLINK+="modelserver/{name}"'
         known = [each for each in facts.rules.splitlines() if each.startswith("SUBSYSTEM") and each.endswith(link)]
         if device:
             device = device.removeprefix(BY_ID)
@@ -528,15 +514,15 @@ def render_udev_rules(
             lines.append(f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", {link}')
         elif known:
             lines.append(known[0])
-        elif re.fullmatch(rf"/dev/({'|'.join(BOARD_UARTS)})[0-9]+", driver.port):
+        elif re.fullmatch(rf"/dev/({'|'.join(BOARD_UARTS)})[0-9]+", port):
             # a UART of the board: its name is fixed
             continue
         else:
-            fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
-            notes.append(f"no device id is known for driver {driver.name} (port {driver.port}); {fix}")
+            fix = f"plug it in, or: --serial {name}={BY_ID}..."
+            notes.append(f"no device id is known for driver {name} (port {port}); {fix}")
             continue
-        if driver.port != own and not driver.port.startswith(BY_ID):
-            notes.append(f"driver {driver.name}: set port: {own} in the vehicle file; {driver.port} may change")
+        if port != own and not port.startswith(BY_ID):
+            notes.append(f"driver {name}: set port: {own} in the vehicle file; {port} may change")
     if not lines:
         return [], notes
     text = "# ModelServer: the devices of the vehicle file, by their ids.\n" + "".join(f"{line}\n" for line in lines)
@@ -544,14 +530,12 @@ def render_udev_rules(
     return [WriteFile(RULES, text.encode(), "names for the serial devices", summary)], notes
 
 
-def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> None:
-    """Raise ConfigError for invalid devices of --serial. `given` are names by driver."""
-    known = [each.name for each in drivers]
+def check_serial(given: Mapping[str, str], ports: Mapping[str, str]) -> None:
+    """Raise ConfigError for invalid devices of --serial. `given` are names by driver, `ports` as in the rules."""
     gathered = ProblemCollector()
     for name, device in given.items():
-        if name not in known:
-            near = find_nearest_names(name, known)
-            offer = f"did you mean {near[0]}?" if near else f"there are: {', '.join(known) or 'none'}"
+        if name not in ports:
+            offer = suggest_name(name, ports, f"there are: {', '.join(ports) or 'none'}")
             gathered.add("--serial", f"{quote(name, 40)} is not a driver on a serial port; {offer}")
         with gathered.collect("--serial"):
             _check_device(device.removeprefix(BY_ID))
@@ -643,7 +627,6 @@ def read_manifest(root: Path) -> Manifest:
 
 
 def _read_file(path: Path) -> bytes | None:
-    """Return the content of a file, None where there is none. Raises OSError."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -663,12 +646,6 @@ def can_be_realtime(systemd_run: str) -> bool:
         return subprocess.run(command, capture_output=True, timeout=20.0, check=False).returncode == 0
     except (OSError, subprocess.TimeoutExpired):
         return False
-
-
-def check_root_user(root: Path, command: str) -> None:
-    """Raise ModelServerError where this user cannot change the system."""
-    if os.geteuid() != 0 and root == Path("/"):
-        raise ModelServerError(f"this changes /etc and needs root: sudo {command} (to see what it would do: --dry-run)")
 
 
 def execute_plan(plan: Plan, root: Path, dry_run: bool) -> None:
@@ -694,7 +671,11 @@ def _print(text: str) -> None:
 def _execute_step(step: Step, root: Path) -> None:
     match step:
         case WriteFile():
-            _write(path_in_root(root, step.path), step.content, step.mode)
+            path = path_in_root(root, step.path)
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+            with write_beside(path) as draft:
+                draft.write_bytes(step.content)
+                draft.chmod(step.mode)
         case RemovePath():
             path = path_in_root(root, step.path)
             if path.is_symlink() or not path.is_dir():
@@ -707,22 +688,6 @@ def _execute_step(step: Step, root: Path) -> None:
                     path.rmdir()
         case RunProgram():
             _run(step)
-
-
-def _write(path: Path, content: bytes, mode: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
-    # atomic: a power failure leaves the old file or the new one
-    handle, draft = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with open(handle, "wb") as file:
-            file.write(content)
-            os.fchmod(file.fileno(), mode)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(draft, path)
-    finally:
-        with suppress(FileNotFoundError):
-            os.unlink(draft)
 
 
 def _run(step: RunProgram) -> None:

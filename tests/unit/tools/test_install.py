@@ -24,7 +24,6 @@ from mstools.commands import install
 from mstools.commands.check import check_vehicle
 from mstools.deployment import (
     SYSCTL,
-    SerialDriver,
     SystemFacts,
     check_drivers,
     check_serial,
@@ -253,8 +252,8 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
 
 @pytest.mark.parametrize("port", ["/dev/ttyTHS1", "/dev/ttymxc0", "/dev/ttyAMA10", "/dev/ttySC0", "/dev/ttyS0"])
 def test_given_a_uart_of_the_board_then_nobody_is_asked_to_plug_it_in(port: str) -> None:
-    assert render_udev_rules([SerialDriver("gps", port)], {}, SystemFacts()) == ([], [])
-    writes, _ = render_udev_rules([SerialDriver("gps", port)], {"gps": "usb-A"}, SystemFacts())
+    assert render_udev_rules({"gps": port}, {}, SystemFacts()) == ([], [])
+    writes, _ = render_udev_rules({"gps": port}, {"gps": "usb-A"}, SystemFacts())
     assert len(writes) == 1
 
 
@@ -463,7 +462,7 @@ BY_ID = {"usb-FTDI_A1-if00-port0": "/dev/ttyUSB0"}
 def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
     port: str, given: dict[str, str], facts: SystemFacts, device: str
 ) -> None:
-    (write,), notes = render_udev_rules([SerialDriver("gps", port)], given, facts)
+    (write,), notes = render_udev_rules({"gps": port}, given, facts)
     line = write.content.decode().splitlines()[1]
     assert line == (
         f'SUBSYSTEM=="tty", SYMLINK=="serial/by-id/{device}", ENV{{ID_MM_DEVICE_IGNORE}}="1", '
@@ -471,12 +470,12 @@ def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
     )
     assert bool(notes) == (port == "/dev/ttyUSB0")
     # unplugged at the next installation it keeps its name
-    again, _ = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts(rules=write.content.decode()))
+    again, _ = render_udev_rules({"gps": "/dev/ttyUSB0"}, {}, SystemFacts(rules=write.content.decode()))
     assert again == [write]
 
 
 def test_given_a_device_that_nobody_knows_then_a_note_reports_what_to_do() -> None:
-    writes, (note,) = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts())
+    writes, (note,) = render_udev_rules({"gps": "/dev/ttyUSB0"}, {}, SystemFacts())
     assert writes == []
     assert "--serial gps=/dev/serial/by-id/..." in note
 
@@ -484,12 +483,12 @@ def test_given_a_device_that_nobody_knows_then_a_note_reports_what_to_do() -> No
 @pytest.mark.parametrize("device", ['x", RUN+="/bin/sh', "a b", "a*", "../x"])
 def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_rejected(device: str) -> None:
     with pytest.raises(ModelServerError, match="is not a name below"):
-        render_udev_rules([SerialDriver("gps", f"/dev/serial/by-id/{device}")], {"gps": device}, SystemFacts())
+        render_udev_rules({"gps": f"/dev/serial/by-id/{device}"}, {"gps": device}, SystemFacts())
 
 
 def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_rejected() -> None:
     with pytest.raises(ModelServerError, match="is not a driver on a serial port"):
-        check_serial({"imu": "usb-Y"}, [SerialDriver("gps", "/dev/ttyUSB0")])
+        check_serial({"imu": "usb-Y"}, {"gps": "/dev/ttyUSB0"})
 
 
 def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> None:

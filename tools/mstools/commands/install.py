@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, Severity, quote
+from modelserver.errors import ConfigError, ModelServerError, Severity, quote
 from modelserver.files import read_regular
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from mstools import deployment
@@ -56,9 +56,10 @@ def command(
     if remove and (vehicle is not None or drivers != "all" or serial or not start):
         raise typer.BadParameter("excludes --vehicle, --drivers, --serial and --no-start", param_hint="--remove")
     root = root.resolve()
-    if not dry_run:
+    if not dry_run and os.geteuid() != 0 and root == Path("/"):
         words = f"--remove{' --purge' if purge else ''}" if remove else "..."
-        deployment.check_root_user(root, f"{deployment.get_command_path()} install {words}")
+        sudo = f"sudo {deployment.get_command_path()} install {words}"
+        raise ModelServerError(f"this changes /etc and needs root: {sudo} (to see what it would do: --dry-run)")
     if remove:
         plan = deployment.plan_removal(deployment.read_facts((), root), purge=purge)
     else:
@@ -90,7 +91,7 @@ def make_plan(
     if vehicle is not None:
         with gathered.collect(str(vehicle)):
             made = CheckedVehicle.load(vehicle)
-            copied = deployment.list_configuration(made.read_files(), {made.key_file})
+            copied = deployment.list_configuration(made.read_files(), made.key_file)
     # the vehicle file in force: an edited one is not replaced
     if is_installed and (vehicle is None or (made is not None and not _is_unmodified(found, vehicle, root))):
         made = None
@@ -212,9 +213,9 @@ class CheckedVehicle:
                 found.append(split_group(getattr(line, "channel", ""))[0])
         return found
 
-    def serial_of(self, names: Iterable[str]) -> list[deployment.SerialDriver]:
-        ports = ((name, getattr(self.drivers[name].line, "port", "")) for name in names)
-        return [deployment.SerialDriver(name, port) for name, port in ports if port]
+    def serial_of(self, names: Iterable[str]) -> dict[str, str]:
+        """Return the serial ports of the named drivers."""
+        return {name: port for name in names if (port := getattr(self.drivers[name].line, "port", ""))}
 
     def read_files(self) -> dict[str, bytes]:
         """Return the vehicle's files by path relative to the vehicle file, which itself is vehicle.yaml.
@@ -249,23 +250,18 @@ def parse_serial(given: Iterable[str] | None) -> dict[str, str]:
     """Return the devices of --serial by driver. Raises typer.BadParameter, a usage error."""
     found = {}
     for each in given or ():
-        name, sign, device = each.partition("=")
-        if not (name and sign and device):
+        name, _, found[name] = each.partition("=")
+        if not (name and found[name]):
             raise typer.BadParameter(f"{quote(each)} is not NAME=ID", param_hint="--serial")
-        found[name] = device
     return found
 
 
 def read_templates() -> dict[str, str]:
-    """Return the unit templates of the package or the source tree."""
     folder = deployment.get_examples_folder() / "systemd"
     return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.service"))}
 
 
 def _is_unmodified(found: Path, vehicle: Path, root: Path) -> bool:
     """Return whether the installed vehicle file equals an earlier installation's, or the given one."""
-    there = deployment.digest(found.read_bytes())
-    return there in (
-        *deployment.read_manifest(root).files.get(deployment.VEHICLE, ()),
-        deployment.digest(vehicle.read_bytes()),
-    )
+    earlier = deployment.read_manifest(root).files.get(deployment.VEHICLE, ())
+    return deployment.digest(found.read_bytes()) in (*earlier, deployment.digest(vehicle.read_bytes()))

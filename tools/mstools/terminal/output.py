@@ -184,11 +184,14 @@ def require_extra(extra: str, what: str) -> None:
 def write_beside(path: Path) -> Iterator[Path]:
     """Give the path of a draft beside a file, for a library that writes files by itself.
 
-    The draft becomes the file at the end of the block; what is interrupted leaves no half file under that name.
+    The draft becomes the file at the end of the block; what is interrupted, also by a power failure, leaves no half
+    file under that name.
     """
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         draft = Path(folder) / path.name
         yield draft
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())
         draft.replace(path)
 
 
@@ -262,6 +265,12 @@ class ProblemCollector:
 def make_error(why: str, place: str | Location, fix: str) -> ConfigError:
     """Return the error of a file or an option with one problem."""
     return ConfigError([Problem(Severity.ERROR, why, place if isinstance(place, Location) else Location(place), fix)])
+
+
+def suggest_name(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return `did you mean NAME?` with the nearest known name, `otherwise` where none is near."""
+    near = find_nearest_names(name, known)
+    return f"did you mean {near[0]}?" if near else otherwise
 
 
 def find_nearest_path(path: str | Path) -> str:
