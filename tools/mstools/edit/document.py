@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Problem, SyntaxProblemError, has_error, quote
@@ -60,49 +60,35 @@ class GeometryItem(NamedTuple):
     name: str
 
 
-class GeometryDocument:
+class GeometryDocument(YamlText):
     """Immutable text of a geometry file in YAML. Changes return another document, or raise EditError.
 
     Positions are in meters, angles in degrees: as they are written.
     """
 
-    def __init__(self, text: str | YamlText):
-        self._yaml = YamlText(text) if isinstance(text, str) else text
-
-    @property
-    def text(self) -> str:
-        return self._yaml.text
-
     # --- what is there
 
     def list_items(self) -> list[GeometryItem]:
         """Return all bodies, frames and constraints, in order."""
-        found = []
-        for body in self._yaml.keys(("bodies",)):
-            found.append(GeometryItem(ItemKind.BODY, body))
-            found += [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for frame in self._list_frames(body)]
-        return found + [GeometryItem(ItemKind.CONSTRAINT, name) for name in self._yaml.keys(("constraints",))]
+        return list(dict.fromkeys(item for _, item in self._list_places()))
 
     def find_item(self, line: int) -> GeometryItem | None:
-        """Return what stands on a line: the last item that begins on it or before."""
+        """Return what stands on a line: the last item that begins on it or before.
+
+        A frame of a template is that of the first body that names it.
+        """
         before = [(at, item) for at, item in self._list_places() if at <= line]
         return max(before, key=lambda each: each[0])[1] if before else None
 
     def _list_places(self) -> Iterator[tuple[int, GeometryItem]]:
-        """Yield each item with its line; a frame of a template is that of the first body that names it."""
-        for at, constraint in self._yaml.list_lines(("constraints",)):
-            yield at, GeometryItem(ItemKind.CONSTRAINT, constraint)
-        seen: set[str] = set()
-        for at, body in self._yaml.list_lines(("bodies",)):
+        """Yield each item with its line, the frames of a template on each body that names it."""
+        for at, body in self.list_lines(("bodies",)):
             yield at, GeometryItem(ItemKind.BODY, body)
-            template = self._get_template(body)
-            paths: list[KeyPath] = [("bodies", body, "frames")]
-            if template and template not in seen:
-                seen.add(template)
-                paths.append(("templates", template, "frames"))
-            for path in paths:
-                for of_frame, frame in self._yaml.list_lines(path):
+            for path in (("templates", self._get_template(body)), ("bodies", body)):
+                for of_frame, frame in self.list_lines((*path, "frames")):
                     yield of_frame, GeometryItem(ItemKind.FRAME, names.join(body, frame))
+        for at, constraint in self.list_lines(("constraints",)):
+            yield at, GeometryItem(ItemKind.CONSTRAINT, constraint)
 
     def find_template(self, item: GeometryItem) -> str:
         """Return the template from which a frame of a body comes, empty if it is the body's own."""
@@ -110,23 +96,18 @@ class GeometryDocument:
             return ""
         body, frame = names.split(item.name)
         template = self._get_template(body)
-        own = self._yaml.has(("bodies", body, "frames", frame))
-        return template if not own and self._yaml.has(("templates", template, "frames", frame)) else ""
+        own = self.has(("bodies", body, "frames", frame))
+        return template if not own and self.has(("templates", template, "frames", frame)) else ""
 
     def list_users(self, template: str) -> list[str]:
-        return [body for body in self._yaml.keys(("bodies",)) if self._get_template(body) == template]
+        return [body for body in self.keys(("bodies",)) if self._get_template(body) == template]
 
     def get_yaml(self, item: GeometryItem) -> str:
         """Return the entry of an item as it is written, without indentation."""
-        return self._yaml.get_entry(self._find_path(item))
+        return self.get_entry(self._find_path(item))
 
     def _get_template(self, body: str) -> str:
-        return self._yaml.get_text(("bodies", body, "template"))
-
-    def _list_frames(self, body: str) -> list[str]:
-        own = self._yaml.keys(("bodies", body, "frames"))
-        shared = self._yaml.keys(("templates", self._get_template(body), "frames"))
-        return list(dict.fromkeys([*shared, *own]))
+        return self.get_text(("bodies", body, "template"))
 
     def _find_path(self, item: GeometryItem) -> KeyPath:
         """Return where an item is written. Raises EditError if it is not there."""
@@ -137,15 +118,13 @@ class GeometryDocument:
             path = (*path, "frames", frame)
         else:
             path = ("bodies" if item.kind is ItemKind.BODY else "constraints", item.name)
-        if not self._yaml.has(path):
+        if not self.has(path):
             raise EditError(f"there is no {item.kind} {quote(item.name)}")
         return path
 
     # --- numbers and texts
 
-    def set_pose(
-        self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3, in_template: bool = False
-    ) -> GeometryDocument:
+    def set_pose(self, item: GeometryItem, xyz: Vector3, rpy_deg: Vector3, in_template: bool = False) -> Self:
         """Set the pose of a frame on its body, or of a constraint. Only what differs is written."""
         _check_finite((*xyz, *rpy_deg))
         text, path = self._open(item, in_template)
@@ -154,16 +133,15 @@ class GeometryDocument:
         has_matrix = text.has((*path, "matrix"))
         if is_turned or has_matrix:
             for key in ("rpy", "quaternion", "rotation", "matrix"):
-                if text.has((*path, key)):
-                    text = text.remove((*path, key))
-            text = _set_numbers(text, path, "rpy_deg", rpy_deg)
+                text = text.drop((*path, key))
+            text = text._set_numbers(path, "rpy_deg", rpy_deg)
         if has_matrix or max(abs(a - b) for a, b in zip(old.xyz, xyz, strict=True)) > SAME_METERS:
-            text = _set_numbers(text, path, "xyz", xyz)
-        return GeometryDocument(text)
+            text = text._set_numbers(path, "xyz", xyz)
+        return text
 
     def set_sigma(
         self, item: GeometryItem, xyz: Vector3 | None, rpy_deg: Vector3 | None, in_template: bool = False
-    ) -> GeometryDocument:
+    ) -> Self:
         """Set the standard deviations of a frame or constraint; a part that is None is not stated."""
         _check_finite([*(xyz or ()), *(rpy_deg or ())])
         text, path = self._open(item, in_template)
@@ -173,79 +151,77 @@ class GeometryDocument:
             if values is not None
         ]
         if stated:
-            return GeometryDocument(_set(text, path, "sigma", f"{{{', '.join(stated)}}}"))
-        return GeometryDocument(text.remove((*path, "sigma")) if text.has((*path, "sigma")) else text)
+            return text._set_key(path, "sigma", f"{{{', '.join(stated)}}}")
+        return text.drop((*path, "sigma"))
 
-    def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> GeometryDocument:
+    def set_description(self, item: GeometryItem, description: str, in_template: bool = False) -> Self:
         """Set the description of an item, or remove it where it is empty."""
         text, path = self._open(item, in_template)
         if description == text.get_text((*path, "description")):
-            return GeometryDocument(text)
+            return text
         if description:
-            return GeometryDocument(_set(text, path, "description", _format_word(description)))
-        return GeometryDocument(text.remove((*path, "description")) if text.has((*path, "description")) else text)
+            return text._set_key(path, "description", _format_word(description))
+        return text.drop((*path, "description"))
 
-    def set_ends(self, constraint: str, from_: str, to: str) -> GeometryDocument:
+    def set_ends(self, constraint: str, from_: str, to: str) -> Self:
         """Set the frames that a constraint joins."""
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         for key, frame in (("from", from_), ("to", to)):
             if _normalize(text.get_text((*path, key))) != frame:
-                text = _set(text, path, key, _format_full_name(frame))
-        return GeometryDocument(text)
+                text = text._set_key(path, key, _format_full_name(frame))
+        return text
 
-    def set_joint(self, constraint: str, old: Joint, new: Joint) -> GeometryDocument:
+    def set_joint(self, constraint: str, old: Joint, new: Joint) -> Self:
         """Set the joint of a constraint, `old` before; keys whose value is the same stay as they are written."""
         text, path = self._open(GeometryItem(ItemKind.CONSTRAINT, constraint))
         inside = (*path, "joint")
         if not new.is_movable:
-            return GeometryDocument(text.remove(inside) if text.has(inside) else text)
+            return text.drop(inside)
         was, now = (dict(each.split(": ", 1) for each in format_joint_fields(joint)) for joint in (old, new))
         if not text.keys(inside):
-            value = f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}"
-            return GeometryDocument(_set(text, path, "joint", value))
+            return text._set_key(path, "joint", f"{{{', '.join(f'{key}: {each}' for key, each in now.items())}}}")
         for key in [*was, *(each for each in now if each not in was)]:
             if was.get(key) == now.get(key):
                 continue
             for written in (key, key.removesuffix("_deg")):
-                if text.has((*inside, written)) and (written != key or key not in now):
-                    text = text.remove((*inside, written))
+                if written != key or key not in now:
+                    text = text.drop((*inside, written))
             if key in now:
                 text = text.set((*inside, key), now[key])
-        return GeometryDocument(text)
+        return text
 
     # --- items
 
-    def add_body(self, name: str) -> GeometryDocument:
+    def add_body(self, name: str) -> Self:
         self._make_new(ItemKind.BODY, name)
-        entry = f"{_format_key(name)}:\n  frames:\n    Origin: {{}}"
-        return GeometryDocument(self._yaml.add(("bodies",), entry, in_block=True))
+        return self.add(("bodies",), f"{_format_key(name)}:\n  frames:\n    Origin: {{}}", in_block=True)
 
-    def add_frame(self, body: str, name: str, xyz: Vector3 = (0.0, 0.0, 0.0)) -> GeometryDocument:
+    def add_frame(self, body: str, name: str, xyz: Vector3 = (0.0, 0.0, 0.0)) -> Self:
         """Add a frame to a body, along the body's axes."""
         self._make_new(ItemKind.FRAME, name, body)
         self._find_path(GeometryItem(ItemKind.BODY, body))
-        value = f"{{xyz: {_format_numbers(xyz)}}}" if any(xyz) else "{}"
-        return GeometryDocument(
-            self._yaml.add(("bodies", body, "frames"), f"{_format_key(name)}: {value}", in_block=True)
+        value = (
+            f"{{xyz: [{', '.join(format_number(round(each, DECIMALS) + 0.0) for each in xyz)}]}}" if any(xyz) else "{}"
         )
+        return self.add(("bodies", body, "frames"), f"{_format_key(name)}: {value}", in_block=True)
 
-    def add_constraint(self, name: str, from_: str, to: str) -> GeometryDocument:
+    def add_constraint(self, name: str, from_: str, to: str) -> Self:
         """Add a constraint at which two frames coincide."""
         self._make_new(ItemKind.CONSTRAINT, name)
         entry = f"{_format_key(name)}:\n  from: {_format_full_name(from_)}\n  to: {_format_full_name(to)}"
-        return GeometryDocument(self._yaml.add(("constraints",), entry, in_block=True))
+        return self.add(("constraints",), entry, in_block=True)
 
-    def duplicate(self, item: GeometryItem, name: str) -> GeometryDocument:
+    def duplicate(self, item: GeometryItem, name: str) -> Self:
         """Add a copy of an item directly after it; a frame's copy is on the same body, `name` without the body."""
         path = self._find_path(item)
         body = names.split(item.name)[0] if item.kind is ItemKind.FRAME else ""
         self._make_new(item.kind, name, body)
-        entry = YamlText(self._yaml.get_entry(path))
-        copy = entry.rename((path[-1],), _format_key(name)).text
+        entry = YamlText(self.get_entry(path))
+        copy = entry.rename_key((path[-1],), _format_key(name)).text
         place = ("bodies", body, "frames") if body else path[:-1]
-        return GeometryDocument(self._yaml.add(place, copy, after=path[-1], in_block=True))
+        return self.add(place, copy, after=path[-1], in_block=True)
 
-    def rename(self, item: GeometryItem, name: str, in_template: bool = False) -> GeometryDocument:
+    def rename(self, item: GeometryItem, name: str, in_template: bool = False) -> Self:
         """Rename an item, a frame without its body, and what refers to it in this file."""
         body, frame = names.split(item.name) if item.kind is ItemKind.FRAME else (item.name, "")
         new = self._make_new(item.kind, name, body if frame else "")
@@ -253,29 +229,27 @@ class GeometryDocument:
         if template and not in_template:
             raise EditError(f"{item.name} is a frame of template {template}; change the template to rename it")
         path = self._find_path(item)
-        text = self._yaml.rename(path, _format_key(name))
+        text = self.rename_key(path, _format_key(name))
         if item.kind is ItemKind.CONSTRAINT:
-            return GeometryDocument(_rename_leader(text, item.name, name))
+            return text._rename_leader(item.name, name)
         renamed = {item.name: new.name}
         if template:
-            users = [
-                each for each in self.list_users(template) if not self._yaml.has(("bodies", each, "frames", frame))
-            ]
-            renamed = {names.join(user, frame): names.join(user, name) for user in users}
+            copies = self._list_copies(template, frame)
+            renamed = {each: names.join(names.split(each)[0], name) for each in copies}
         for constraint, end, joined in self._list_ends():
             other = renamed.get(joined, joined)
             if item.kind is ItemKind.BODY and joined.partition(":")[0] == body:
                 other = names.join(name, joined.partition(":")[2])
             if other != joined:
                 text = text.set(("constraints", constraint, end), _format_full_name(other))
-        return GeometryDocument(text)
+        return text
 
-    def delete(self, item: GeometryItem, in_template: bool = False) -> GeometryDocument:
+    def delete(self, item: GeometryItem, in_template: bool = False) -> Self:
         """Delete an item, and the constraints at a body or frame."""
         template = self.find_template(item)
         if template and not in_template:
             raise EditError(f"{item.name} is a frame of template {template}; change the template to delete it")
-        text = self._yaml.remove(self._find_path(item))
+        text = self.remove(self._find_path(item))
         gone = {item.name}
         if template:
             gone = set(self._list_copies(template, names.split(item.name)[1]))
@@ -288,25 +262,25 @@ class GeometryDocument:
             }
             for constraint in lost:
                 text = text.remove(("constraints", constraint))
-        return GeometryDocument(text)
+        return text
 
-    def set_yaml(self, item: GeometryItem, entry: str) -> GeometryDocument:
+    def set_yaml(self, item: GeometryItem, entry: str) -> Self:
         """Write the entry of an item, `name: value`, as given. Its name stays."""
         path = self._find_path(item)
         keys = YamlText(entry).keys()
         if keys != [path[-1]]:
             raise EditError(f"the text is one entry that begins with {path[-1]}:")
-        return GeometryDocument(self._yaml.replace_entry(path, entry))
+        return self.replace_entry(path, entry)
 
     # --- inside
 
-    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[YamlText, KeyPath]:
+    def _open(self, item: GeometryItem, in_template: bool = False) -> tuple[Self, KeyPath]:
         """Return the text, in which a frame of a template has an entry on its body if that alone is changed."""
         path = self._find_path(item)
         if path[0] != "templates" or in_template:
-            return self._yaml, path
+            return self, path
         body, _ = names.split(item.name)
-        text = self._yaml.add(("bodies", body, "frames"), self._yaml.get_entry(path), in_block=True)
+        text = self.add(("bodies", body, "frames"), self.get_entry(path), in_block=True)
         return text, ("bodies", body, "frames", path[-1])
 
     def _make_new(self, kind: ItemKind, name: str, body: str = "") -> GeometryItem:
@@ -321,25 +295,45 @@ class GeometryDocument:
 
     def _list_copies(self, template: str, frame: str) -> list[str]:
         """Return the full names of a template's frame on the bodies that have it from there."""
-        found = [GeometryItem(ItemKind.FRAME, names.join(body, frame)) for body in self.list_users(template)]
-        return [item.name for item in found if self.find_template(item)]
+        copies = (GeometryItem(ItemKind.FRAME, names.join(body, frame)) for body in self.list_users(template))
+        return [item.name for item in copies if self.find_template(item)]
 
     def _list_ends(self) -> Iterator[tuple[str, str, str]]:
         """Yield each end of each constraint: constraint, key, frame."""
-        for constraint in self._yaml.keys(("constraints",)):
+        for constraint in self.keys(("constraints",)):
             for end in ("from", "to"):
-                if joined := _normalize(self._yaml.get_text(("constraints", constraint, end))):
+                if joined := _normalize(self.get_text(("constraints", constraint, end))):
                     yield constraint, end, joined
 
+    def _rename_leader(self, old: str, new: str) -> Self:
+        """Rename the constraint that mimic joints follow."""
+        text = self
+        for constraint in text.keys(("constraints",)):
+            path = ("constraints", constraint, "joint", "mimic")
+            for place in (path, (*path, "joint")):
+                if text.get_text(place) == old:
+                    text = text.set(place, _format_word(new))
+        return text
 
-def _rename_leader(text: YamlText, old: str, new: str) -> YamlText:
-    """Rename the constraint that mimic joints follow."""
-    for constraint in text.keys(("constraints",)):
-        path = ("constraints", constraint, "joint", "mimic")
-        for place in (path, (*path, "joint")):
-            if text.get_text(place) == old:
-                text = text.set(place, _format_word(new))
-    return text
+    def _set_key(self, path: KeyPath, key: str, value: str) -> Self:
+        """Set a key of an entry; a new one stands after those that usually precede it."""
+        if self.has((*path, key)):
+            return self.set((*path, key), value)
+        usual = WRITTEN_ORDER[: WRITTEN_ORDER.index(key)]
+        before = [each for each in self.keys(path) if each in usual]
+        if before or not self.keys(path):
+            return self.add(path, f"{key}: {value}", before[-1] if before else "")
+        return self.insert_first(path, f"{key}: {value}")
+
+    def _set_numbers(self, path: KeyPath, key: str, values: Sequence[float]) -> Self:
+        """Set a list of numbers; those that are the same stay as they are written."""
+        written = self.get_list((*path, key))
+        old = [_parse(each) for each in written] if len(written) == len(values) else [math.nan] * len(values)
+        new = [round(value, DECIMALS) + 0.0 for value in values]
+        if old == new or (not written and not any(new)):
+            return self
+        shown = [written[n] if old[n] == value else format_number(value) for n, value in enumerate(new)]
+        return self._set_key(path, key, f"[{', '.join(shown)}]")
 
 
 def _read_pose(text: YamlText, path: KeyPath) -> Pose:
@@ -351,31 +345,7 @@ def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     return read_pose(YamlMapping(ModelBuilder(), "", root.pairs[0][1], "", WRITTEN_ORDER)) or Pose.identity()
 
 
-def _set(text: YamlText, path: KeyPath, key: str, value: str) -> YamlText:
-    """Set a key of an entry; a new one stands after those that usually precede it."""
-    if text.has((*path, key)):
-        return text.set((*path, key), value)
-    usual = WRITTEN_ORDER[: WRITTEN_ORDER.index(key)]
-    before = [each for each in text.keys(path) if each in usual]
-    if before or not text.keys(path):
-        return text.add(path, f"{key}: {value}", before[-1] if before else "")
-    return text.insert_first(path, f"{key}: {value}")
-
-
-def _set_numbers(text: YamlText, path: KeyPath, key: str, values: Sequence[float]) -> YamlText:
-    """Set a list of numbers; those that are the same stay as they are written."""
-    written = text.get_list((*path, key)) or []
-    old = [_parse(each) for each in written] if len(written) == len(values) else [math.nan] * len(values)
-    new = [round(value, DECIMALS) + 0.0 for value in values]
-    if old == new or (not written and not any(new)):
-        return text
-    same = [a == b for a, b in zip(old, new, strict=True)]
-    shown = [written[n] if same[n] else format_number(value) for n, value in enumerate(new)]
-    return _set(text, path, key, f"[{', '.join(shown)}]")
-
-
 def _check_finite(values: Sequence[float]) -> None:
-    """Raise EditError for a number that is not finite."""
     for value in values:
         if not math.isfinite(value):
             raise EditError(f"{value} is no number of a pose or sigma; enter a finite one")
@@ -386,10 +356,6 @@ def _parse(text: str) -> float:
         return parse_number(text)
     except ValueError:
         return math.nan
-
-
-def _format_numbers(values: Sequence[float]) -> str:
-    return f"[{', '.join(format_number(round(value, DECIMALS) + 0.0) for value in values)}]"
 
 
 def _format_key(name: str) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import yaml
 
@@ -47,7 +47,7 @@ class TextEntry(NamedTuple):
 
 
 class YamlText:
-    """Immutable YAML text. Each change returns another one, or raises EditError."""
+    """Immutable YAML text. Each change returns another one of this class, or raises EditError."""
 
     def __init__(self, text: str):
         self.text = text
@@ -76,7 +76,6 @@ class YamlText:
         return [each.name for each in self.entries(path)]
 
     def has(self, path: KeyPath) -> bool:
-        """Return whether a key is there."""
         return self._find(path) is not None
 
     def get_text(self, path: KeyPath) -> str:
@@ -84,11 +83,11 @@ class YamlText:
         node = self._get(path)
         return str(node.value).strip() if isinstance(node, yaml.ScalarNode) else ""
 
-    def get_list(self, path: KeyPath) -> list[str] | None:
-        """Return the texts of a list of scalars, None if it is none."""
+    def get_list(self, path: KeyPath) -> list[str]:
+        """Return the texts of a list of scalars, empty if it is none."""
         node = self._get(path)
         if not isinstance(node, yaml.SequenceNode) or any(not isinstance(each, yaml.ScalarNode) for each in node.value):
-            return None
+            return []
         return [str(each.value) for each in node.value]
 
     def get_entry(self, path: KeyPath) -> str:
@@ -104,7 +103,7 @@ class YamlText:
 
     # --- changes
 
-    def set(self, path: KeyPath, value: str) -> YamlText:
+    def set(self, path: KeyPath, value: str) -> Self:
         """Set the value of a key to a value on one line; the key is added last if it is absent."""
         found = self._find(path)
         if found is None:
@@ -116,7 +115,7 @@ class YamlText:
             return self._set_value(found, f" {value}")
         return self._replace(begin, found.end, value)
 
-    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> YamlText:
+    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> Self:
         """Add an entry `key: value`, of one or more lines without indentation, to a mapping.
 
         It stands after the key `after`, else last. An empty mapping gets braces, or with `in_block` lines of its own;
@@ -129,7 +128,11 @@ class YamlText:
         self._check_own(path, is_whole=False)
         entries = self.entries(path)
         if not entries:
-            return self._fill(path, entry, in_block)
+            found = self._require(path)
+            if in_block and not found.is_flow:
+                indent = " " * (found.key.start_mark.column + self._get_step())
+                return self._set_value(found, self._newline + self._indent(entry, indent))
+            return self._set_value(found, f" {{{entry}}}")
         last = next((each for each in entries if each.name == after), entries[-1])
         if node.flow_style:
             if "\n" in entry:
@@ -137,24 +140,18 @@ class YamlText:
             return self._replace(last.end, last.end, f", {entry}")
         indent = " " * entries[0].key.start_mark.column
         end = self._find_line_end(last.end)
-        gap = self._newline if self._has_gaps(entries) else ""
+        # by the first two, whether a blank line stands between entries
+        has_gaps = len(entries) > 1 and self._newline * 2 in self.text[entries[0].end : entries[1].line + 1]
+        gap = self._newline if has_gaps else ""
         return self._replace(end, end, self._newline + gap + self._indent(entry, indent))
 
-    def _fill(self, path: KeyPath, entry: str, in_block: bool) -> YamlText:
-        """Add the first entry of a mapping that is empty or has no value."""
-        found = self._require(path)
-        if in_block and not found.is_flow:
-            indent = " " * (found.key.start_mark.column + self._get_step())
-            return self._set_value(found, self._newline + self._indent(entry, indent))
-        return self._set_value(found, f" {{{entry}}}")
-
-    def _set_value(self, entry: TextEntry, value: str) -> YamlText:
+    def _set_value(self, entry: TextEntry, value: str) -> Self:
         """Write a value, with the space before it, behind the colon of an entry."""
         if entry.colon:
             return self._replace(entry.colon, entry.end, value)
         return self._replace(entry.end, entry.end, f":{value}")
 
-    def insert_first(self, path: KeyPath, entry: str) -> YamlText:
+    def insert_first(self, path: KeyPath, entry: str) -> Self:
         """Add an entry on one line before the others of a mapping."""
         entries = self.entries(path)
         if not entries:
@@ -166,13 +163,15 @@ class YamlText:
             return self._replace(at, at, f"{entry}, ")
         return self._replace(at, at, entry + self._newline + " " * first.key.start_mark.column)
 
-    def remove(self, path: KeyPath) -> YamlText:
+    def remove(self, path: KeyPath) -> Self:
         """Remove a key with its value, and the comment on the lines directly before it."""
         found = self._require(path)
         self._check_own(path)
         entries = self.entries(path[:-1])
         if len(entries) == 1 and len(path) > 1:
-            return self._empty(path[:-1], found)
+            if found.is_flow:
+                return self._replace(found.key.start_mark.index, found.end, "")
+            return self._set_value(self._require(path[:-1]), " {}")
         number = next(n for n, each in enumerate(entries) if each.name == path[-1])
         if found.is_flow:
             if number + 1 < len(entries):
@@ -187,19 +186,17 @@ class YamlText:
             begin = max(begin - len(self._newline), 0)
         return self._replace(begin, end, "")
 
-    def _empty(self, path: KeyPath, last: TextEntry) -> YamlText:
-        """Remove the only entry of a mapping."""
-        if last.is_flow:
-            return self._replace(last.key.start_mark.index, last.end, "")
-        return self._set_value(self._require(path), " {}")
+    def drop(self, path: KeyPath) -> Self:
+        """Remove a key where it is there."""
+        return self.remove(path) if self.has(path) else self
 
-    def rename(self, path: KeyPath, key: str) -> YamlText:
+    def rename_key(self, path: KeyPath, key: str) -> Self:
         """Write another key, as YAML, in the place of one."""
         found = self._require(path)
         self._check_own(path[:-1], is_whole=False)
         return self._replace(found.key.start_mark.index, found.key.end_mark.index, key)
 
-    def replace_entry(self, path: KeyPath, entry: str) -> YamlText:
+    def replace_entry(self, path: KeyPath, entry: str) -> Self:
         """Write another entry, `key: value` of one or more lines without indentation, in the place of one."""
         found = self._require(path)
         self._check_own(path)
@@ -210,8 +207,8 @@ class YamlText:
 
     # --- where things stand
 
-    def _replace(self, begin: int, end: int, text: str) -> YamlText:
-        return YamlText(self.text[:begin] + text + self.text[end:])
+    def _replace(self, begin: int, end: int, text: str) -> Self:
+        return type(self)(self.text[:begin] + text + self.text[end:])
 
     def _get(self, path: KeyPath) -> Any:
         found = self._find(path)
@@ -317,12 +314,6 @@ class YamlText:
                 break
             begin = previous
         return begin
-
-    def _has_gaps(self, entries: list[TextEntry]) -> bool:
-        """Return whether a blank line stands between the entries of a block, by its first two."""
-        if len(entries) < 2:
-            return False
-        return self._newline * 2 in self.text[entries[0].end : entries[1].line + 1]
 
     def _get_step(self) -> int:
         """Return by how much the file indents: as its first nested block does."""
