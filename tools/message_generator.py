@@ -124,7 +124,6 @@ class Struct:
 
     @property
     def base(self) -> str:
-        """Its name without the ending."""
         return self.name.removesuffix("_t")
 
     @property
@@ -134,7 +133,6 @@ class Struct:
 
     @property
     def is_tuple(self) -> bool:
-        """Whether its value is a NamedTuple."""
         return self.options.get("value", "").endswith(" tuple")
 
     @property
@@ -143,7 +141,6 @@ class Struct:
         return self.options.get("codec", "")
 
     def in_order(self, values: Mapping[str, T]) -> list[T]:
-        """Return values by the name of their attribute in the order of the attributes."""
         order = self.options.get("order", "").split()
         return [values[name] for name in order] if order else list(values.values())
 
@@ -212,7 +209,6 @@ def parse_struct(text: str, source: str = "") -> Struct:
 
 
 def read_structs(folder: Path) -> dict[str, Struct]:
-    """Return the structs of the .lcm files in a folder by name."""
     structs = [parse_struct(path.read_text(encoding="utf-8"), str(path)) for path in sorted(folder.glob("*.lcm"))]
     return {each.name: each for each in structs}
 
@@ -346,7 +342,6 @@ class _Codecs:
         return self._formats.setdefault(code, f"_S{len(self._formats)}")
 
     def formats(self) -> str:
-        """Return the definitions of the formats that were used."""
         return "\n".join(f'{name} = struct.Struct(">{code}")' for code, name in self._formats.items())
 
     def write_constants(self, struct: Struct) -> list[str]:
@@ -497,7 +492,6 @@ class _Reader:
         self._offset = 0
 
     def position(self) -> str:
-        """Return the expression of where the next field begins."""
         return f"at + {self._offset}" if self._offset else "at"
 
     def flush(self) -> None:

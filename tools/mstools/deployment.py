@@ -170,7 +170,6 @@ class SystemFacts:
 
 
 def path_in_root(root: str | Path, path: str) -> Path:
-    """Return the location of an absolute path of a system with the given root."""
     return Path(root, path.lstrip("/"))
 
 
@@ -567,7 +566,6 @@ def get_command_path() -> str:
 
 
 def get_examples_folder() -> Path:
-    """Return the folder of vehicle files and units that comes with the package."""
     installed = Path(str(files("modelserver"))) / "share" / "config"
     return installed if installed.is_dir() else Path(__file__).resolve().parents[2] / "config"
 

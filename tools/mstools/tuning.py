@@ -165,7 +165,6 @@ def search(
 
 
 def _step(parameter: Parameter, value: float, begin: float, up: bool) -> float | None:
-    """Return the value after a step, None where it is out of bounds."""
     trial = max(value, parameter.from_value) * FACTOR if up else value / FACTOR
     start = max(begin, parameter.from_value) if up else begin
     high, low = min(parameter.high, start * MAX_FACTOR), max(parameter.low, start / MAX_FACTOR)
@@ -253,7 +252,6 @@ class UsableFixes:
 
     @property
     def begin(self) -> int:
-        """Stamp of the first fix, utime."""
         return self.samples[0].header.utime
 
     @property

@@ -61,7 +61,6 @@ class MountCheck:
 
     @property
     def text(self) -> str:
-        """The result as text."""
         measured, stated = axis_name(self.measured_up), axis_name(self.stated_up)
         degrees = math.degrees(self.angle)
         if self.is_consistent:
@@ -126,7 +125,6 @@ def aligned_rotations() -> tuple[Quaternion, ...]:
 
 
 def axis_name(direction: Vector3) -> str:
-    """Return the axis nearest to a direction, e.g. `+y`."""
     index = max(range(3), key=lambda each: abs(direction[each]))
     return f"{'+' if direction[index] >= 0 else '-'}{'xyz'[index]}"
 
@@ -229,7 +227,6 @@ QUANTITIES = (
 
 
 def propose_settings(noise: ImuNoise) -> dict[str, float]:
-    """Return the filter settings that were determined."""
     return {each.setting: value for each in QUANTITIES if each.setting and math.isfinite(value := each.propose(noise))}
 
 
@@ -237,7 +234,6 @@ VIBRATION_NOTE = "of the stationary unit, without the vibration of engine and ro
 
 
 def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[str]:
-    """Return the report on noise as lines."""
     lines = [
         f"{log}: {format_count(noise.samples, 'sample')}, {noise.rate_hz:.1f} Hz; stationary, used: {noise.begin:.1f} "
         f"to {noise.end:.1f} s of the log ({noise.seconds:.1f} s)"
@@ -286,7 +282,6 @@ def format_noise_yaml(log: str, noise: ImuNoise) -> str:
 
 
 def render_noise_page(log: str, noise: ImuNoise) -> str:
-    """Return an HTML page with the Allan deviations."""
     drawn = [
         _render_allan_chart("Gyro", "rad/s", noise.gyro, QUANTITIES[0].propose(noise)),
         _render_allan_chart("Accelerometer", "m/s²", noise.accelerometer, QUANTITIES[3].propose(noise)),
@@ -313,7 +308,6 @@ def _render_allan_chart(name: str, unit: str, axes: Sequence[AxisNoise], white: 
 
 
 def format_magnetometer(log: str, found: MagnetometerFit, position: Vector3 | None, field: Vector3 | None) -> list[str]:
-    """Return the report on a magnetometer as lines."""
     seen = sum(found.sectors)
     lines = [
         f"{log}: {format_count(found.samples, 'sample')}, {seen} of {SECTORS} sectors of 30 degrees seen, "

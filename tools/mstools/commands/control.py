@@ -122,7 +122,6 @@ def find_rejection(before: Health | None, now: Health, sources: Collection[str])
 
 
 def parse_mode(text: str) -> Mode:
-    """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest name."""
     name = text.strip().replace("-", "_").lower()
     return Mode[(name if name in MODES else choose_name(text, MODES, "mode", "MODE")).upper()]
 

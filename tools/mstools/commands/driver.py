@@ -264,7 +264,6 @@ def run(
 
 
 def stop_on_signal(runner: Runner[Any]) -> None:
-    """Let SIGTERM and Ctrl-C end a runner."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
 
@@ -502,7 +501,6 @@ def emulate(
 
 
 def _make_device_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str) -> Link[Any]:
-    """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
     from msdrivers.links import TcpServerLink
     from msdrivers.links.serial_port import PtyLink
     from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings

@@ -188,7 +188,6 @@ def _match_frames(model: Model, patterns: Sequence[str]) -> list[str]:
 
 
 def _parse_numbers(given: Sequence[str] | None, hint: str) -> dict[str, float]:
-    """Return the numbers of NAME=NUMBER by name. Raises typer.BadParameter."""
     found = {}
     for text in given or ():
         name, _, value = text.rpartition("=")

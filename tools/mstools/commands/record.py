@@ -192,7 +192,6 @@ class Recorder:
         return path.open("wb")
 
     def close(self) -> None:
-        """Finish the file."""
         if self._file is not None:
             self._file.close()
             self.parts.append((self._name_part(self._number - 1), self._size))
@@ -207,7 +206,6 @@ class Recorder:
         )
 
     def format_channels(self) -> str:
-        """Format channels, types and rates as a table."""
         rows = [
             (
                 name,

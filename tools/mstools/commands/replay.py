@@ -304,7 +304,6 @@ def replay_offline(
 def _track_progress(
     events: Iterable[LogEvent], show: Callable[[float], object], channels: set[str]
 ) -> Iterator[LogEvent]:
-    """Yield events, update the progress bar, and collect their channels."""
     updated = 0.0
     for event in events:
         channels.add(event.channel)

@@ -390,12 +390,10 @@ def get_types_jar() -> Path:
 
 
 def get_cache_folder() -> Path:
-    """Return this program's folder in the user's cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modelserver"
 
 
 def hash_contract(files: Sequence[Path]) -> str:
-    """Return a hash of these types and of the version of lcm."""
     digest = hashlib.sha256(version("lcm").encode())
     for path in files:
         digest.update(b"\0%b\0%b" % (path.name.encode(), path.read_bytes()))

@@ -205,7 +205,6 @@ def _describe_loop(closing: LoopClosure, model: Model) -> str:
 
 
 def describe_joint(constraint: Constraint) -> str:
-    """Describe a constraint's joint: type, and limits in degrees and meters."""
     joint = constraint.joint
     if not joint.is_movable:
         return "fixed"
@@ -241,7 +240,6 @@ def _format_number(value: float, joint: Joint, number: int, signed: bool = False
 
 
 def describe_crossing(crossing: Crossing, notes: Mapping[str, str] = NO_NOTES) -> str:
-    """Describe the constraint between a body and its parent, with its note by its name."""
     direction = "" if crossing.forward else ", from here"
     constraint = crossing.constraint
     return f"{constraint.name}: {describe_joint(constraint)}{notes.get(constraint.name, '')}{direction}"

@@ -122,7 +122,6 @@ def has_screen() -> bool:
 
 
 def check_installed() -> None:
-    """Raise ModelServerError if the extra `view` is not installed."""
     require_extra("view", "the viewer needs viser")
 
 

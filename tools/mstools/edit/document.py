@@ -69,7 +69,6 @@ class GeometryDocument(YamlText):
     # --- what is there
 
     def list_items(self) -> list[GeometryItem]:
-        """Return all bodies, frames and constraints, in order."""
         return list(dict.fromkeys(item for _, item in self._list_places()))
 
     def find_item(self, line: int) -> GeometryItem | None:
@@ -206,7 +205,6 @@ class GeometryDocument(YamlText):
         return self.add(("bodies", body, "frames"), f"{_format_key(name)}: {value}", in_block=True)
 
     def add_constraint(self, name: str, from_: str, to: str) -> Self:
-        """Add a constraint at which two frames coincide."""
         self._make_new(ItemKind.CONSTRAINT, name)
         entry = f"{_format_key(name)}:\n  from: {_format_full_name(from_)}\n  to: {_format_full_name(to)}"
         return self.add(("constraints",), entry, in_block=True)
@@ -306,7 +304,6 @@ class GeometryDocument(YamlText):
                     yield constraint, end, joined
 
     def _rename_leader(self, old: str, new: str) -> Self:
-        """Rename the constraint that mimic joints follow."""
         text = self
         for constraint in text.keys(("constraints",)):
             path = ("constraints", constraint, "joint", "mimic")
@@ -479,12 +476,10 @@ class EditSession:
 
     @property
     def is_changed(self) -> bool:
-        """Whether there is something to save."""
         return self.document.text != self._saved.removeprefix(_BOM)
 
     @property
     def has_errors(self) -> bool:
-        """Whether a problem forbids to save."""
         return has_error(self.problems)
 
     @property
@@ -514,7 +509,6 @@ class EditSession:
             self._check()
 
     def redo(self) -> None:
-        """Make the last undone change again."""
         if self._undone:
             self._steps.append(self._undone.pop())
             self._check()

@@ -187,7 +187,6 @@ class YamlText:
         return self._replace(begin, end, "")
 
     def drop(self, path: KeyPath) -> Self:
-        """Remove a key where it is there."""
         return self.remove(path) if self.has(path) else self
 
     def rename_key(self, path: KeyPath, key: str) -> Self:
@@ -293,14 +292,12 @@ class YamlText:
         return end
 
     def _find_line_end(self, at: int) -> int:
-        """Return where the line of an offset ends, before its line break."""
         end = self.text.find("\n", at)
         if end < 0:
             return len(self.text)
         return end - 1 if self.text[end - 1 : end] == "\r" else end
 
     def _find_next_line(self, at: int) -> int:
-        """Return the begin of the line after that of an offset."""
         end = self.text.find("\n", at)
         return len(self.text) if end < 0 else end + 1
 

@@ -135,7 +135,6 @@ class Table:
 
     @property
     def utimes(self) -> npt.NDArray[np.int64]:
-        """The times (n,), microseconds."""
         return self._utimes[: self.count]
 
     @property
@@ -376,7 +375,6 @@ class Drive:
                 self.set_joint(joint.name, sample.header.utime, joint.position)
 
     def set_joint(self, name: str, utime: int, position: float) -> None:
-        """Set a coordinate, radians or meters."""
         self.joints.setdefault(name, Table(1)).append(utime, position)
 
     def _process_gps(self, sample: GpsSample) -> None:
@@ -434,7 +432,6 @@ class Drive:
             del stored[1::2]
 
     def _add_mode_event(self, utime: int, data: bytes) -> None:
-        """Add an event for a change of the mode, which is the first field after the stamp."""
         try:
             mode = Mode(int.from_bytes(data[16:17], "big", signed=True))
         except ValueError:
@@ -526,7 +523,6 @@ class Drive:
         return Picture(utime, pose, Invalid(int(row[_INVALID])), covariance, *levels, joints)
 
     def get_joints(self, utime: int) -> dict[str, float]:
-        """Return the last position of each coordinate at or before a time."""
         found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
         return {name: float(table.rows[row, 0]) for name, (table, row) in found.items() if row >= 0}
 
@@ -611,13 +607,11 @@ class FramePoses:
         }
 
     def move_joints(self, joints: Mapping[str, float]) -> dict[str, Pose]:
-        """Set the coordinates that were received, and return the poses of the bodies that moved."""
         known, self._joints = self._joints, dict(joints)
         moved = {name for name in known.keys() | joints.keys() if known.get(name) != joints.get(name)}
         return self.compute_bodies(moved) if moved else {}
 
     def compute_frames(self, bodies: Mapping[str, Pose]) -> dict[str, Pose]:
-        """Return the poses of the frames of bodies by full name."""
         return {frame.full_name: pose @ frame.pose for name, pose in bodies.items() for frame in self.model.body(name)}
 
     def _get_position(self, joint: str) -> Coordinates:

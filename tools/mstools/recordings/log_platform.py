@@ -161,7 +161,6 @@ class LogPlatform(LocalPlatform):
         return False
 
     def _find_start(self, oldest: int) -> int:
-        """Return the offset in the file from which poses from `oldest` on are read."""
         earlier = [offset for stamp, offset in self._contents.offsets if stamp < oldest - OFFSET_MARGIN_US]
         return earlier[-1] if earlier else 0
 

@@ -43,7 +43,6 @@ class TfTree:
         self.conflicts: set[str] = set()
 
     def add(self, message: Any) -> None:
-        """Add the transforms of a message."""
         for child, parent, pose in filter(None, map(_read_transform, message.transforms)):
             known = self.edges.get(child)
             if known is None:
@@ -86,7 +85,6 @@ class TfTree:
 
     @property
     def has_joints(self) -> bool:
-        """Whether any frame moves in its parent."""
         return any(edge.is_moving for edge in self.edges.values())
 
     def read_joints(self, message: Any) -> Iterator[tuple[int, tuple[JointSample, ...]]]:

@@ -113,7 +113,6 @@ def value_range(values: Iterable[float], share: float = 1.0, min_width: float = 
 
 
 def level(name: str, x: Axis, y: float, color: str = GRAY) -> Series:
-    """Return a dashed horizontal line."""
     return Series(name, (x.low, x.high), (y, y), color, shape="dashes")
 
 
@@ -145,7 +144,6 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
-    """Return rows with intervals."""
     traces: list[dict[str, Any]] = [
         {
             "type": "bar",
@@ -322,7 +320,6 @@ def _render_figure(
 
 
 def check_installed() -> None:
-    """Raise ModelServerError if the extra `report` is not installed."""
     _find_library()
 
 

@@ -168,7 +168,6 @@ class SensorMotion:
         return DistanceComparison(rolled, fixed)
 
     def _mean_speed(self) -> dict[int, float]:
-        """Return the mean magnitude of the wheels' speeds."""
         means = SecondMeans()
         for speeds in self.wheels.values():
             for second, value in speeds.items():
@@ -435,7 +434,6 @@ class ReplayData:
         return next((len(each.times) for each in self.sensors if each.name == source), 0)
 
     def to_seconds(self, utime: int) -> float:
-        """Return a utime as seconds from the log's first event."""
         return (utime - self.first_utime) * 1e-6
 
 
@@ -443,7 +441,6 @@ class ReplayCollector:
     """Collects `ReplayData`: pass `on_sample` and `on_decision` to the offline run, then call `finish`."""
 
     def __init__(self, vehicle: Vehicle):
-        """Start for a vehicle, which must have localization."""
         assert vehicle.rig is not None
         self._vehicle = vehicle
         self._rig = vehicle.rig

@@ -40,7 +40,6 @@ def complete_channel(ctx: Any, incomplete: str) -> list[str]:
 
 
 def complete_driver(ctx: Any, incomplete: str) -> list[str]:
-    """Return the drivers of the vehicle file."""
     config = _find_config(ctx)
     return [] if config is None else _select(config.drivers, incomplete)
 

@@ -55,7 +55,6 @@ def format_report(health: Health, drivers: Iterable[DriverHealth] = (), expected
 
 
 def format_body(health: Health) -> str:
-    """Format pose, filter, geometry and process of a report."""
     localization = health.localization
     if localization.mode is None:
         rows = [("pose", "none: no localization sensor is configured")]
@@ -100,7 +99,6 @@ def _format_place(localization: LocalizationHealth) -> str:
 
 
 def _format_stability(stability: StabilityHealth) -> str:
-    """Format the tip-over margins and the loads."""
     margins = [
         f"{name} {math.degrees(margin):.1f} deg" + ("" if math.isnan(sigma) else f" +- {math.degrees(sigma):.1f}")
         for name, margin, sigma in (
@@ -116,7 +114,6 @@ def _format_stability(stability: StabilityHealth) -> str:
 
 
 def _format_bounds(localization: LocalizationHealth) -> str:
-    """Format the levels beside their limits, and the protection levels."""
     position, heading = localization.horizontal_protection_level, localization.heading_protection_level
     if not math.isfinite(position) and not math.isfinite(heading):
         return "protection levels unknown"
@@ -140,7 +137,6 @@ def _get_sensors(health: Health) -> list[ChannelHealth]:
 
 
 def _format_motion(health: Health) -> str:
-    """Format the filter's phase and whether the vehicle moves."""
     localization = health.localization
     phase = "no filter" if localization.phase is None else localization.phase.name.lower()
     if not _get_sensors(health):

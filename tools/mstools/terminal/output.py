@@ -67,7 +67,6 @@ def format_count(count: int, one: str, several: str = "") -> str:
 
 
 def describe_size(model: Model) -> str:
-    """Return the numbers of bodies, frames and constraints."""
     frames = sum(len(body.frames) for body in model.bodies)
     bodies, constraints = len(model.bodies), len(model.constraints)
     counts = format_count(bodies, "body", "bodies"), format_count(frames, "frame")
@@ -241,7 +240,6 @@ class ProblemCollector:
         self._errors: list[Problem] = []
 
     def add(self, what: str, why: str, fix: str = "") -> None:
-        """Add an error of a file or an option."""
         self._errors.append(Problem(Severity.ERROR, why, Location(what), fix))
 
     @contextmanager
@@ -263,7 +261,6 @@ class ProblemCollector:
 
 
 def make_error(why: str, place: str | Location, fix: str) -> ConfigError:
-    """Return the error of a file or an option with one problem."""
     return ConfigError([Problem(Severity.ERROR, why, place if isinstance(place, Location) else Location(place), fix)])
 
 

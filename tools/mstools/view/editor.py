@@ -284,7 +284,6 @@ class Editor:
         return True
 
     def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change of what is selected; return whether it could be made."""
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
@@ -416,7 +415,6 @@ def _describe_problem(problem: Problem) -> str:
 
 
 def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
-    """Return a name for a copy of an item: its own with the first free number."""
     taken = {each.name for each in document.list_items() if each.kind is item.kind}
     plain = item.name.rpartition(":")[2]
     numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
@@ -638,7 +636,6 @@ class ItemFields:
 
     @property
     def in_template(self) -> bool:
-        """Whether all bodies of the template are to change."""
         return "template" in self._fields and bool(self._fields["template"].value)
 
     # --- what is set

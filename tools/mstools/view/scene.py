@@ -282,7 +282,6 @@ class VehicleScene:
         return self._poses[body] @ self._frames.model.frame(frame).pose
 
     def highlight_path(self, frames: Sequence[str]) -> None:
-        """Highlight the path through some frames, none to remove it."""
         self._path = tuple(frames)
         self._draw_path()
 
@@ -457,7 +456,6 @@ def compute_ellipsoid(covariance: Array, quantile: float) -> tuple[Vector3, Pose
 
 
 def _make_circle() -> Array:
-    """Return the segments (64, 2, 3) of the unit circle."""
     angles = np.linspace(0.0, 2.0 * math.pi, 65)
     points = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1)
     return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)

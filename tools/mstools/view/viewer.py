@@ -326,7 +326,6 @@ def describe_answer(explanation: Explanation, motion: MotionAnswer | None) -> st
 
 
 def _list_sigmas(covariance: Array) -> list[float]:
-    """Return the standard deviations of a pose, meters and degrees."""
     variances = np.maximum(np.diag(covariance), 0.0)
     return list(map(float, np.sqrt(variances) * np.repeat((1.0, math.degrees(1.0)), 3)))
 
