@@ -92,7 +92,8 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
     """
     import foxglove
 
-    from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
+    from mstools.lcm_wheel import find_type_files
+    from mstools.recordings.foxglove_messages import FoxgloveWriter
 
     count = 0
     with write_beside(out) as draft:
@@ -103,7 +104,7 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
             foxglove.open_mcap(draft, context=context),
         ):
             given = None if model is None else load_given_model(model, {})
-            writer = FoxgloveWriter(context, prefix, find_definitions() if raw else None, given)
+            writer = FoxgloveWriter(context, prefix, find_type_files()[0].parent if raw else None, given)
             for count, event in enumerate(events, 1):
                 writer.feed(event.channel, event.data, event.utime)
                 if count % PROGRESS_EVENTS == 0:

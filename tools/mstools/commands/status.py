@@ -18,7 +18,6 @@ from contextlib import nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from threading import Event
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
@@ -119,7 +118,7 @@ def command(
     if metrics:
         if watch or as_json:
             raise typer.BadParameter("excludes --watch and --json", param_hint="--metrics")
-        follow_metrics(MetricsListener(open_lcm(provider), prefix), metrics)
+        follow_metrics(HealthListener(open_lcm(provider), prefix), metrics)
         return
     listener = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
@@ -214,33 +213,31 @@ def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> b
 
 
 class HealthListener(DaemonListener):
-    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's."""
+    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's.
+
+    `times` are those when the last reports were received, seconds of the monotonic clock, by channel or driver.
+    """
 
     def __init__(self, bus: lcm.LCM, prefix: str, more: Mapping[str, Callable[[Any], object]] = MappingProxyType({})):
         self.health: Health | None = None
         self.reports = 0
         self.drivers: dict[str, DriverHealth] = {}
+        self.times: dict[str, float] = {}
         super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver, **more})
 
     def _on_health(self, health: Health) -> None:
-        self.health = health
+        self.health, self.times[HEALTH] = health, time.monotonic()
         self.reports += 1
 
     def _on_driver(self, health: DriverHealth) -> None:
         if health.source in self.drivers or len(self.drivers) < MAX_NAMES:
-            self.drivers[health.source] = health
+            self.drivers[health.source], self.times[f"driver {health.source}"] = health, time.monotonic()
 
     @property
     def report(self) -> Health:
         """The last report, after one was received."""
         assert self.health is not None
         return self.health
-
-    def wait_for_report(self, seconds: float, stop: Event) -> bool:
-        """Wait up to `seconds`, or until `stop`, for another report; return whether there was one."""
-        before = self.reports
-        self.listen(seconds, lambda: stop.is_set() or self.reports > before)
-        return self.reports > before
 
     def has_drivers(self, drivers: tuple[str, ...]) -> bool:
         """Return whether all these drivers have reported; False for none, as others may exist."""
@@ -285,11 +282,14 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
 def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
     """Show each report until Ctrl-C, and warn when there is none: in place on a terminal, else one after the other."""
     is_screen = sys.stdout.isatty() and not as_json
-    last = time.monotonic()
     with catch_signals() as stop, open_screen() if is_screen else nullcontext() as live:
-        is_new = True
+        shown = 0
+
+        def is_over() -> bool:
+            return stop.is_set() or listener.reports > shown
+
         while not stop.is_set():
-            silent = time.monotonic() - last
+            silent = time.monotonic() - listener.times[HEALTH]
             reports = (listener.report, listener.drivers.values())
             text = json.dumps(as_data(*reports)) if as_json else replace_unencodable(format_report(*reports, drivers))
             if silent > SILENT_S:
@@ -298,49 +298,32 @@ def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: b
                 from rich.text import Text
 
                 live.update(Text(text, overflow="crop", no_wrap=True), refresh=True)
-            elif is_new:
+            elif listener.reports > shown:
                 typer.echo(text)
                 sys.stdout.flush()
             elif silent > SILENT_S:
                 typer.echo(f"no report for {silent:.0f} s", err=True)
-            is_new = listener.wait_for_report(1.0 if is_screen else SILENT_S, stop)
-            last = time.monotonic() if is_new else last
+            shown = listener.reports
+            listener.listen(1.0 if is_screen else SILENT_S, is_over)
 
 
 # --- metrics
 
 
-class MetricsListener(HealthListener):
-    """Receive health reports with the times when they were received, so that old ones are not taken for current."""
+def follow_metrics(listener: HealthListener, address: str) -> None:
+    """Serve the metrics of current reports until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
 
-    def __init__(self, bus: lcm.LCM, prefix: str):
-        self._times: dict[str, float] = {}
-        super().__init__(bus, prefix)
-
-    def _on_health(self, health: Health) -> None:
-        super()._on_health(health)
-        self._times[HEALTH] = time.monotonic()
-
-    def _on_driver(self, health: DriverHealth) -> None:
-        super()._on_driver(health)
-        self._times[f"driver {health.source}"] = time.monotonic()
-
-    def render(self) -> str:
-        """Return the metrics of the current reports."""
-        now = time.monotonic()
-        age = now - self._times.get(HEALTH, -math.inf)
-        times = dict(self._times)
-        drivers = [
+    def render() -> str:
+        # copies: the listener changes them in another thread
+        now, times, drivers = time.monotonic(), dict(listener.times), dict(listener.drivers)
+        current = [
             each
-            for name, each in dict(self.drivers).items()
+            for name, each in drivers.items()
             if now - times.get(f"driver {name}", -math.inf) <= health_metrics.MAX_AGE_S
         ]
-        return health_metrics.format_metrics(self.health, age, drivers)
+        return health_metrics.format_metrics(listener.health, now - times.get(HEALTH, -math.inf), current)
 
-
-def follow_metrics(listener: MetricsListener, address: str) -> None:
-    """Serve metrics until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
-    server = health_metrics.serve_metrics(address, listener.render)
+    server = health_metrics.serve_metrics(address, render)
     host, port = server.server_address[:2]
     typer.echo(f"http://{host!s}:{port}/metrics (Ctrl-C ends it)")
     sys.stdout.flush()
@@ -368,29 +351,27 @@ def run_spy(url: str) -> NoReturn:
 
 def check_java() -> None:
     """Raise MissingToolError if lcm-spy cannot open its window."""
-    wrong = ""
     if shutil.which("java") is None:
-        wrong = "needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
-    elif not os.environ.get("DISPLAY"):
-        ways = "Over ssh use ssh -X, or modelserver status --watch"
-        wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
-    if wrong:
-        raise MissingToolError(f"lcm-spy {wrong}")
+        raise MissingToolError(
+            "lcm-spy needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
+        )
+    if not os.environ.get("DISPLAY"):
+        raise MissingToolError(
+            "lcm-spy opens a window, but there is no display (DISPLAY is empty). Over ssh use ssh -X, or modelserver "
+            "status --watch"
+        )
 
 
 def get_types_jar() -> Path:
     """Return the jar of the wire types, compiled once for each version of them."""
     files = find_type_files()
-    folder = get_cache_folder() / hash_contract(files)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "modelserver" / hash_contract(files)
     jar = folder / "mslcm.jar"
     if not jar.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         _build_jar(files, jar)
     return jar
-
-
-def get_cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modelserver"
 
 
 def hash_contract(files: Sequence[Path]) -> str:

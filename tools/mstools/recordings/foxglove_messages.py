@@ -18,7 +18,6 @@ base_link:Origin.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -103,15 +102,6 @@ _STATUS: Final = _make_schema(
 DIAGNOSTICS_SCHEMA: Final = {"title": "diagnostic_msgs/DiagnosticArray"} | _make_schema(
     header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"), status=[_STATUS]
 )
-
-
-def find_definitions() -> Path:
-    """Return the folder of the .lcm files: in the installed package, or in the source tree beside it."""
-    spec = importlib.util.find_spec("mslcm")
-    assert spec is not None
-    assert spec.origin is not None
-    folder = Path(spec.origin).parent
-    return folder / "lcm" if (folder / "lcm").is_dir() else folder.parent
 
 
 class FoxgloveWriter:
