@@ -34,9 +34,9 @@ def main() -> int:
     take_editor("view-edit.png")
     with tempfile.TemporaryDirectory() as folder:
         log = record_drive(Path(folder), DRIVE_S)
-        source = open_log(log, "", None, lambda part: None)
+        source = open_log(log)
         take("view-log.png", source, "Time", "Play", 12.0)
-        take("view-state.png", open_log(log, "", None, lambda part: None), "Time", "Play", 20.0)
+        take("view-state.png", open_log(log), "Time", "Play", 20.0)
     with tempfile.TemporaryDirectory() as folder, reserved_url() as url, follow_drive(url, Path(folder)) as source:
         take("view-live.png", source, seconds=25.0)
     return 0

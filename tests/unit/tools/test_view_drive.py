@@ -352,7 +352,7 @@ def test_given_a_truncated_log_then_it_opens_and_its_damage_is_known(tmp_path: P
     events = [encode_event(n, START + n, *each) for n, each in enumerate(messages)]
     path = tmp_path / "drive.lcm"
     path.write_bytes(b"".join(events)[:-10])
-    source = open_log(path, "", None, lambda part: None)
+    source = open_log(path)
     assert source.drive.end == START + 1_800_000
     assert [each.partition(" after")[0] for each in source.notes] == ["the log is truncated"]
 
@@ -365,7 +365,7 @@ def test_given_a_log_whose_stamps_are_off_then_the_amount_is_reported(tmp_path: 
     events = [encode_event(n, START + 7_200_000_000 + n, b"GPS", encode(fix)) for n, fix in enumerate(fixes)]
     events.append(encode_event(5, START + 7_200_000_005, b"MODEL_SNAPSHOT", snapshot))
     path.write_bytes(b"".join(events))
-    source = open_log(path, "", None, lambda part: None)
+    source = open_log(path)
     assert source.notes == (
         "all stamps are 7,200.0 s (2 h: a time zone?) behind their receipt: the axis of the stamps is used",
     )

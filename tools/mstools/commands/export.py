@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.terminal.options import PrefixOption, UrlOption, option
 from mstools.terminal.output import (
@@ -19,12 +18,10 @@ from mstools.terminal.output import (
     check_writable,
     format_count,
     load_given_model,
+    read_with_progress,
     require_extra,
-    show_progress,
     write_beside,
 )
-
-PROGRESS_EVENTS = 5_000
 
 NEEDS_FOXGLOVE = "this needs foxglove-sdk"
 
@@ -99,16 +96,14 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
     with write_beside(out) as draft:
         context = foxglove.Context()
         with (
-            LogFile(log) as events,
-            show_progress(f"exporting {log.name}", events.size) as show,
+            read_with_progress("exporting", log) as (recording, events),
             foxglove.open_mcap(draft, context=context),
         ):
             given = None if model is None else load_given_model(model, {})
             writer = FoxgloveWriter(context, prefix, find_type_files()[0].parent if raw else None, given)
-            for count, event in enumerate(events, 1):
+            for event in events:
+                count += 1
                 writer.feed(event.channel, event.data, event.utime)
-                if count % PROGRESS_EVENTS == 0:
-                    show(event.end)
             if not writer.has_geometry:
                 raise RecordingError(
                     f"{log}: no complete geometry on {prefix}MODEL_SNAPSHOT, so there are no frames. The service "
@@ -117,7 +112,7 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
                     "with which the localization runs too: -c FILE"
                 )
     typer.echo(f"{out}: {format_count(count, 'message')}, {out.stat().st_size / 1e6:.1f} MB")
-    for damage in events.damage:
+    for damage in recording.damage:
         typer.echo(f"modelserver: note: {log}: {damage}", err=True)
     if writer.skipped:
         typer.echo(f"modelserver: note: {format_count(writer.skipped, 'message')} could not be read", err=True)

@@ -8,7 +8,7 @@ import math
 import os
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -29,6 +29,7 @@ from mstools.terminal.output import (
     escape,
     format_count,
     open_atomic,
+    read_with_progress,
     show_progress,
     to_json,
     write_beside,
@@ -46,6 +47,7 @@ TIMES_LIMIT = 64 << 20
 
 
 def command(
+    ctx: typer.Context,
     log: Annotated[Path, argument("LOG", "LCM event log; with --verify a journal, or its folder.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     poses: Annotated[
@@ -110,48 +112,51 @@ def command(
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --log localized.lcm
       modelserver replay --verify /var/lib/modelserver/journal-Husky --key /etc/modelserver/commands.key
     """
-    if verify:
-        if any(
-            (config, poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")
-        ):
-            raise typer.BadParameter("--verify accepts only --json and --key: everything else is in the journal")
-
-        run_verification(log, as_json, key)
-        return
-    if key is not None:
-        raise typer.BadParameter("--key needs --verify")
+    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
+    _check_options({name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"})
     channels = frozenset(channel or ())
-    if out is not None:
-        if config is None:
-            raise typer.BadParameter("needs the vehicle file: -c FILE", param_hint="--log")
-        if any((poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")):
-            raise typer.BadParameter("goes with -c and --json alone: run twice for more", param_hint="--log")
+    if verify:
+        run_verification(log, as_json, key)
+    elif out is not None and config is not None:
         localize(log, config, out, as_json)
-    elif poses or report:
-        if config is None:
-            raise typer.BadParameter(f"{'--poses' if poses else '--report'} needs the vehicle file: -c FILE")
+    elif (poses or report) and config is not None:
         if rate is not None and not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
             raise typer.BadParameter(f"a rate must be above 0 and at most 10000 Hz, got {rate:g}")
-        if rate is not None and at_times is not None:
-            raise typer.BadParameter("--rate and --at-times exclude each other")
-        if speed != "1" or restamp or url or everything:
-            raise typer.BadParameter(
-                "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline"
-            )
-        if not poses and (frame or at_times is not None or rate is not None):
-            raise typer.BadParameter("--frame, --rate and --at-times need --poses CSV")
         if (poses, decisions, report).count("-") > 1:
             raise typer.BadParameter("only one of --poses, --decisions and --report can be standard output")
         replay_offline(log, config, poses, decisions, report, frame, rate or RATE_HZ, at_times, channels, as_json)
     else:
-        if frame or decisions or at_times is not None or rate is not None:
-            raise typer.BadParameter(
-                "--frame, --rate and --at-times need --poses CSV, --decisions needs that or --report"
-            )
         factor = _parse_speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp needs --speed 1: stamps must not run faster than the clock")
         replay_to_bus(log, config, factor, None if everything else channels, url, as_json, restamp)
+
+
+def _check_options(given: set[str]) -> None:
+    """Raise typer.BadParameter, a usage error, where the parameters that were given do not go together."""
+    more, of_poses = given - {"log", "as_json"}, given & {"frame", "rate", "at_times"}
+    offline = [name for name in ("out", "poses", "report") if name in given]
+    rules: list[tuple[object, str]] = [
+        (
+            "verify" in given and more - {"verify", "key"},
+            "--verify accepts only --json and --key: everything else is in the journal",
+        ),
+        ("key" in given and "verify" not in given, "--key needs --verify"),
+        ("out" in given and more - {"out", "config"}, "--log goes with -c and --json alone: run twice for more"),
+        (
+            offline and given & {"speed", "restamp", "everything", "url"},
+            "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline",
+        ),
+        (of_poses and "poses" not in given, "--frame, --rate and --at-times need --poses CSV"),
+        ("decisions" in given and not offline, "--decisions needs --poses CSV or --report"),
+        (of_poses >= {"rate", "at_times"}, "--rate and --at-times exclude each other"),
+    ]
+    for is_broken, text in rules:
+        if is_broken:
+            raise typer.BadParameter(text)
+    if offline and "config" not in given:
+        option = "--log" if offline[0] == "out" else f"--{offline[0]}"
+        raise typer.BadParameter(f"{option} needs the vehicle file: -c FILE")
 
 
 def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
@@ -186,14 +191,12 @@ def replay_to_bus(
 
     if not url and config is not None:
         url = load_config(config).lcm.url
-    with LogFile(log) as recording:
-        player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
-        events: Iterable[LogEvent] = recording
+    player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
+    with read_with_progress("replaying", log) as (recording, events):
         if channels is not None:
-            events = _filter_channels(recording, channels) if channels else _exclude_service_messages(recording)
+            events = _filter_channels(events, log, channels) if channels else _exclude_service_messages(events)
         try:
-            with show_progress(f"replaying {log.name}", recording.size) as show:
-                player.play(_track_progress(events, show, set()))
+            player.play(events)
         finally:
             report = {"sent": player.sent, "seconds": player.duration, "max_delay": player.max_delay}
             words = (
@@ -234,8 +237,10 @@ def replay_offline(
 
         charts.check_installed()
     _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
-    with LogFile(log) as recording:
-        run = OfflineRun(vehicle, _filter_channels(recording, channels), frame or vehicle.config.base_frame)
+    seen: set[str] = set()
+    with read_with_progress("replaying", log) as (recording, events):
+        events = _filter_channels(events, log, channels, seen)
+        run = OfflineRun(vehicle, events, frame or vehicle.config.base_frame)
         collector = None
         if report:
             from mstools.report.replay_data import ReplayCollector
@@ -248,11 +253,9 @@ def replay_offline(
         gc.set_threshold(50_000, 20, 100)
         started = time.monotonic()
         counts = ReplayCounts()
-        seen: set[str] = set()
         with (
             _open_output(poses) if poses else nullcontext() as out,
             _open_output(decisions) if decisions else nullcontext() as ledger,
-            show_progress(f"replaying {log.name}", recording.size) as show,
         ):
 
             def on_decision(decision: Decision) -> None:
@@ -263,7 +266,6 @@ def replay_offline(
                 if collector is not None:
                     collector.on_decision(decision)
 
-            run.log = _track_progress(run.log, show, seen)
             run.on_decision = on_decision
             if out is not None:
                 out.write(CSV_HEADER + "\n")
@@ -292,25 +294,15 @@ def replay_offline(
             from mstools.report import replay_report
             from mstools.report.findings import collect_findings
 
-            replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, seen, run.axis)
+            replayed = collector.finish(
+                log.name, run.first_utime, run.last_utime, run.rejected, channels & seen or seen, run.axis
+            )
             with _open_output(report) as out:
                 out.write(replay_report.render_page(replayed))
             if not as_json:
                 findings = replay_report.format_summary(collect_findings(replayed), report)
                 typer.echo("\n".join(findings), err=report == "-")
         _report_damage(recording)
-
-
-def _track_progress(
-    events: Iterable[LogEvent], show: Callable[[float], object], channels: set[str]
-) -> Iterator[LogEvent]:
-    updated = 0.0
-    for event in events:
-        channels.add(event.channel)
-        if (now := time.monotonic()) > updated + 0.1:
-            updated = now
-            show(event.end)
-        yield event
 
 
 @dataclass
@@ -421,19 +413,22 @@ def read_times(path: Path) -> list[int]:
     return times
 
 
-def _filter_channels(recording: LogFile, channels: frozenset[str]) -> Iterator[LogEvent]:
-    """Yield the events of some channels, or of all. Raises RecordingError at the end if there were none."""
-    seen: dict[str, None] = {}
-    found = not channels
-    for event in recording:
-        seen[event.channel] = None
+def _filter_channels(
+    events: Iterable[LogEvent], log: Path, channels: frozenset[str], seen: set[str] | None = None
+) -> Iterator[LogEvent]:
+    """Yield the events of some channels, or of all, and collect their channels in `seen`.
+
+    Raises RecordingError at the end if there were none.
+    """
+    seen = set() if seen is None else seen
+    for event in events:
+        seen.add(event.channel)
         if not channels or event.channel in channels:
-            found = True
             yield event
-    if not found:
+    if channels and channels.isdisjoint(seen):
         near = [name for each in sorted(channels) for name in find_nearest_names(each, seen)]
         hint = f"Nearest: {', '.join(near)}" if near else f"The log has: {_join_sorted(seen)}"
-        raise RecordingError(f"{recording.path}: no message on {_join_sorted(channels)}. {hint}")
+        raise RecordingError(f"{log}: no message on {_join_sorted(channels)}. {hint}")
 
 
 def _join_sorted(names: Iterable[str]) -> str:

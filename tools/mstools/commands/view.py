@@ -23,7 +23,7 @@ from mstools.terminal.options import (
     option,
     parse_variables,
 )
-from mstools.terminal.output import catch_signals, check_writable, escape, require_extra, show_progress
+from mstools.terminal.output import catch_signals, check_writable, escape, require_extra
 
 if TYPE_CHECKING:
     from mstools.view.editor import Editing
@@ -158,9 +158,7 @@ def open_source(
         return open_live(url, prefix, timeout)
     kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
     if kind is FileKind.LOG:
-        size = file.stat().st_size
-        with show_progress(f"reading {file.name}", size) as show:
-            return open_log(file, prefix, model, lambda part: show(round(part * size)))
+        return open_log(file, prefix, model)
     if model is not None:
         raise typer.BadParameter(f"goes with a log, but {file} is none: {kind.value}", param_hint="--model")
     session = None if editing is None else editing.session

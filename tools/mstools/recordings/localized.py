@@ -15,10 +15,7 @@ from modelserver.config.vehicle_file import load_config
 from modelserver.server.offline import serve
 from modelserver.server.recordings import StampAxis
 from modelserver.server.vehicle import load_vehicle
-from modelserver.wire.eventlog import LogFile
-from mstools.terminal.output import escape, show_progress
-
-PROGRESS_EVENTS = 500
+from mstools.terminal.output import escape, read_with_progress
 
 
 def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
@@ -31,15 +28,13 @@ def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
     counts: Counter[str] = Counter()
     writer = lcm.EventLog(str(out), "w", overwrite=True)
     try:
-        with LogFile(log) as events, show_progress(f"localizing {log.name}", events.size) as show:
-            for number, event in enumerate(serve(vehicle, events, axis)):
+        with read_with_progress("localizing", log) as (recording, events):
+            for event in serve(vehicle, events, axis):
                 writer.write_event(event.utime, event.channel, event.data)
                 counts[event.channel] += 1
-                if number % PROGRESS_EVENTS == 0:
-                    show(event.end)
     finally:
         writer.close()
-    for note in (*axis.describe(), *map(str, events.damage)):
+    for note in (*axis.describe(), *map(str, recording.damage)):
         typer.echo(escape(f"modelserver: {log}: {note}"), err=True)
     return counts
 

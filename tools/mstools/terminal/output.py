@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
@@ -33,6 +34,8 @@ from modelserver.geometry.model import Model
 
 if TYPE_CHECKING:
     from rich.live import Live
+
+    from modelserver.wire.eventlog import LogEvent, LogFile
 
 
 def escape(text: str) -> str:
@@ -300,6 +303,23 @@ def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Iterator[LogEvent]]]:
+    """Open a log; give it with its events, and show how much of them is read, at most ten times a second."""
+    from modelserver.wire.eventlog import LogFile
+
+    def track() -> Iterator[LogEvent]:
+        updated = 0.0
+        for event in log:
+            if (now := time.monotonic()) > updated + 0.1:
+                updated = now
+                show(event.end)
+            yield event
+
+    with LogFile(path) as log, show_progress(f"{label} {path.name}", log.size) as show:
+        yield log, track()
 
 
 def open_screen() -> Live:
