@@ -24,7 +24,7 @@ from modelserver.errors import (
 )
 from modelserver.server.log import set_up_logging
 from modelserver.server.supervision import Notifier
-from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
+from mstools.commands.run import LEVELS, FormatOption, check_log_options, wait_on_error
 from mstools.terminal.completion import complete_driver
 from mstools.terminal.options import UrlOption, argument, choose_name, option
 from mstools.terminal.output import escape
@@ -110,13 +110,12 @@ def command(
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
     if record_raw is not None and play_raw is not None:
         raise typer.BadParameter("a replayed recording is not recorded again", param_hint="--record-raw")
-    start = ServiceStart(config, Notifier.from_environment())
-    with start.wait_on_error():
+    with wait_on_error(config, Notifier.from_environment()):
         vehicle, settings = load_driver(name, config)
     set_up_logging(log_level, log_format)
     with contextlib.ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, play_raw)
-        run(vehicle, settings, link, config.parent, url, start)
+        run(vehicle, settings, link, config, url)
 
 
 def show_ports() -> None:
@@ -218,17 +217,15 @@ def _make_link(
     return RecordingLink(link, stack.enter_context(open_for_writing(record)), *names, SystemTimeSource())
 
 
-def run(
-    vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: ServiceStart
-) -> None:
+def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], config: Path, url: str) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_driver
 
-    kind = settings.kind
-    with start.wait_on_error():
-        station = make_driver(settings, folder)
+    kind, notifier = settings.kind, Notifier.from_environment()
+    with wait_on_error(config, notifier):
+        station = make_driver(settings, config.parent)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
     publisher = DriverPublisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
     options = RunnerSettings(settings.name, kind.name)
@@ -254,7 +251,6 @@ def run(
         attend = corrections.feed_runner(runner)
         corrections.start()
     stop_on_signal(runner)
-    notifier = Notifier.from_environment()
     try:
         runner.run(supervise(runner, notifier, attend))
     finally:

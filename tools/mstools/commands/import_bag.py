@@ -15,7 +15,6 @@ import lcm
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
-from modelserver.files import check_links
 from modelserver.formats import save_model
 from modelserver.messages import MAX_CHANNEL_LENGTH, JointsSample, SensorHeader
 from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
@@ -103,7 +102,6 @@ def command(
             _, topics = choose_topics(opened.topics, kinds, str(bag), has_tf=geometry is not None)
         report = ImportReport("", list(topics.values()))
     else:
-        check_writable(str(log))
         if geometry is not None:
             check_writable(str(geometry), replace=force)
         options = BagOptions(altitude, undulation, imu_orientation, track_width)
@@ -163,11 +161,7 @@ def import_bag(
     """
     if log_path.exists() and not force:
         raise RecordingError(f"{log_path}: already exists; --force replaces it")
-    if log_path.is_dir():
-        raise RecordingError(f"{log_path}: is a folder; give a file in it")
-    if not log_path.parent.is_dir():
-        raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
-    check_links(log_path)
+    check_writable(str(log_path))
     with write_beside(log_path) as part:
         if is_lcm_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
@@ -191,11 +185,10 @@ def _read_tf(bag: Bag, reports: Mapping[str, TopicReport]) -> TfTree:
     for name, _, message in bag.messages(of_tf):
         tree.add(message)
         reports[name].written += 1
-    for name in of_tf:
-        if tree.conflicts:
-            reports[name].notes.append(
-                f"frames with two parents, of which the last counts: {', '.join(tree.conflicts)}"
-            )
+    if tree.conflicts:
+        note = f"frames with two parents, of which the last counts: {', '.join(tree.conflicts)}"
+        for name in of_tf:
+            reports[name].notes.append(note)
     return tree
 
 

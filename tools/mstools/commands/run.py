@@ -47,8 +47,7 @@ def command(
     set_up_logging(log_level, log_format)
     notifier = Notifier.from_environment()
     notifier.notify_starting(f"reading {config}")
-    start = ServiceStart(config, notifier)
-    with start.wait_on_error():
+    with wait_on_error(config, notifier):
         settings = load_config(config)
         vehicle = load_vehicle(settings, str(config))
         vehicle.make_command_verifier(0, str(config))
@@ -65,44 +64,36 @@ def check_log_options(level: str, log_format: str) -> None:
             raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=name)
 
 
-class ServiceStart:
-    """Start of a service from its vehicle file."""
+@contextmanager
+def wait_on_error(config: Path, notifier: Notifier) -> Iterator[None]:
+    """Run the block, the start of a service; where its files are wrong, report that and wait before the process exits.
 
-    def __init__(self, config: Path, notifier: Notifier):
-        self._config, self._notifier = config, notifier
-
-    @contextmanager
-    def wait_on_error(self) -> Iterator[None]:
-        """Run the block; where its files are wrong, report that and wait before the process exits.
-
-        Without a service manager errors propagate. With one they are printed at once, the first is its status, and the
-        process exits with the same code, after `FAILED_START_S`.
-        """
-        if not self._notifier.is_active:
-            yield
-            return
-        code = 1
-        try:
-            yield
-            return
-        except (ConfigError, GeometryError) as error:
-            problems = error.problems
-        except OSError as error:
-            if error.filename is None or Path(error.filename) != self._config:
-                raise
-            problems = self._make_problem(f"the vehicle file cannot be read: {error.strerror}")
-        except typer.BadParameter as error:
-            problems, code = self._make_problem(error.message), error.exit_code
-        except ModelServerError as error:
-            problems = self._make_problem(str(error))
-        print_problems(problems)
-        # also extends the start timeout of systemd
-        self._notifier.notify_starting(format_status(problems))
-        time.sleep(FAILED_START_S)
-        raise typer.Exit(code)
-
-    def _make_problem(self, why: str) -> tuple[Problem, ...]:
-        return (Problem(Severity.ERROR, why, Location(str(self._config))),)
+    Without a service manager errors propagate. With one they are printed at once, the first is its status, and the
+    process exits with the same code, after `FAILED_START_S`.
+    """
+    if not notifier.is_active:
+        yield
+        return
+    code, problems = 1, tuple[Problem, ...]()
+    try:
+        yield
+        return
+    except (ConfigError, GeometryError) as error:
+        text, problems = "", error.problems
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != config:
+            raise
+        text = f"the vehicle file cannot be read: {error.strerror}"
+    except typer.BadParameter as error:
+        text, code = error.message, error.exit_code
+    except ModelServerError as error:
+        text = str(error)
+    problems = problems or (Problem(Severity.ERROR, text, Location(str(config))),)
+    print_problems(problems)
+    # also extends the start timeout of systemd
+    notifier.notify_starting(format_status(problems))
+    time.sleep(FAILED_START_S)
+    raise typer.Exit(code)
 
 
 def format_status(problems: Iterable[Problem]) -> str:
