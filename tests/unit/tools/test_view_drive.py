@@ -36,7 +36,7 @@ from modelserver.transforms.transformation import Transformation
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import encode_event
 from mstools.recordings import drive as drive_module
-from mstools.recordings.drive import FIX_COLORS, Drive, EventKind, FixColor, Table
+from mstools.recordings.drive import Drive, EventKind, FixColor, Table
 from mstools.view.sources import open_log
 
 START = 1_700_000_000_000_000
@@ -184,7 +184,7 @@ def test_given_fixes_then_they_have_their_place_and_the_color_of_their_decision(
     drive.feed("LOCALIZATION_DECISIONS", make_decision(0.5, Verdict.USED, "second receiver"), START)
     places, colors = drive.get_fixes(START + 2_000_000)
     np.testing.assert_allclose(places, [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]], atol=1e-6)
-    assert [FIX_COLORS[n] for n in colors] == [FixColor.NO_DECISION, FixColor.REJECTED, FixColor.USED]
+    assert list(colors) == [FixColor.NO_DECISION, FixColor.REJECTED, FixColor.USED]
     assert len(drive.get_fixes(START + 600_000)[0]) == 2
     assert drive.events[-1].text == "rejected gps_position of gps: gate"
 

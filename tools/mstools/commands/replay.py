@@ -28,6 +28,7 @@ from mstools.terminal.output import (
     check_writable,
     escape,
     format_count,
+    guess_time_unit,
     open_atomic,
     read_with_progress,
     show_progress,
@@ -373,19 +374,13 @@ class ReplayCounts:
         return "\n".join(lines)
 
 
-UNITS = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
-"""Units that times may be in by mistake, with the factor to microseconds."""
-
-
 def _warn_of_times(times: list[int], run: OfflineRun, path: Path | None) -> None:
     """Warn if no time lies within the log, with the unit that the times may have."""
     if any(run.first_utime <= each <= run.last_utime for each in times):
         return
     hint = f"the log lasts from {run.first_utime} to {run.last_utime}, in microseconds since 1970"
-    for unit, factor in UNITS:
-        if any(run.first_utime <= each * factor <= run.last_utime + 1e6 for each in times):
-            hint += f"; these look like {unit}"
-            break
+    if unit := guess_time_unit(times, run.first_utime, run.last_utime):
+        hint += f"; these look like {unit}"
     typer.echo(f"modelserver: {path}: none of {format_count(len(times), 'time')} lies within the log: {hint}", err=True)
 
 

@@ -16,7 +16,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -84,17 +84,13 @@ POSITION: Final = "gps_position"
 """The kind of decisions that are about the position of a fix."""
 
 
-class FixColor(StrEnum):
-    """What became of a fix."""
+class FixColor(IntEnum):
+    """What became of a fix, by which it is colored."""
 
-    USED = "used"
-    REJECTED = "rejected"
-    MONITORED = "monitored"
-    NO_DECISION = "no decision"
-
-
-FIX_COLORS: Final = tuple(FixColor)
-_NO_DECISION: Final = FIX_COLORS.index(FixColor.NO_DECISION)
+    USED = 0
+    REJECTED = 1
+    MONITORED = 2
+    NO_DECISION = 3
 
 
 class EventKind(StrEnum):
@@ -394,7 +390,7 @@ class Drive:
             return
         geodesy = geodesy_of(self.origin)
         position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
-        self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
+        self._fixes.setdefault(source, Table(4)).append(utime, *position, FixColor.NO_DECISION)
 
     def _process_decisions(self, name: str, stamp: int, data: bytes) -> None:
         for decision in decode("decisions_t", data).decisions:
@@ -403,14 +399,12 @@ class Drive:
     def _process_decision(self, decision: Decision) -> None:
         if not 0 < decision.utime < MAX_STAMP:
             raise WireError("malformed", f"{decision.utime} is no stamp")
-        table = self._fixes.get(decision.source)
+        table, is_reset = self._fixes.get(decision.source), decision.verdict is Verdict.RESET
         if decision.kind == POSITION and table is not None:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
-                is_used = decision.verdict is Verdict.RESET
-                table.rows[row, 3] = FIX_COLORS.index(FixColor.USED if is_used else FixColor[decision.verdict.name])
-        if decision.verdict in (Verdict.REJECTED, Verdict.RESET):
-            is_reset = decision.verdict is Verdict.RESET
+                table.rows[row, 3] = FixColor.USED if is_reset else FixColor[decision.verdict.name]
+        if is_reset or decision.verdict is Verdict.REJECTED:
             verb = "reset by" if is_reset else "rejected"
             reason = f": {decision.reason}" if decision.reason else ""
             kind = EventKind.RESET if is_reset else EventKind.REJECTION
@@ -485,7 +479,7 @@ class Drive:
         return f"{since}; is it running (modelserver run -c vehicle.yaml), on this bus and with this channel prefix?"
 
     def get_fixes(self, utime: int) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the positions in World:UTM (n, 3) of the fixes until a time, and indexes into `FIX_COLORS` (n,)."""
+        """Return the positions in World:UTM (n, 3) of the fixes until a time, and their `FixColor` (n,)."""
         rows = [table.rows[: table.find(utime) + 1] for table in self._fixes.values()]
         found = np.concatenate([np.zeros((0, 4)), *rows])
         return found[:, :3], found[:, 3].astype(np.int64)

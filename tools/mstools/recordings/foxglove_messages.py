@@ -61,7 +61,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Shape, ShapeKind
 from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
 from modelserver.transforms.pose import Pose
-from modelserver.wire.codec import decode, fingerprint_of, get_type_names
+from modelserver.wire.codec import decode, fingerprint_of, type_name_of
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, FramePoses
 
 FIX_PERIOD_US: Final = 200_000
@@ -71,12 +71,7 @@ STATIC_PERIOD_US: Final = 5_000_000
 BODY_COLOR: Final = (0.42, 0.55, 0.69, 1.0)
 MAX_SOURCES: Final = 100
 
-_LEVELS: Final[Mapping[EventKind, LogLevel]] = {
-    EventKind.INVALID: LogLevel.Warning,
-    EventKind.REJECTION: LogLevel.Warning,
-    EventKind.RESET: LogLevel.Warning,
-}
-_TYPE_OF: Final = {fingerprint_of(name): name for name in get_type_names()}
+_WARNINGS: Final = (EventKind.INVALID, EventKind.REJECTION, EventKind.RESET)
 _OK, _WARN, _ERROR, _STALE = range(4)
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
@@ -244,7 +239,7 @@ class FoxgloveWriter:
         self._diagnostics.log({"header": header, "status": status}, log_time=now * 1000)
 
     def _log_event(self, event: DriveEvent) -> None:
-        level = _LEVELS.get(event.kind, LogLevel.Info)
+        level = LogLevel.Warning if event.kind in _WARNINGS else LogLevel.Info
         message = Log(timestamp=_stamp(event.utime), level=level, message=event.text, name=event.kind)
         self._log.log(message, log_time=self._now * 1000)
 
@@ -252,7 +247,7 @@ class FoxgloveWriter:
         if channel not in self._raw:
             if len(self._raw) >= MAX_SOURCES:
                 return
-            name = _TYPE_OF.get(data[:8], "")
+            name = type_name_of(data)
             text = (definitions / f"{name}.lcm").read_bytes() if name else b""
             schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
             self._raw[channel] = Channel(

@@ -273,6 +273,13 @@ def suggest_name(name: str, known: Iterable[str], otherwise: str) -> str:
     return f"did you mean {near[0]}?" if near else otherwise
 
 
+def guess_time_unit(times: Iterable[int], begin: int, end: int) -> str:
+    """Return the unit in which one of these times would lie between two utimes, empty for none."""
+    units = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
+    times = list(times)
+    return next((name for name, factor in units if any(begin <= each * factor <= end + 1e6 for each in times)), "")
+
+
 def find_nearest_path(path: str | Path) -> str:
     """Return the existing path in the same folder with the most similar name; empty if there is none."""
     path = Path(path)
