@@ -74,7 +74,7 @@ class MountCheck:
         )
         if not self.candidates:
             return f"{head}; no mount along the vehicle's axes fits: the unit is tilted or the vehicle on a steep slope"
-        mounts = ", ".join(_format_rpy(each.rpy_deg) for each in self.candidates)
+        mounts = ", ".join(f"[{', '.join(f'{angle:g}' for angle in each.rpy_deg)}]" for each in self.candidates)
         tail = "; drive straight ahead or look at the unit to find which"
         if degrees > 180.0 - math.degrees(MAX_TILT):
             tail += "; or the driver publishes gravity instead of specific force, its opposite: compare imu_t"
@@ -138,19 +138,12 @@ def _find_candidates(measured: Vector3, q_stated: Quaternion) -> tuple[MountCand
     for each in rotations:
         q = so3.normalize(so3.multiply(tilt, each))
         if _angle(so3.rotate(q, measured), _UP) <= MAX_TILT:
-            found.append(MountCandidate(_rpy_deg(q), _rotation_angle(q, q_stated)))
+            rpy_deg = so3.to_vector3(round(math.degrees(angle), 2) + 0.0 for angle in so3.to_rpy(q))
+            found.append(MountCandidate(rpy_deg, _rotation_angle(q, q_stated)))
     # rounded, for a fixed order of mounts equally near
     return tuple(
         sorted(found, key=lambda each: (round(each.rotation_angle, 9), [abs(angle) for angle in each.rpy_deg]))
     )
-
-
-def _format_rpy(rpy_deg: Vector3) -> str:
-    return f"[{', '.join(f'{each:g}' for each in rpy_deg)}]"
-
-
-def _rpy_deg(q: Quaternion) -> Vector3:
-    return so3.to_vector3(round(math.degrees(each), 2) + 0.0 for each in so3.to_rpy(q))
 
 
 def _rotation_angle(a: Quaternion, b: Quaternion) -> float:
@@ -226,10 +219,6 @@ QUANTITIES = (
 )
 
 
-def propose_settings(noise: ImuNoise) -> dict[str, float]:
-    return {each.setting: value for each in QUANTITIES if each.setting and math.isfinite(value := each.propose(noise))}
-
-
 VIBRATION_NOTE = "of the stationary unit, without the vibration of engine and road"
 
 
@@ -244,8 +233,12 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
         value = quantity.propose(noise)
         words = f"{value:.3g} {quantity.unit}" if math.isfinite(value) else "not determined"
         lines.append(f"{quantity.name}: {words}")
-        figures = [_format_figure(quantity, axis) for axis in quantity.axes(noise)]
-        lines += [f"  {axis}: {figure}" for axis, figure in zip("xyz", figures, strict=True)]
+        for axis, measured in zip("xyz", quantity.axes(noise), strict=True):
+            words = "not determined"
+            if (figure := quantity.of(measured.figures)) is not None:
+                where = f"at {figure.tau:.3g} s, {format_count(round(figure.clusters), 'cluster')}"
+                words = f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
+            lines.append(f"  {axis}: {words}")
     for name, axes in (("gyro", noise.gyro), ("accelerometer", noise.accelerometer)):
         missing: dict[str, str] = {}
         for axis, found in zip("xyz", axes, strict=True):
@@ -256,14 +249,6 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
     if advice is not None:
         lines.append(f"mount: {advice.text}")
     return lines
-
-
-def _format_figure(quantity: _Quantity, axis: AxisNoise) -> str:
-    figure = quantity.of(axis.figures)
-    if figure is None:
-        return "not determined"
-    where = f"at {figure.tau:.3g} s, {format_count(round(figure.clusters), 'cluster')}"
-    return f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
 
 
 def format_noise_yaml(log: str, noise: ImuNoise) -> str:

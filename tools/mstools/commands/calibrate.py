@@ -94,7 +94,7 @@ def imu(
     if noise.seconds < MIN_STATIONARY_S:
         needed = f"{MIN_STATIONARY_S:.0f} s are needed for a proposal, 10 minutes for the bias random walk"
         raise _make_error(log, f"the longest stationary range is {noise.seconds:.1f} s; {needed}: record longer")
-    if not calibrate_report.propose_settings(noise):
+    if not any(each.setting and math.isfinite(each.propose(noise)) for each in calibrate_report.QUANTITIES):
         why = "the samples are frozen, or other errors exceed the noise; see --plot"
         raise _make_error(log, f"no figure follows from {noise.seconds:.0f} s: {why}")
     write_file(output, calibrate_report.format_noise_yaml(str(log), noise), replace=force)

@@ -25,8 +25,7 @@ from modelserver.errors import (
 from modelserver.server.log import set_up_logging
 from modelserver.server.supervision import Notifier
 from mstools.commands.run import LEVELS, FormatOption, check_log_options, wait_on_error
-from mstools.terminal.completion import complete_driver
-from mstools.terminal.options import UrlOption, argument, choose_name, option
+from mstools.terminal.options import UrlOption, argument, choose_name, complete_driver, option
 from mstools.terminal.output import escape
 
 if TYPE_CHECKING:

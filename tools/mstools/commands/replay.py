@@ -22,8 +22,7 @@ from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.completion import complete_frame
-from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, option
+from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, complete_frame, option
 from mstools.terminal.output import (
     check_writable,
     escape,

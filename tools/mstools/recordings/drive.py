@@ -348,14 +348,12 @@ class Drive:
             found.invalid_reasons,
             found.pose_epoch,
         )
-        self._add_validity_events(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
-
-    def _add_validity_events(self, utime: int, invalid: Invalid, epoch: int) -> None:
+        invalid, epoch = Invalid(found.invalid_reasons), found.pose_epoch
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
-            self._add_event(utime, kind, invalid.explain() if invalid else "the pose is valid")
+            self._add_event(stamp, kind, invalid.explain() if invalid else "the pose is valid")
         if self._epoch >= 0 and epoch != self._epoch:
-            self._add_event(utime, EventKind.RESET, f"the position was reset: epoch {epoch}")
+            self._add_event(stamp, EventKind.RESET, f"the position was reset: epoch {epoch}")
         self._invalid, self._epoch = invalid, epoch
 
     def _process_joints(self, name: str, stamp: int, data: bytes) -> None:

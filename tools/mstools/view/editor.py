@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
@@ -136,7 +135,7 @@ class Editor:
         self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
-            self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
+            self._snap: Any = gui.add_dropdown("Snap", tuple(SNAPS), initial_value="none")
             actions.on_update(self._gizmo, self.show_gizmo)
         with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
@@ -336,7 +335,7 @@ class Editor:
 
     def _drag(self, pose: Pose, is_end: bool) -> None:
         """Follow the gizmo: the fields while it moves, a change when it is released. Called in the page's thread."""
-        self._actions.put(lambda: self._fields.set_dragged(pose, Snap(self._snap.value), is_end))
+        self._actions.put(lambda: self._fields.set_dragged(pose, SNAPS[self._snap.value], is_end))
 
     # --- saving and applying
 
@@ -489,18 +488,13 @@ class NumberFields:
         self._problem.content = problem
 
 
-class Snap(StrEnum):
-    """Steps to which the gizmo rounds."""
-
-    NONE = "none"
-    FINE = "1 mm, 1 deg"
-    MEDIUM = "1 cm, 5 deg"
-    COARSE = "5 cm, 15 deg"
-
-    @property
-    def steps(self) -> tuple[float, float]:
-        """Meters and degrees; without snap what a hand can place."""
-        return {Snap.NONE: (1e-4, 0.01), Snap.FINE: (1e-3, 1.0), Snap.MEDIUM: (0.01, 5.0)}.get(self, (0.05, 15.0))
+SNAPS: Final = {
+    "none": (1e-4, 0.01),
+    "1 mm, 1 deg": (1e-3, 1.0),
+    "1 cm, 5 deg": (0.01, 5.0),
+    "5 cm, 15 deg": (0.05, 15.0),
+}
+"""Steps to which the gizmo rounds, meters and degrees; without snap what a hand can place."""
 
 
 def list_frames(document: GeometryDocument) -> list[str]:
@@ -751,11 +745,11 @@ class ItemFields:
             return names.split(self._item.name)[0], Pose.identity(), part.pose
         return names.split(part.from_)[0], model.frame(part.from_).pose, part.pose
 
-    def set_dragged(self, pose: Pose, snap: Snap, is_end: bool) -> None:
+    def set_dragged(self, pose: Pose, steps: tuple[float, float], is_end: bool) -> None:
         """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
         if self._part is None:
             return
-        meters, degrees = snap.steps
+        meters, degrees = steps
         moved, turned = self._part.pose.distance(pose)
         if moved > SAME:
             self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])

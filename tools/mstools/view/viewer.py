@@ -136,13 +136,13 @@ class Viewer:
                 self._time.advance(drive, seconds)
                 utime = self._time.utime
             picture = drive.get_picture(utime)
-            utimes, track = drive.get_track(picture.utime, display.trail_s)
+            utimes, track = drive.get_track(picture.utime, TRAILS[display.trail.value])
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
             origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
             if model is not None and model is not self._model:
                 self._set_model(model, base_frame)
-            if (named := (display.labels, self._query.frames)) != self._named:
+            if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
             self._scene.show(picture, display.follow.value)
@@ -150,7 +150,8 @@ class Viewer:
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
                 self._scene.show_fixes(*fixes)
-            self._scene.show_uncertainty(picture, display.confidence, display.uncertainty.value)
+            confidence = int(display.confidence.value.split()[0])
+            self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
         if now >= self._next_slider and self._time is not None:
             self._next_slider = now + SLIDER_PERIOD_S
@@ -586,24 +587,12 @@ class DisplayPanel:
     """What the scene shows."""
 
     def __init__(self, gui: viser.GuiApi):
-        self._labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
+        self.labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
         self.follow = gui.add_checkbox("Follow the vehicle", True)
         self.uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid of the position; protection levels")
         confidences = tuple(f"{each} %" for each in CHI_SQUARE_3)
-        self._confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
-        self._trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
-
-    @property
-    def labels(self) -> NameLabels:
-        return NameLabels(self._labels.value)
-
-    @property
-    def confidence(self) -> int:
-        return int(self._confidence.value.split()[0])
-
-    @property
-    def trail_s(self) -> float:
-        return TRAILS[self._trail.value]
+        self.confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
+        self.trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
 
 
 class JointsPanel:
