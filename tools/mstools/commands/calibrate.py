@@ -24,9 +24,9 @@ from mstools.calibration import report as calibrate_report
 from mstools.calibration.allan import allan_deviation, fit_noise_parameters
 from mstools.calibration.ellipsoid import MagnetometerFit, fit_level
 from mstools.calibration.report import AxisNoise, ImuNoise, MountCheck, axis_name, check_mount
-from mstools.report import charts
+from mstools.report.charts import NEEDS_PLOTLY
 from mstools.terminal.options import argument, option
-from mstools.terminal.output import check_outputs, escape, format_count, write_file
+from mstools.terminal.output import check_outputs, escape, format_count, require_extra, write_file
 
 MIN_STATIONARY_S = 60.0
 """Shortest stationary range with a proposal, seconds: noise at 1 s averaging is then known to 10 %."""
@@ -231,7 +231,7 @@ def _check_options(begin: float, end: float, log: Path, plot: str, output: str, 
         raise typer.BadParameter(f"--from {begin:g} --to {end:g} is no range; expected 0 <= from < to, seconds")
     check_outputs((log,), plot, output, force)
     if plot:
-        charts.check_installed()
+        require_extra("report", NEEDS_PLOTLY)
 
 
 def _print_damage(log: Path, recorded: ImuRecording) -> None:

@@ -30,6 +30,7 @@ from mstools.terminal.output import (
     guess_time_unit,
     open_atomic,
     read_with_progress,
+    require_extra,
     show_progress,
     to_json,
     write_beside,
@@ -233,9 +234,9 @@ def replay_offline(
     times = None if at_times is None else read_times(at_times)
     inputs = [log, config, Path(vehicle.config.geometry), *([] if at_times is None else [at_times])]
     if report:
-        from mstools.report import charts
+        from mstools.report.charts import NEEDS_PLOTLY
 
-        charts.check_installed()
+        require_extra("report", NEEDS_PLOTLY)
     _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
     seen: set[str] = set()
     with read_with_progress("replaying", log) as (recording, events):
