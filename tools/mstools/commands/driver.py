@@ -8,20 +8,14 @@ import math
 import signal
 import time
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import (
-    ConfigError,
-    ModelServerError,
-    Problem,
-    find_nearest_names,
-    quote,
-)
+from modelserver.errors import ConfigError, ModelServerError, Problem, find_nearest_names, quote
 from modelserver.server.log import set_up_logging
 from modelserver.server.supervision import Notifier
 from mstools.commands.run import LEVELS, FormatOption, check_log_options, wait_on_error
@@ -365,24 +359,19 @@ GPS_HZ = 4.0
 """Default rate of a receiver."""
 
 
-@dataclass(frozen=True, slots=True)
-class DriveOptions:
-    """The simulated drive of `seconds` that a device measures.
+def simulate(
+    vehicle: VehicleConfig,
+    settings: DriverSettings,
+    start: int | None = None,
+    seconds: float = MAX_DRIVE_S,
+    scenario: str = "eight",
+    seed: int = 1,
+    own_field: Vector3 = (0.0, 0.0, 0.0),
+) -> Iterator[Sample]:
+    """Return the samples that the emulator of a driver's device measures in a drive; their end is logged.
 
-    start: its start, microseconds of UTC; None: now. own_field: hard iron, tesla along the sensor's axes.
-    """
-
-    start: int | None
-    seconds: float
-    scenario: str
-    seed: int
-    own_field: Vector3
-
-
-def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
-    """Return the samples that the emulator of a driver's device measures; their end is logged.
-
-    A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
+    The drive starts at `start`, microseconds of UTC, None for now; `own_field` is hard iron, tesla along the sensor's
+    axes. A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
     wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a drive that is already
     over, and a sensor without a section in the vehicle file.
     """
@@ -391,15 +380,15 @@ def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOpti
     from mstools.launch.drive import WHEELS_HZ, make_simulation
 
     now = time.time_ns() // 1000
-    start = now + START_DELAY_US if wanted.start is None else wanted.start
+    begin = now + START_DELAY_US if start is None else start
     sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
     sensors, kind = vehicle.sensors, settings.kind.sample
-    follows_commands = not settings.kind.follows_samples or (wanted.start is None and settings.kind.command_channel)
+    follows_commands = not settings.kind.follows_samples or (start is None and settings.kind.command_channel)
     if follows_commands or kind not in sections:
         return
-    if start + round(wanted.seconds * 1e6) < now:
-        ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
-        raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
+    if begin + round(seconds * 1e6) < now:
+        ago = f"{(now - begin) * 1e-6:.0f} s ago, and the drive lasts {seconds:g} s"
+        raise ModelServerError(f"--start {start} is {ago}: it is over, so there are no samples")
     if getattr(sensors, sections[kind]) is None:
         raise ModelServerError(
             f"the vehicle file has no section sensors.{sections[kind]}, which has the sensor's frame"
@@ -409,18 +398,18 @@ def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOpti
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
     run = make_simulation(
         vehicle,
-        start,
-        wanted.seconds,
-        wanted.scenario,
-        wanted.seed,
+        begin,
+        seconds,
+        scenario,
+        seed,
         (kind,),
         gps_model=GpsModel(Timing(getattr(settings.device_settings, "rate_hz", GPS_HZ))),
-        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=wanted.own_field)),
+        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
         wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
     # samples before now are skipped, also those of the time that making the drive took
     now = time.time_ns() // 1000
-    for sample in run.events(wanted.seconds):
+    for sample in run.events(seconds):
         if isinstance(sample, kind) and sample.header.utime >= now:
             yield sample
     log.warning("%s: the simulated drive is over, there are no more measurements", settings.name)
@@ -479,7 +468,7 @@ def emulate(
     own_field = _parse_field(iron)
     line = _make_device_link(settings, link, tcp, can)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    samples = simulate(vehicle, settings, DriveOptions(start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
+    samples = simulate(vehicle, settings, start, seconds or MAX_DRIVE_S, scenario, seed, own_field)
 
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_emulator

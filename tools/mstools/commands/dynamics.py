@@ -22,6 +22,7 @@ from mstools.terminal.options import (
     UrlOption,
     Variables,
     argument,
+    list_given,
     option,
     parse_variables,
 )
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 
 def command(
+    ctx: typer.Context,
     frame: Annotated[str, argument("FRAME", "Frame of center of mass and inertia. Default: the base frame.")] = "",
     model: ModelOption = None,
     config: Annotated[
@@ -77,22 +79,12 @@ def command(
       modelserver dynamics --model config/raptor/geometry.yaml --joint FLEALateral=0.5 --equations
     """
     if model is None and config is None:
-        for name, given in (
-            ("--set", settings),
-            ("--joint", joints),
-            ("--payload", payload),
-            ("--mass", masses),
-            ("--contact", contacts),
-            ("--tilt-deg", any(tilt)),
-            ("--acceleration", any(acceleration)),
-            ("--allow-massless", allow_massless),
-            ("--cut-loops", cut_loops),
-        ):
-            if given:
-                raise typer.BadParameter(
-                    "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
-                    param_hint=name,
-                )
+        of_file = {"settings", "joints", "payload", "masses", "contacts", "tilt", "acceleration"}
+        if wrong := list_given(ctx, of_file | {"allow_massless", "cut_loops"}):
+            raise typer.BadParameter(
+                "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
+                param_hint=next(iter(wrong.values())),
+            )
         _show(*_query_daemon(frame, floating, equations, npy is not None, url, prefix, timeout), npy, as_json)
         return
     from modelserver.dynamics import MassUncertainty, assess_stability

@@ -22,7 +22,7 @@ from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, complete_frame, option
+from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, complete_frame, list_given, option
 from mstools.terminal.output import (
     check_writable,
     escape,
@@ -113,8 +113,7 @@ def command(
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --log localized.lcm
       modelserver replay --verify /var/lib/modelserver/journal-Husky --key /etc/modelserver/commands.key
     """
-    sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
-    _check_options({name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"})
+    _check_options(list_given(ctx))
     channels = frozenset(channel or ())
     if verify:
         run_verification(log, as_json, key)
@@ -133,17 +132,17 @@ def command(
         replay_to_bus(log, config, factor, None if everything else channels, url, as_json, restamp)
 
 
-def _check_options(given: set[str]) -> None:
-    """Raise typer.BadParameter, a usage error, where the parameters that were given do not go together."""
-    more, of_poses = given - {"log", "as_json"}, given & {"frame", "rate", "at_times"}
-    offline = [name for name in ("out", "poses", "report") if name in given]
+def _check_options(options: dict[str, str]) -> None:
+    """Raise typer.BadParameter, a usage error, where options do not go together; they are by parameter."""
+    given = options.keys() - {"log", "as_json"}
+    of_poses, offline = given & {"frame", "rate", "at_times"}, given & {"out", "poses", "report"}
     rules: list[tuple[object, str]] = [
         (
-            "verify" in given and more - {"verify", "key"},
+            "verify" in given and given - {"verify", "key"},
             "--verify accepts only --json and --key: everything else is in the journal",
         ),
         ("key" in given and "verify" not in given, "--key needs --verify"),
-        ("out" in given and more - {"out", "config"}, "--log goes with -c and --json alone: run twice for more"),
+        ("out" in given and given - {"out", "config"}, "--log goes with -c and --json alone: run twice for more"),
         (
             offline and given & {"speed", "restamp", "everything", "url"},
             "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline",
@@ -156,8 +155,7 @@ def _check_options(given: set[str]) -> None:
         if is_broken:
             raise typer.BadParameter(text)
     if offline and "config" not in given:
-        option = "--log" if offline[0] == "out" else f"--{offline[0]}"
-        raise typer.BadParameter(f"{option} needs the vehicle file: -c FILE")
+        raise typer.BadParameter(f"{options[min(offline)]} needs the vehicle file: -c FILE")
 
 
 def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:

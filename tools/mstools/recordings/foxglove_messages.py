@@ -77,14 +77,9 @@ _OK, _WARN, _ERROR, _STALE = range(4)
 
 
 def _make_schema(**fields: object) -> dict[str, object]:
-    """Return the JSON schema of an object; a list is an array of its item, a text the name of a plain type."""
-
-    def convert(field: object) -> object:
-        if isinstance(field, list):
-            return {"type": "array", "items": convert(field[0])}
-        return {"type": field} if isinstance(field, str) else field
-
-    return {"type": "object", "properties": {name: convert(field) for name, field in fields.items()}}
+    """Return the JSON schema of an object; a text is the name of a plain type."""
+    properties = {name: {"type": field} if isinstance(field, str) else field for name, field in fields.items()}
+    return {"type": "object", "properties": properties}
 
 
 _STATUS: Final = _make_schema(
@@ -92,10 +87,11 @@ _STATUS: Final = _make_schema(
     name="string",
     message="string",
     hardware_id="string",
-    values=[_make_schema(key="string", value="string")],
+    values={"type": "array", "items": _make_schema(key="string", value="string")},
 )
 DIAGNOSTICS_SCHEMA: Final = {"title": "diagnostic_msgs/DiagnosticArray"} | _make_schema(
-    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"), status=[_STATUS]
+    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"),
+    status={"type": "array", "items": _STATUS},
 )
 
 

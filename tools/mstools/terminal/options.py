@@ -86,6 +86,16 @@ def argument(metavar: str, about: str, **more: Any) -> Any:
     return typer.Argument(metavar=metavar, help=about, **more)
 
 
+def list_given(ctx: typer.Context, names: Iterable[str] = ()) -> dict[str, str]:
+    """Return the parameters on the command line, all or those of some names, each with its option."""
+    sources = {each.name or "": (each, ctx.get_parameter_source(each.name or "")) for each in ctx.command.params}
+    return {
+        name: each.opts[0]
+        for name, (each, source) in sources.items()
+        if source is not None and source.name == "COMMANDLINE" and (not names or name in names)
+    }
+
+
 Variables: TypeAlias = Annotated[
     list[str] | None,
     option(
