@@ -115,7 +115,6 @@ def test_given_two_poses_then_one_in_between_is_interpolated() -> None:
     assert picture.pose.is_close(Pose.from_rpy((5.0, 0.0, 0.0), yaw=0.1), 1e-9, 1e-9)
     assert picture.covariance is not None
     np.testing.assert_allclose(picture.covariance, np.diag([4.0, 1.0, 9.0]))
-    assert picture.heading_sigma == pytest.approx(0.2)
     assert (picture.horizontal_protection_level, picture.heading_protection_level) == (3.0, 0.1)
 
 
@@ -160,7 +159,6 @@ def test_given_a_pose_without_covariance_then_the_picture_has_none() -> None:
     feed_poses(drive, [make_pose(0.0, 0.0, covariance=False)])
     picture = drive.get_picture()
     assert picture.covariance is None
-    assert math.isnan(picture.heading_sigma)
 
 
 def test_given_a_pose_that_becomes_invalid_and_valid_then_both_are_events_in_words() -> None:

@@ -387,14 +387,6 @@ class Step(NamedTuple):
     change: str
 
 
-class CheckedText(NamedTuple):
-    """The model in a text, None if it has an error; what can be drawn of it, then its bodies alone; all problems."""
-
-    model: Model | None
-    drawn: Model | None
-    problems: tuple[Problem, ...]
-
-
 @dataclass(frozen=True)
 class EditedFile:
     """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it."""
@@ -421,8 +413,8 @@ class EditedFile:
         except UnicodeDecodeError:
             raise EditError(f"{self.path} is not UTF-8 text; save it as that first") from None
 
-    def check(self, text: str, variables: Mapping[str, str]) -> CheckedText:
-        """Return what a text has, with all problems, also of frames in the vehicle file."""
+    def check(self, text: str, variables: Mapping[str, str]) -> tuple[Model | None, Model | None, tuple[Problem, ...]]:
+        """Return the model in a text, None for one with an error; what can be drawn of it; and all problems."""
         builder = parse_content(text.encode(), str(self.path), variables)
         model, problems = builder.check()
         partial = model or builder.build_bodies()
@@ -430,7 +422,7 @@ class EditedFile:
             from modelserver.server.vehicle import find_frame_problems
 
             problems += tuple(find_frame_problems(self.config, partial, str(self.vehicle), model is not None))
-        return CheckedText(model, partial, problems)
+        return model, partial, problems
 
 
 class EditSession:
@@ -448,7 +440,7 @@ class EditSession:
         if not document.list_items():
             path = self.file.path
             raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
-        drawn = self.file.check(document.text, self._variables).drawn
+        _, drawn, _ = self.file.check(document.text, self._variables)
         if drawn is None:
             raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
         self._saved = saved
@@ -462,13 +454,12 @@ class EditSession:
         self._check()
 
     def _check(self) -> None:
-        found = self.file.check(self.document.text, self._variables)
-        self.problems = found.problems
-        if found.model is not None:
-            self.model = self.drawn = found.model
+        model, drawn, self.problems = self.file.check(self.document.text, self._variables)
+        if model is not None:
+            self.model = self.drawn = model
             self._loaded = self.document
-        elif self.model is None and found.drawn is not None:
-            self.drawn = found.drawn
+        elif self.model is None and drawn is not None:
+            self.drawn = drawn
 
     @property
     def document(self) -> GeometryDocument:

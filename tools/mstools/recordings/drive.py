@@ -205,15 +205,13 @@ class ChannelCount:
 class Picture(NamedTuple):
     """The vehicle at `utime`: pose of the base frame in World:UTM, None where it is unknown, and what is known of it.
 
-    `covariance` is that of the position (3, 3), m2, and `heading_sigma` in radians, nan where unknown; `joints` gives
-    the position of each coordinate that was received.
+    `covariance` is that of the position (3, 3), m2; `joints` gives the position of each coordinate that was received.
     """
 
     utime: int
     pose: Pose | None = None
     invalid: Invalid = VALID
     covariance: Array | None = None
-    heading_sigma: float = math.nan
     horizontal_protection_level: float = math.nan
     heading_protection_level: float = math.nan
     joints: Mapping[str, float] = {}
@@ -221,8 +219,8 @@ class Picture(NamedTuple):
 
 # columns of the table of poses
 _POSITION, _QUATERNION, _COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 13)
-_HEADING_SIGMA, _HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 18)
-_POSE_COLUMNS: Final = 18
+_HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 17)
+_POSE_COLUMNS: Final = 17
 _UPPER: Final = np.triu_indices(3)
 MAX_INTERPOLATION_US: Final = 1_000_000
 """Longest time between two poses that is interpolated."""
@@ -342,7 +340,6 @@ class Drive:
             *found.pose.xyz,
             *found.pose.wxyz,
             *upper,
-            math.nan if covariance is None else math.sqrt(max(covariance[5, 5], 0.0)),
             answer.horizontal_protection_level,
             answer.heading_protection_level,
             found.invalid_reasons,
@@ -511,7 +508,7 @@ class Drive:
             covariance = np.zeros((3, 3))
             covariance[_UPPER] = row[_COVARIANCE]
             covariance = covariance + np.triu(covariance, 1).T
-        levels = float(row[_HEADING_SIGMA]), float(row[_HORIZONTAL]), float(row[_HEADING])
+        levels = float(row[_HORIZONTAL]), float(row[_HEADING])
         return Picture(utime, pose, Invalid(int(row[_INVALID])), covariance, *levels, joints)
 
     def get_joints(self, utime: int) -> dict[str, float]:

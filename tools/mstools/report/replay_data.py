@@ -336,7 +336,6 @@ class StateSample:
     yaw_rate: float = math.nan
     velocity: tuple[float, float] | None = None
     is_stationary: bool = False
-    mode: Mode | None = None
     phase: Phase | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     sigmas: Mapping[str, float] = field(default_factory=dict)
@@ -561,7 +560,6 @@ class ReplayCollector:
                 "yaw_rate": state.angular_velocity[2],
                 "velocity": so3.rotate(state.pose.wxyz, state.linear_velocity)[:2],
                 "is_stationary": state.stationary,
-                "mode": state.mode,
                 "phase": state.phase,
                 "values": dict(zip(state.names, state.values, strict=True)),
                 "sigmas": dict(zip(state.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True)),
