@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
+from mstools.terminal.options import option
 from mstools.terminal.output import escape, print_problems, suggest_path
 
 GROUPS = {
@@ -219,15 +220,7 @@ def _show_version(wanted: bool) -> None:
 
 
 def _options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            help="Print the version.",
-            callback=_show_version,
-            is_eager=True,
-        ),
-    ] = False,
+    version: Annotated[bool, option("--version", "Print the version.", callback=_show_version, is_eager=True)] = False,
 ) -> None:
     pass
 

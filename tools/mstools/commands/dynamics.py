@@ -52,12 +52,9 @@ def command(
         list[str] | None,
         option("--contact FRAME", "Contact with the ground, or a pattern like Cart:*Wheel. May be repeated."),
     ] = None,
-    tilt: Annotated[
-        tuple[float, float], typer.Option("--tilt-deg", metavar="ROLL PITCH", help="Attitude of the root frame.")
-    ] = (0.0, 0.0),
+    tilt: Annotated[tuple[float, float], option("--tilt-deg ROLL PITCH", "Attitude of the root frame.")] = (0.0, 0.0),
     acceleration: Annotated[
-        tuple[float, float, float],
-        typer.Option("--acceleration", metavar="X Y Z", help="Acceleration of the root frame in the world, m/s2."),
+        tuple[float, float, float], option("--acceleration X Y Z", "Acceleration of the root frame in the world, m/s2.")
     ] = (0.0, 0.0, 0.0),
     floating: Annotated[bool, option("--floating", "Six coordinates for the base, too.")] = False,
     equations: Annotated[bool, option("--equations", "Print coordinates, gravity and mass matrix.")] = False,

@@ -12,7 +12,7 @@ import typer
 
 from modelserver.errors import ModelServerError, RecordingError
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.terminal.options import PrefixOption, UrlOption, option
+from mstools.terminal.options import PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import (
     catch_signals,
     check_writable,
@@ -30,14 +30,14 @@ DEFAULT_PORT = 8765
 
 
 def command(
-    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="LCM log of the service.")] = None,
-    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="MCAP file to write.")] = None,
+    log: Annotated[Path | None, argument("[LOG]", "LCM log of the service.")] = None,
+    out: Annotated[Path | None, argument("[OUT]", "MCAP file to write.")] = None,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log that has none of the service.")] = None,
     config: Annotated[
         Path | None, option("--config -c FILE", "Vehicle file: run the localization on a log that has no poses.")
     ] = None,
     live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
-    raw: Annotated[bool, typer.Option("--raw/--no-raw", help="Include the LCM messages as they are.")] = True,
+    raw: Annotated[bool, option("--raw/--no-raw", "Include the LCM messages as they are.")] = True,
     force: Annotated[bool, option("--force", "Replace OUT if it exists.")] = False,
     bind: Annotated[str, option("--bind ADDRESS", "With --live: serve at this address.")] = "127.0.0.1",
     port: Annotated[int, option("--port N", "With --live: port; 0 is any free one.", min=0, max=65535)] = DEFAULT_PORT,

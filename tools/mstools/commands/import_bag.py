@@ -41,9 +41,7 @@ from mstools.terminal.output import check_writable, escape, show_progress, write
 
 def command(
     bag: Annotated[Path, argument("BAG", "ROS 1 file, folder of a ROS 2 recording, or MCAP file of export.")],
-    log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="LCM event log to write. Without: show what would be taken.")
-    ] = None,
+    log: Annotated[Path | None, argument("[LOG]", "LCM event log to write. Without: show what would be taken.")] = None,
     topic: Annotated[
         list[str] | None,
         option(

@@ -31,7 +31,7 @@ from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
 from mstools.terminal import health_metrics
 from mstools.terminal.health_text import as_data, format_report, is_healthy
-from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
 
 if TYPE_CHECKING:
@@ -59,9 +59,7 @@ HEALTH = "MODELSERVER_HEALTH"
 
 
 def command(
-    log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="Show the last report in this LCM log instead.")
-    ] = None,
+    log: Annotated[Path | None, argument("[LOG]", "Show the last report in this LCM log instead.")] = None,
     config: Annotated[
         Path | None,
         option("--config -c FILE", "The vehicle file, for its bus and prefix; with LOG: run the localization on it."),

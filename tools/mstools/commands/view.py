@@ -20,6 +20,7 @@ from mstools.terminal.options import (
     TimeoutOption,
     UrlOption,
     Variables,
+    argument,
     option,
     parse_variables,
 )
@@ -35,9 +36,7 @@ SHOWN_NOTES = 5
 
 
 def command(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A geometry file, vehicle file, or LCM log.")
-    ] = None,
+    file: Annotated[Path | None, argument("[FILE]", "A geometry file, vehicle file, or LCM log.")] = None,
     live: Annotated[bool, option("--live", "Follow the running service.")] = False,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log, in place of its own.")] = None,
     config: Annotated[
