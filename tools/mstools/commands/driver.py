@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -274,32 +275,28 @@ def subscribe_commands(
     prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
     plain = f"{prefix}{channel}"
 
-    def handle(_: str, data: bytes) -> None:
-        try:
-            runner.send_command(decode(COMMAND_TYPE, data))
-        except WireError as error:
-            runner.reject_command(error.reason, f"a command on {plain} rejected: {error}")
+    def handle(channel: str, read: Callable[[bytes], Any]) -> None:
+        """Subscribe to a channel: its commands are sent as they are read, or rejected."""
 
-    def reject_unsigned(_: str, data: bytes) -> None:
-        text = (
-            f"a command on {plain} rejected: it is not signed; use modelserver.VehicleCommander with the vehicle's key"
-        )
-        runner.reject_command("unsigned", text)
+        def send(_: str, data: bytes) -> None:
+            try:
+                runner.send_command(read(data))
+            except (WireError, CommandDeniedError) as error:
+                runner.reject_command(error.reason, f"a command on {channel} rejected: {error}")
+
+        bus.subscribe(to_subscription_pattern(channel), send)
+
+    def reject_unsigned(_: bytes) -> None:
+        text = "it is not signed; use modelserver.VehicleCommander with the vehicle's key"
+        raise CommandDeniedError("unsigned", text)
 
     if config.is_drive_signed:
-        signed = f"{prefix}{DRIVE_SIGNED}"
-        verifier = DriveVerifier(
-            read_keys(config.key_file), prefix, channel, config.window_s, time_source.now().monotonic_ns
-        )
-
-        def verify(_: str, data: bytes) -> None:
-            try:
-                runner.send_command(verifier.verify(data, time_source.now()))
-            except CommandDeniedError as error:
-                runner.reject_command(error.reason, f"a command on {signed} rejected: {error}")
-
-        bus.subscribe(to_subscription_pattern(signed), verify)
-    bus.subscribe(to_subscription_pattern(plain), reject_unsigned if config.is_drive_signed else handle)
+        now = time_source.now().monotonic_ns
+        verifier = DriveVerifier(read_keys(config.key_file), prefix, channel, config.window_s, now)
+        handle(f"{prefix}{DRIVE_SIGNED}", lambda data: verifier.verify(data, time_source.now()))
+        handle(plain, reject_unsigned)
+    else:
+        handle(plain, partial(decode, COMMAND_TYPE))
 
     def attend() -> None:
         while handle_message(bus):
