@@ -24,7 +24,7 @@ from modelserver.formats.common import format_number, parse_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.placement import (
     DistanceFit,
     Placement,
@@ -286,25 +286,19 @@ class Editor:
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
-        name = self._new.value.strip()
-        item = self._item
-        frames = list_frames(self._session.document)
-        if kind is ItemKind.BODY:
-            self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
-        elif kind is ItemKind.FRAME:
-            body = item.name.partition(":")[0] if item.kind is not ItemKind.CONSTRAINT else frames[0].partition(":")[0]
-            new = GeometryItem(kind, names.join(body, name))
-            self._change(f"add {new.name}", lambda document: document.add_frame(body, name), new)
-        else:
+        name, item, frames = self._new.value.strip(), self._item, list_frames(self._session.document)
+        body = (frames[0] if item.kind is ItemKind.CONSTRAINT else item.name).partition(":")[0]
+        new, change = name, lambda document: document.add_body(name)
+        if kind is ItemKind.FRAME:
+            new, change = names.join(body, name), lambda document: document.add_frame(body, name)
+        elif kind is ItemKind.CONSTRAINT:
             from_ = item.name if item.kind is ItemKind.FRAME else frames[0]
             others = [each for each in frames if each.partition(":")[0] != from_.partition(":")[0]]
             if not others:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
-            to = others[-1]
-            self._change(
-                f"add {name}", lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name)
-            )
+            change = lambda document: document.add_constraint(name, from_, others[-1])  # noqa: E731
+        self._change(f"add {new}", change, GeometryItem(kind, new))
 
     def _duplicate(self) -> None:
         item = self._item
@@ -557,20 +551,19 @@ class ItemFields:
             users = ", ".join(document.list_users(template))
             hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
             self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
-        if isinstance(self._part, Constraint):
-            self._add_ends(self._part)
+        part: BodyFrame | Constraint | Body | None = self._part
+        if isinstance(part, Constraint):
+            frames = tuple(list_frames(document))
+            for key, frame in (("from", part.from_), ("to", part.to)):
+                shown = frame if frame in frames else frames[0]
+                self._add(key, self._gui.add_dropdown(key, frames, initial_value=shown))
         if self._part is not None:
             self._add_pose(self._part.pose, self._part.sigma)
-        if isinstance(self._part, Constraint):
-            self._add_joint(self._part.joint)
-        self._add("description", self._gui.add_text("Description", self._get_description(item)))
+        if isinstance(part, Constraint):
+            self._add_joint(part.joint)
+        part = part or next((each for each in self._session.drawn.bodies if each.name == item.name), None)
+        self._add("description", self._gui.add_text("Description", part.description if part is not None else ""))
         self._actions.add_button(self._gui, "Set", self.set)
-
-    def _get_description(self, item: GeometryItem) -> str:
-        if self._part is not None:
-            return self._part.description
-        bodies = {each.name: each for each in self._session.drawn.bodies}
-        return bodies[item.name].description if item.name in bodies else ""
 
     def _add(self, key: str, field: Any) -> None:
         self._fields[key], self._given[key] = field, field.value
@@ -589,11 +582,6 @@ class ItemFields:
         turns = np.degrees(known.rotation).tolist()
         self._add_vector("sigma_xyz", [f"sigma {axis} (m)" for axis in "xyz"], known.position)
         self._add_vector("sigma_rpy", [f"sigma {axis} (deg)" for axis in ("roll", "pitch", "yaw")], turns)
-
-    def _add_ends(self, constraint: Constraint) -> None:
-        frames = tuple(list_frames(self._session.document))
-        for key, frame in (("from", constraint.from_), ("to", constraint.to)):
-            self._add(key, self._gui.add_dropdown(key, frames, initial_value=frame if frame in frames else frames[0]))
 
     def _add_joint(self, joint: Joint) -> None:
         gui = self._gui

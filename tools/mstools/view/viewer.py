@@ -602,22 +602,21 @@ class JointsPanel:
         self._gui = gui
         self._source = source
         self._actions = actions
-        self._sliders: dict[str, tuple[Any, float]] = {}
-        self._defaults: dict[str, float] = {}
+        self._sliders: dict[str, tuple[Any, float, float]] = {}
         self._folder = gui.add_folder("Positions")
 
     def set_model(self, model: Model) -> None:
         """Offer the coordinates of a model; those that were moved stay where they are."""
         moved = {
             name: slider.value
-            for name, (slider, _) in self._sliders.items()
-            if not math.isclose(slider.value, self._defaults[name], abs_tol=1e-6)
+            for name, (slider, _, default) in self._sliders.items()
+            if not math.isclose(slider.value, default, abs_tol=1e-6)
         }
-        old, self._sliders, self._defaults = self._sliders, {}, {}
+        old, self._sliders = self._sliders, {}
         with self._folder:
             for name, joint, number in list_coordinates(model):
                 self._add_slider(name, joint, number, moved.get(name))
-        for slider, _ in old.values():
+        for slider, *_ in old.values():
             # last: a page hides a folder that was empty for a moment, and may never show it again
             slider.remove()
         if moved.keys() & self._sliders.keys():
@@ -630,13 +629,13 @@ class JointsPanel:
         low = max(joint.lower[number], -free) if joint.lower else -free
         high = min(joint.upper[number], free) if joint.upper else free
         lower, upper = low * scale, max(high, low + 1e-6) * scale
-        self._defaults[name] = default = min(max(joint.default_position[number] * scale, lower), upper)
+        default = min(max(joint.default_position[number] * scale, lower), upper)
         value = default if moved is None else min(max(moved, lower), upper)
         unit, step = ("deg", 0.1) if is_angle else ("m", 0.001)
         slider = self._gui.add_slider(f"{name} ({unit})", lower, upper, step, value)
         self._actions.on_update(slider, self._apply)
-        self._sliders[name] = (slider, scale)
+        self._sliders[name] = (slider, scale, default)
 
     def _apply(self) -> None:
         assert self._source.set_joints is not None
-        self._source.set_joints({name: slider.value / scale for name, (slider, scale) in self._sliders.items()})
+        self._source.set_joints({name: slider.value / scale for name, (slider, scale, _) in self._sliders.items()})
