@@ -15,7 +15,7 @@ from support_lcm import reserved_url
 from support_view import follow_drive, record_drive
 
 from mstools.commands.demo import find_vehicle_file
-from mstools.edit.document import EditedFile, EditSession
+from mstools.edit import EditedFile, EditSession
 from mstools.report import charts
 from mstools.view.editor import Editing
 from mstools.view.sources import Source, open_geometry, open_log

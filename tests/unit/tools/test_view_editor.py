@@ -17,7 +17,7 @@ from modelserver.errors import Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
+from mstools.edit import EditedFile, EditSession, GeometryItem, ItemKind
 from mstools.view.editor import SNAPS, Editing, Editor
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import VehicleScene

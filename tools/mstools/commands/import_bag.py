@@ -23,10 +23,12 @@ from mstools.recordings.bags import (
     CONVERTERS,
     DEFAULT_OPTIONS,
     ROS_TYPES,
+    TF_TYPES,
     Altitude,
     Bag,
     BagOptions,
     ImuOrientation,
+    TfTree,
     Topic,
     TopicKind,
     is_lcm_mcap,
@@ -34,7 +36,6 @@ from mstools.recordings.bags import (
     open_mcap,
     read_stamp,
 )
-from mstools.recordings.tf_tree import TF_TYPES, TfTree
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, show_progress, write_beside, write_file
 

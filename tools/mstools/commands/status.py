@@ -29,8 +29,7 @@ from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_patt
 from modelserver.wire.codec import decode
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
-from mstools.terminal import health_metrics
-from mstools.terminal.health_text import as_data, format_report, is_healthy
+from mstools.terminal.health import MAX_AGE_S, as_data, format_metrics, format_report, is_healthy, serve_metrics
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
 
@@ -317,11 +316,11 @@ def follow_metrics(listener: HealthListener, address: str) -> None:
         current = [
             each
             for name, each in drivers.items()
-            if now - times.get(f"driver {name}", -math.inf) <= health_metrics.MAX_AGE_S
+            if now - times.get(f"driver {name}", -math.inf) <= MAX_AGE_S
         ]
-        return health_metrics.format_metrics(listener.health, now - times.get(HEALTH, -math.inf), current)
+        return format_metrics(listener.health, now - times.get(HEALTH, -math.inf), current)
 
-    server = health_metrics.serve_metrics(address, render)
+    server = serve_metrics(address, render)
     host, port = server.server_address[:2]
     typer.echo(f"http://{host!s}:{port}/metrics (Ctrl-C ends it)")
     sys.stdout.flush()

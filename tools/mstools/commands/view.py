@@ -129,7 +129,7 @@ def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, 
 
     Bus and prefix of the service are those given, else of the vehicle file.
     """
-    from mstools.edit.document import EditedFile, EditSession
+    from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing
 
     if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:

@@ -20,7 +20,7 @@ from modelserver.server.recordings import LOOKED_AT, measure
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.edit.document import EditedFile, EditSession
+from mstools.edit import EditedFile, EditSession
 from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
 from mstools.terminal.output import load_given_model, read_with_progress

@@ -22,9 +22,9 @@ from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
 from modelserver.transforms.so3 import Array
-from mstools.edit.document import GeometryItem, ItemKind
+from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
-from mstools.terminal.health_text import format_body, format_duration
+from mstools.terminal.health import format_body, format_duration
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
