@@ -75,7 +75,7 @@ def command(
     if model is not None and config is not None:
         raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
     require_extra("foxglove", NEEDS_FOXGLOVE)
-    from mstools.recordings.localized import open_localized
+    from mstools.commands.replay import open_localized
 
     check_writable(str(out), force)
     with open_localized(log, config) as localized:

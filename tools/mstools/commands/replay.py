@@ -6,10 +6,11 @@ import gc
 import json
 import math
 import os
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -160,8 +161,6 @@ def _check_options(options: dict[str, str]) -> None:
 
 def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
     """Write a log with the service's messages, whole or not at all."""
-    from mstools.recordings.localized import write_localized
-
     _check_outputs({"log": str(out)}, [log, config])
     with write_beside(out) as draft:
         counts = write_localized(log, config, draft)
@@ -171,6 +170,46 @@ def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
     typer.echo(escape(f"{out}: {format_count(sum(counts.values()), 'message')}"))
     for name, count in sorted(counts.items()):
         typer.echo(escape(f"  {name} {count}"))
+
+
+def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
+    """Write the log with the service's messages; return the number of messages by channel.
+
+    Notes of the log go to stderr. Raises ConfigError, GeometryError, RecordingError, OSError.
+    """
+    import lcm
+
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.server.offline import serve
+    from modelserver.server.recordings import StampAxis
+    from modelserver.server.vehicle import load_vehicle
+
+    vehicle = load_vehicle(load_config(config), str(config))
+    axis = StampAxis()
+    counts: Counter[str] = Counter()
+    writer = lcm.EventLog(str(out), "w", overwrite=True)
+    try:
+        with read_with_progress("localizing", log) as (recording, events):
+            for event in serve(vehicle, events, axis):
+                writer.write_event(event.utime, event.channel, event.data)
+                counts[event.channel] += 1
+    finally:
+        writer.close()
+    for note in (*axis.describe(), *map(str, recording.damage)):
+        typer.echo(escape(f"modelserver: {log}: {note}"), err=True)
+    return counts
+
+
+@contextmanager
+def open_localized(log: Path, config: Path | None) -> Iterator[Path]:
+    """Give the log itself, or with a vehicle file a temporary one with what the service makes of it."""
+    if config is None:
+        yield log
+        return
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        out = Path(folder) / log.name
+        write_localized(log, config, out)
+        yield out
 
 
 def replay_to_bus(

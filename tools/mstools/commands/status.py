@@ -144,7 +144,7 @@ def show_report(health: Health, reports: Iterable[DriverHealth], drivers: tuple[
 def show_last_report(log: Path, config: Path | None, prefix: str, as_json: bool) -> None:
     """Print the last report in a log, with a vehicle file after the localization. Raises RecordingError, OSError."""
     from modelserver.wire.eventlog import LogFile
-    from mstools.recordings.localized import open_localized
+    from mstools.commands.replay import open_localized
 
     health: Health | None = None
     drivers: dict[str, DriverHealth] = {}
@@ -313,11 +313,7 @@ def follow_metrics(listener: HealthListener, address: str) -> None:
     def render() -> str:
         # copies: the listener changes them in another thread
         now, times, drivers = time.monotonic(), dict(listener.times), dict(listener.drivers)
-        current = [
-            each
-            for name, each in drivers.items()
-            if now - times.get(f"driver {name}", -math.inf) <= MAX_AGE_S
-        ]
+        current = [each for name, each in drivers.items() if now - times.get(f"driver {name}", -math.inf) <= MAX_AGE_S]
         return format_metrics(listener.health, now - times.get(HEALTH, -math.inf), current)
 
     server = serve_metrics(address, render)

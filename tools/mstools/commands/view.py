@@ -89,7 +89,7 @@ def command(
     with ExitStack() as stack:
         shown = file
         if config is not None and file is not None:
-            from mstools.recordings.localized import open_localized
+            from mstools.commands.replay import open_localized
 
             shown = stack.enter_context(open_localized(file, config))
         source = open_source(shown, model, settings, url, prefix, timeout, editing)

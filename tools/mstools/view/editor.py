@@ -38,8 +38,7 @@ from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit import SAME_RADIANS, EditSession, GeometryDocument, GeometryItem, ItemKind
-from mstools.edit import EditError
+from mstools.edit import SAME_RADIANS, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.terminal.output import format_count
 from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
