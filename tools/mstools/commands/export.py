@@ -89,7 +89,7 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
     """
     import foxglove
 
-    from mstools.lcm_wheel import find_type_files
+    from mstools.commands.status import find_type_files
     from mstools.recordings.foxglove_messages import FoxgloveWriter
 
     count = 0

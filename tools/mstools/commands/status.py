@@ -17,18 +17,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
-from modelserver.errors import NoServerError, RecordingError, WireError, find_nearest_names, quote
+from modelserver.errors import ModelServerError, NoServerError, RecordingError, WireError, find_nearest_names, quote
+from modelserver.extras import DEBIAN_INSTALLER, make_system_command, read_installation
 from modelserver.messages import DriverHealth, Health
 from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_pattern
 from modelserver.wire.codec import decode
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
-from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
 from mstools.terminal.health import MAX_AGE_S, as_data, format_metrics, format_report, is_healthy, serve_metrics
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
@@ -385,7 +386,8 @@ def _build_jar(files: Sequence[Path], jar: Path) -> None:
         work = Path(scratch)
         _run([find_binary("lcm-gen"), "--java", "--jpath", work / "src", *files])
         sources = sorted((work / "src").rglob("*.java"))
-        _run([compiler, "-nowarn", "-cp", find_java_library(), "-d", work / "classes", *sources])
+        java_library = _check_file(_get_site_packages() / "share" / "java" / "lcm.jar")
+        _run([compiler, "-nowarn", "-cp", java_library, "-d", work / "classes", *sources])
         finished = work / jar.name
         with zipfile.ZipFile(finished, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted((work / "classes").rglob("*.class")):
@@ -399,3 +401,45 @@ def _run(arguments: Sequence[str | Path]) -> None:
     if done.returncode:
         output = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
         raise MissingToolError(f"{Path(arguments[0]).name} failed: {output[0]}")
+
+
+class MissingToolError(ModelServerError):
+    """A program or a file that a tool needs is missing; the message is how to install it."""
+
+
+def find_binary(name: str) -> Path:
+    """Return the path of the lcm wheel's program `name`, e.g. lcm-gen. Raises MissingToolError.
+
+    It is the wheel's binary, not its `lcm-*` console script: that starts the binary as a child process and leaves it
+    running when it gets SIGTERM.
+    """
+    return _check_file(_get_site_packages() / "bin" / name)
+
+
+def find_type_files() -> tuple[Path, ...]:
+    """Return the .lcm files: of the checkout, or as installed with the package mslcm. Raises MissingToolError."""
+    spec = find_spec("mslcm")
+    if spec is None or spec.origin is None:
+        raise MissingToolError("the package mslcm is missing; reinstall modelserver")
+    package = Path(spec.origin).parent
+    for folder in (package / "lcm", package.parent):
+        files = tuple(sorted(folder.glob("*_t.lcm")))
+        if files:
+            return files
+    raise MissingToolError(f"no .lcm files beside {package}; reinstall modelserver")
+
+
+def _get_site_packages() -> Path:
+    spec = find_spec("lcm")
+    if spec is None or spec.origin is None:
+        raise MissingToolError("the package lcm is missing: pip install lcm")
+    return Path(spec.origin).resolve().parent.parent
+
+
+def _check_file(path: Path) -> Path:
+    if not path.is_file():
+        if read_installation()[0] == DEBIAN_INSTALLER:
+            fix = f"the Debian package does not have it; in a folder with the source: {make_system_command('.')}"
+            raise MissingToolError(f"{path.name} is missing: {fix}")
+        raise MissingToolError(f"{path} is missing; reinstall the wheel: pip install --force-reinstall lcm")
+    return path
