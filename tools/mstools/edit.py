@@ -41,8 +41,6 @@ from modelserver.yaml_tree import LOADER, parse_yaml
 from mstools.terminal.output import open_atomic
 
 KeyPath = Sequence[str]
-MAX_SPACES = 1000
-"""Spaces before a colon that are looked through."""
 
 DECIMALS: Final = 9
 """Of meters and degrees that are written."""
@@ -284,46 +282,31 @@ class YamlText:
     def _make_entry(self, key: Any, value: Any, is_flow: bool) -> TextEntry:
         line = self.text.rfind("\n", 0, key.start_mark.index) + 1
         colon = self._find_colon(key)
-        end = max(self._find_end(value, key.start_mark.column), colon, key.end_mark.index)
+        end = max(self._find_end(value), colon, key.end_mark.index)
         return TextEntry(key, value, line, colon, end, is_flow)
 
     def _find_colon(self, key: Any) -> int:
         """Return the end of the colon behind a key, 0 if there is none."""
-        at = int(key.end_mark.index)
-        between = len(self.text[at : at + MAX_SPACES]) - len(self.text[at : at + MAX_SPACES].lstrip())
-        return at + between + 1 if self.text[at + between : at + between + 1] == ":" else 0
+        found = re.compile(r"\s*:").match(self.text, int(key.end_mark.index))
+        return 0 if found is None else found.end()
 
-    def _find_end(self, node: Any, indent: int) -> int:
+    def _find_end(self, node: Any) -> int:
         """Return the end of a value without the comments and blank lines after it, 0 for one that is not written.
 
-        The parser ends blocks where the next thing begins. `indent` is the column of the key.
+        The parser ends blocks where the next thing begins.
         """
         if isinstance(node, yaml.ScalarNode):
             if node.style in ("|", ">"):
-                return self._find_block_end(node.start_mark.index, indent)
+                written = self.text[node.start_mark.index : node.end_mark.index].rstrip()
+                return self._find_line_end(node.start_mark.index + len(written) - 1)
             return 0 if node.start_mark.index == node.end_mark.index else int(node.end_mark.index)
         if node.flow_style or not node.value:
             return int(node.end_mark.index)
         last = node.value[-1]
         if isinstance(node, yaml.MappingNode):
             key, value = last
-            column = key.start_mark.column
-            return max(self._find_end(value, column), self._find_colon(key))
-        return max(self._find_end(last, node.start_mark.column), int(last.start_mark.index))
-
-    def _find_block_end(self, begin: int, indent: int) -> int:
-        """Return the end of a block scalar whose indicator is at `begin`: of its last line that is not blank."""
-        end = self._find_line_end(begin)
-        line = self._find_next_line(begin)
-        while line < len(self.text):
-            line_end = self._find_line_end(line)
-            text = self.text[line:line_end]
-            if text.strip():
-                if len(text) - len(text.lstrip(" ")) <= indent:
-                    break
-                end = line_end
-            line = self._find_next_line(line)
-        return end
+            return max(self._find_end(value), self._find_colon(key))
+        return max(self._find_end(last), int(last.start_mark.index))
 
     def _find_line_end(self, at: int) -> int:
         end = self.text.find("\n", at)
