@@ -31,7 +31,7 @@ from modelserver.extras import SYSTEM_ENVIRONMENT, make_requirement, make_system
 from modelserver.files import INSTALLED_FOLDER, STATE_FOLDER, read_regular
 from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from modelserver.wire.provider import group_of
-from mstools.terminal.options import option
+from mstools.terminal.options import option, parse_pairs
 from mstools.terminal.output import ProblemCollector, escape, make_error, suggest_name, write_beside
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def command(
     if remove:
         plan = plan_removal(read_facts((), root), purge=purge)
     else:
-        plan = make_plan(vehicle, drivers, parse_serial(serial), root, start)
+        plan = make_plan(vehicle, drivers, parse_pairs(serial, "NAME=ID", "--serial", str), root, start)
     execute_plan(plan, root, dry_run)
 
 
@@ -264,16 +264,6 @@ class CheckedVehicle:
                     found[relative] = read_regular(whole, LARGEST_FILE)
         gathered.raise_any()
         return found
-
-
-def parse_serial(given: Iterable[str] | None) -> dict[str, str]:
-    """Return the devices of --serial by driver. Raises typer.BadParameter, a usage error."""
-    found = {}
-    for each in given or ():
-        name, _, found[name] = each.partition("=")
-        if not (name and found[name]):
-            raise typer.BadParameter(f"{quote(each)} is not NAME=ID", param_hint="--serial")
-    return found
 
 
 def _is_unmodified(found: Path, vehicle: Path, root: Path) -> bool:

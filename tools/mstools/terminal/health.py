@@ -273,30 +273,25 @@ Samples: TypeAlias = Iterable[tuple[Labels, float]]
 UNITS: Final = ("seconds", "meters", "radians", "hertz", "bytes", "ratio")
 
 
-SOURCE_METRICS: Final[tuple[tuple[str, str, str, Callable[[ChannelHealth], float]], ...]] = (
-    ("source_messages", "counter", "Messages received.", lambda each: each.count),
-    ("source_measured", "counter", "Measurements that localization decided on.", lambda each: each.measured),
-    ("source_used", "counter", "Measurements that localization used.", lambda each: each.used),
-    ("source_rate_hertz", "gauge", "Messages a second in the last period.", lambda each: each.rate_hz),
-    ("source_age_seconds", "gauge", "Time since the last message.", lambda each: each.age),
-    (
-        "source_delay_seconds",
-        "gauge",
-        "Greatest delay of a sample in the last period.",
-        lambda each: each.delay_max,
-    ),
-    ("source_silent", "gauge", "Whether the source is silent.", lambda each: each.silent),
+SOURCE_METRICS: Final = (
+    ("source_messages", "counter", "Messages received.", "count"),
+    ("source_measured", "counter", "Measurements that localization decided on.", "measured"),
+    ("source_used", "counter", "Measurements that localization used.", "used"),
+    ("source_rate_hertz", "gauge", "Messages a second in the last period.", "rate_hz"),
+    ("source_age_seconds", "gauge", "Time since the last message.", "age"),
+    ("source_delay_seconds", "gauge", "Greatest delay of a sample in the last period.", "delay_max"),
+    ("source_silent", "gauge", "Whether the source is silent.", "silent"),
 )
-"""Name, type, description and value of the metrics of each source."""
+"""Name, type, description and attribute of the metrics of each source."""
 
-DRIVER_METRICS: Final[tuple[tuple[str, str, str, Callable[[DriverHealth], float]], ...]] = (
-    ("driver_samples", "counter", "Samples published.", lambda each: each.samples),
-    ("driver_reconnects", "counter", "How often the line was reopened.", lambda each: each.reconnects),
-    ("driver_rate_hertz", "gauge", "Samples a second in the last period.", lambda each: each.rate_hz),
-    ("driver_age_seconds", "gauge", "Time since the last sample.", lambda each: each.age),
-    ("driver_clock_offset_seconds", "gauge", "Host minus device time.", lambda each: each.clock_offset),
+DRIVER_METRICS: Final = (
+    ("driver_samples", "counter", "Samples published.", "samples"),
+    ("driver_reconnects", "counter", "How often the line was reopened.", "reconnects"),
+    ("driver_rate_hertz", "gauge", "Samples a second in the last period.", "rate_hz"),
+    ("driver_age_seconds", "gauge", "Time since the last sample.", "age"),
+    ("driver_clock_offset_seconds", "gauge", "Host minus device time.", "clock_offset"),
 )
-"""Name, type, description and value of the metrics of each driver."""
+"""Name, type, description and attribute of the metrics of each driver."""
 
 
 def format_metrics(health: Health | None, age: float, drivers: Iterable[DriverHealth]) -> str:
@@ -360,8 +355,8 @@ def _format_health_metrics(health: Health, age: float) -> Iterator[str]:
     ):
         yield from _format_family(name, "counter", what, [({}, value)])
     sources = [({"source": each.channel}, each) for each in health.channels]
-    for name, kind, what, read in SOURCE_METRICS:
-        yield from _format_family(name, kind, what, [(labels, read(each)) for labels, each in sources])
+    for name, kind, what, attribute in SOURCE_METRICS:
+        yield from _format_family(name, kind, what, [(labels, getattr(each, attribute)) for labels, each in sources])
     rejected = [({"source": source, "reason": reason}, count) for source, reason, count in health.rejected]
     yield from _format_family("rejected", "counter", "Rejected input.", rejected)
     warnings = [({"subject": subject}, 1) for subject, _ in health.warnings]
@@ -376,8 +371,8 @@ def _format_driver_metrics(drivers: list[DriverHealth]) -> Iterator[str]:
         for state, value in _make_states("driver_phase", {phase.name: phase is each.phase for phase in DriverPhase})
     ]
     yield from _format_family("driver_phase", "stateset", "Phase of a driver.", phases)
-    for name, kind, what, read in DRIVER_METRICS:
-        yield from _format_family(name, kind, what, [(labels, read(each)) for labels, each in labeled])
+    for name, kind, what, attribute in DRIVER_METRICS:
+        yield from _format_family(name, kind, what, [(labels, getattr(each, attribute)) for labels, each in labeled])
     counts = [(labels | {"counter": name}, value) for labels, each in labeled for name, value in each.counters]
     yield from _format_family("driver_counter", "counter", "Counters of the device's driver.", counts)
 

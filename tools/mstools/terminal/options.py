@@ -8,9 +8,9 @@ while a line is typed.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import typer
 
@@ -19,6 +19,8 @@ from modelserver.errors import ModelServerError, find_nearest_names, quote
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.geometry import Model
+
+T = TypeVar("T")
 
 
 def complete_frame(ctx: Any, incomplete: str) -> list[str]:
@@ -118,8 +120,6 @@ ChannelsOption = Annotated[
 ]
 JsonOption = Annotated[bool, option("--json", "Print JSON, for scripts.")]
 
-_ASSIGNMENT = re.compile(r"(\w+)=(.*)", re.ASCII | re.DOTALL)
-
 
 def choose_name(text: str, known: Collection[str], what: str, option: str) -> str:
     """Return a known name. Raises typer.BadParameter, a usage error of `option`, with the nearest one for another."""
@@ -130,12 +130,26 @@ def choose_name(text: str, known: Collection[str], what: str, option: str) -> st
     raise typer.BadParameter(f"{quote(text, 40)} is an unknown {what}; {hint}", param_hint=option)
 
 
+def parse_pairs(
+    given: Iterable[str] | None, form: str, hint: str, parse: Callable[[str], T], pattern: str = "([^=]+)=(.+)"
+) -> dict[str, T]:
+    """Return the values of an option of a `form` like NAME=KG by name.
+
+    Raises typer.BadParameter, a usage error of the option `hint`, where the pattern does not match, or `parse` raises
+    ValueError.
+    """
+    found = {}
+    for text in given or ():
+        match = re.fullmatch(pattern, text, re.ASCII | re.DOTALL)
+        try:
+            if match is None:
+                raise ValueError
+            found[match[1]] = parse(match[2])
+        except ValueError:
+            raise typer.BadParameter(f"{quote(text)} is not {form}", param_hint=hint) from None
+    return found
+
+
 def parse_variables(given: Iterable[str] | None) -> dict[str, str]:
     """Return the variables of `--set`. Raises typer.BadParameter, a usage error, for a malformed one."""
-    variables = {}
-    for text in given or ():
-        match = _ASSIGNMENT.fullmatch(text)
-        if match is None:
-            raise typer.BadParameter(f"{quote(text)} is not NAME=VALUE", param_hint="--set")
-        variables[match[1]] = match[2]
-    return variables
+    return parse_pairs(given, "NAME=VALUE", "--set", str, r"(\w+)=(.*)")
