@@ -7,6 +7,7 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
@@ -206,20 +207,18 @@ def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) ->
         if has_kinds:
             raise RecordingError(f"{mcap_path}: --topic goes with a ROS bag; this file has the messages as they were")
         first = last = 0
-        out = lcm.EventLog(str(path), "w", overwrite=True)
-        try:
-            with show_progress(
-                f"importing {mcap_path.name}", sum(count for _, count in mcap.channels.values())
-            ) as show:
-                for number, (utime, channel, data) in enumerate(mcap.read(), 1):
-                    report = reports[channel]
-                    out.write_event(utime, report.channel, data)
-                    report.written += 1
-                    first, last = first or utime, utime
-                    if number % 512 == 0:
-                        show(number)
-        finally:
-            out.close()
+        total = sum(count for _, count in mcap.channels.values())
+        with (
+            closing(lcm.EventLog(str(path), "w", overwrite=True)) as out,
+            show_progress(f"importing {mcap_path.name}", total) as show,
+        ):
+            for number, (utime, channel, data) in enumerate(mcap.read(), 1):
+                report = reports[channel]
+                out.write_event(utime, report.channel, data)
+                report.written += 1
+                first, last = first or utime, utime
+                if number % 512 == 0:
+                    show(number)
     return list(reports.values()), (last - first) * 1e-6
 
 
@@ -297,40 +296,39 @@ def _write(
     for name, kind in chosen.items():
         reports[name].channel = f"{prefix}{kind.upper()}"
     first = last = done = num_joints = 0
-    out = lcm.EventLog(str(path), "w", overwrite=True)
-    try:
-        with show_progress(f"importing {path.name}", total) as show:
-            for name, received_ns, message in bag.messages(chosen.keys() | moving):
-                report = reports[name]
-                arrived = received_ns // 1000
-                if name in moving:
-                    for stamp, joints in tree.read_joints(message):
-                        header = SensorHeader(stamp or arrived, TF, num_joints, arrived)
-                        out.write_event(arrived, f"{prefix}JOINTS", codec.encode(JointsSample(header, joints)))
-                        num_joints += 1
-                    continue
-                utime = read_stamp(message)
-                if utime <= 0:
-                    utime = arrived
-                    unstamped[name] += 1
-                elif len(offsets[name]) < LOOKED_AT:
-                    offsets[name].append((utime - arrived) * 1e-6)
-                header = SensorHeader(utime, chosen[name].value, report.written, arrived)
-                try:
-                    sample = converters[name].convert(header, message)
-                except AttributeError as error:
-                    raise RecordingError(
-                        f"topic {name}: {error}: the file defines {report.type_name} otherwise than ROS does: "
-                        "it is damaged, or this is another type of that name"
-                    ) from None
-                out.write_event(arrived, report.channel, codec.encode(sample))
-                report.written += 1
-                first, last = first or arrived, arrived
-                done += 1
-                if done % 512 == 0:
-                    show(done)
-    finally:
-        out.close()
+    with (
+        closing(lcm.EventLog(str(path), "w", overwrite=True)) as out,
+        show_progress(f"importing {path.name}", total) as show,
+    ):
+        for name, received_ns, message in bag.messages(chosen.keys() | moving):
+            report = reports[name]
+            arrived = received_ns // 1000
+            if name in moving:
+                for stamp, joints in tree.read_joints(message):
+                    header = SensorHeader(stamp or arrived, TF, num_joints, arrived)
+                    out.write_event(arrived, f"{prefix}JOINTS", codec.encode(JointsSample(header, joints)))
+                    num_joints += 1
+                continue
+            utime = read_stamp(message)
+            if utime <= 0:
+                utime = arrived
+                unstamped[name] += 1
+            elif len(offsets[name]) < LOOKED_AT:
+                offsets[name].append((utime - arrived) * 1e-6)
+            header = SensorHeader(utime, chosen[name].value, report.written, arrived)
+            try:
+                sample = converters[name].convert(header, message)
+            except AttributeError as error:
+                raise RecordingError(
+                    f"topic {name}: {error}: the file defines {report.type_name} otherwise than ROS does: "
+                    "it is damaged, or this is another type of that name"
+                ) from None
+            out.write_event(arrived, report.channel, codec.encode(sample))
+            report.written += 1
+            first, last = first or arrived, arrived
+            done += 1
+            if done % 512 == 0:
+                show(done)
     if not done:
         raise RecordingError("the bag has no messages")
     axis = StampAxis({name: statistics.median(values) for name, values in offsets.items() if values}, last * 1e-6)

@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -187,14 +187,13 @@ def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
     vehicle = load_vehicle(load_config(config), str(config))
     axis = StampAxis()
     counts: Counter[str] = Counter()
-    writer = lcm.EventLog(str(out), "w", overwrite=True)
-    try:
-        with read_with_progress("localizing", log) as (recording, events):
-            for event in serve(vehicle, events, axis):
-                writer.write_event(event.utime, event.channel, event.data)
-                counts[event.channel] += 1
-    finally:
-        writer.close()
+    with (
+        closing(lcm.EventLog(str(out), "w", overwrite=True)) as writer,
+        read_with_progress("localizing", log) as (recording, events),
+    ):
+        for event in serve(vehicle, events, axis):
+            writer.write_event(event.utime, event.channel, event.data)
+            counts[event.channel] += 1
     for note in (*axis.describe(), *map(str, recording.damage)):
         typer.echo(escape(f"modelserver: {log}: {note}"), err=True)
     return counts
