@@ -70,6 +70,7 @@ _MODULES = {
     "key": "control",
     "mode": "control",
     "reload": "control",
+    "run": "driver",
     "set-pose": "control",
 }
 """Modules that hold more commands than that of their own name, each as a function of its name. Else a command is

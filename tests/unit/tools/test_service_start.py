@@ -12,8 +12,8 @@ from support_samples import VEHICLE, write_vehicle
 from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
 from modelserver.server.supervision import FAILED_START_S, Notifier
 from mstools.cli import main
-from mstools.commands import run
-from mstools.commands.run import format_status, wait_on_error
+from mstools.commands import driver
+from mstools.commands.driver import format_status, wait_on_error
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")
@@ -28,7 +28,7 @@ PROBLEMS = [
 def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Return the seconds of each wait; waits end at once."""
     found: list[float] = []
-    monkeypatch.setattr(run.time, "sleep", found.append)
+    monkeypatch.setattr(driver.time, "sleep", found.append)
     return found
 
 

@@ -1,27 +1,35 @@
-"""`modelserver driver`: publish the samples of a device, and check its section; `emulate`: the device itself."""
+"""`modelserver run`: the daemon; `driver`: publish the samples of a device; `emulate`: the device itself."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from modelserver.errors import ConfigError, ModelServerError, Problem, find_nearest_names, quote
-from modelserver.server.log import set_up_logging
-from modelserver.server.supervision import Notifier
-from mstools.commands.run import LEVELS, FormatOption, check_log_options, wait_on_error
+from modelserver.errors import (
+    ConfigError,
+    GeometryError,
+    Location,
+    ModelServerError,
+    Problem,
+    Severity,
+    find_nearest_names,
+    quote,
+)
+from modelserver.server.log import FORMATS, set_up_logging
+from modelserver.server.supervision import FAILED_START_S, Notifier
 from mstools.terminal.options import UrlOption, argument, choose_name, complete_driver, option
-from mstools.terminal.output import escape
+from mstools.terminal.output import escape, print_problems
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -31,6 +39,98 @@ if TYPE_CHECKING:
     from msdrivers.links import Link
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
+
+
+LEVELS = ("debug", "info", "warning", "error")
+
+FormatOption: TypeAlias = Annotated[
+    str, option("--log-format", f"One of {', '.join(FORMATS)}; auto: journal where systemd reads the log.")
+]
+
+
+def run(
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
+    url: UrlOption = "",
+    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
+    log_format: FormatOption = "auto",
+) -> None:
+    """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
+
+    Loads the geometry, subscribes to the sensors, publishes POSE and answers requests. Does not start with a wrong
+    vehicle file or geometry, and reports all problems; under a service manager, which would restart it at once, it then
+    exits after 10 s. Logs go to stderr. SIGHUP reloads the geometry file:
+    the whole file is used, or, if it is wrong, nothing changes and the log has the reason.
+
+    Example: modelserver run -c config/raptor/vehicle.yaml
+    """
+    check_log_options(log_level, log_format)
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.server import daemon
+    from modelserver.server.vehicle import load_vehicle
+
+    set_up_logging(log_level, log_format)
+    notifier = Notifier.from_environment()
+    notifier.notify_starting(f"reading {config}")
+    with wait_on_error(config, notifier):
+        settings = load_config(config)
+        vehicle = load_vehicle(settings, str(config))
+        vehicle.make_command_verifier(0, str(config))
+    for problem in vehicle.model.problems:
+        level = logging.INFO if problem.severity is Severity.NOTE else logging.WARNING
+        logging.getLogger("modelserver").log(level, "%s", problem)
+    daemon.run(vehicle, url, str(config), notifier)
+
+
+def check_log_options(level: str, log_format: str) -> None:
+    """Raise typer.BadParameter, a usage error, for an unknown level or format of the log."""
+    for name, given, known in (("--log-level", level, LEVELS), ("--log-format", log_format, FORMATS)):
+        if given not in known:
+            raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=name)
+
+
+@contextmanager
+def wait_on_error(config: Path, notifier: Notifier) -> Iterator[None]:
+    """Run the block, the start of a service; where its files are wrong, report that and wait before the process exits.
+
+    Without a service manager errors propagate. With one they are printed at once, the first is its status, and the
+    process exits with the same code, after `FAILED_START_S`.
+    """
+    if not notifier.is_active:
+        yield
+        return
+    code, problems = 1, tuple[Problem, ...]()
+    try:
+        yield
+        return
+    except (ConfigError, GeometryError) as error:
+        text, problems = "", error.problems
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != config:
+            raise
+        text = f"the vehicle file cannot be read: {error.strerror}"
+    except typer.BadParameter as error:
+        text, code = error.message, error.exit_code
+    except ModelServerError as error:
+        text = str(error)
+    problems = problems or (Problem(Severity.ERROR, text, Location(str(config))),)
+    print_problems(problems)
+    # also extends the start timeout of systemd
+    notifier.notify_starting(format_status(problems))
+    time.sleep(FAILED_START_S)
+    raise typer.Exit(code)
+
+
+def format_status(problems: Iterable[Problem]) -> str:
+    """Return the problems in one line: the first error, and the number of others."""
+    errors = [problem for problem in problems if problem.severity is Severity.ERROR]
+    first = errors[0] if errors else None
+    place = f"{first.file}:{first.line}: " if first is not None and first.line else ""
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    message = first.message if first is not None else "the vehicle file or its geometry is wrong"
+    return f"start failed, waiting for the file to be fixed: {place}{message}{more}"
+
+
+# --- drivers
 
 
 def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
@@ -107,9 +207,9 @@ def command(
     with wait_on_error(config, Notifier.from_environment()):
         vehicle, settings = load_driver(name, config)
     set_up_logging(log_level, log_format)
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, play_raw)
-        run(vehicle, settings, link, config, url)
+        run_driver(vehicle, settings, link, config, url)
 
 
 def show_ports() -> None:
@@ -191,9 +291,7 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
     return channels
 
 
-def _make_link(
-    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, play: Path | None
-) -> Link[Any]:
+def _make_link(stack: ExitStack, settings: DriverSettings, record: Path | None, play: Path | None) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
     from msdrivers.registry import SerialSettings, TcpSettings
@@ -211,7 +309,7 @@ def _make_link(
     return RecordingLink(link, stack.enter_context(open_for_writing(record)), *names, SystemTimeSource())
 
 
-def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], config: Path, url: str) -> None:
+def run_driver(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], config: Path, url: str) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
@@ -326,7 +424,7 @@ def supervise(
 
     progress, passes = StallDetector(), count(1)
 
-    def format_status() -> str:
+    def describe_phase() -> str:
         phase, text = runner.state
         return f"{phase.name.lower()}: {text}" if text else phase.name.lower()
 
@@ -334,9 +432,9 @@ def supervise(
         attend()
         if not notifier.is_ready:
             if next(passes) >= READY_PASSES:
-                notifier.notify_ready(format_status())
+                notifier.notify_ready(describe_phase())
             return
-        notifier.update_status(format_status)
+        notifier.update_status(describe_phase)
         failures = sum(number for name, number in runner.counts.items() if name.startswith("errors."))
         if progress.is_progressing(runner.samples, failures, monotonic_ns()):
             notifier.ping_watchdog()
@@ -393,7 +491,7 @@ def simulate(
     steered = sensors.steering.wheels if sensors.steering is not None else ()
     mapped = getattr(settings.device_settings, "wheels", {})
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
-    run = make_simulation(
+    drive = make_simulation(
         vehicle,
         begin,
         seconds,
@@ -406,7 +504,7 @@ def simulate(
     )
     # samples before now are skipped, also those of the time that making the drive took
     now = time.time_ns() // 1000
-    for sample in run.events(seconds):
+    for sample in drive.events(seconds):
         if isinstance(sample, kind) and sample.header.utime >= now:
             yield sample
     log.warning("%s: the simulated drive is over, there are no more measurements", settings.name)
