@@ -183,15 +183,14 @@ class ChannelCount:
     rate: float = math.nan
     _first: int = 0
     _since: int = 0
-    _counted: int = 0
+    _counted: int = 1
 
     def add(self, now: int) -> None:
+        if not self.count:
+            self._first = self._since = now
         self.count += 1
         self.last = now
-        self._first = self._first or now
-        if not self._since:
-            self._since, self._counted = now, self.count
-        elif now - self._since >= 1_000_000:
+        if now - self._since >= 1_000_000:
             self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
             self._since, self._counted = now, self.count
 
