@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -101,8 +102,7 @@ class YamlText:
 
     def entries(self, path: KeyPath = ()) -> list[TextEntry]:
         """Return the entries of a mapping, in order; none if it is absent or no mapping."""
-        node: Any = self._root if not path else self._get(path)
-        return [] if node is None else list(self._list_entries(node))
+        return list(self._list_entries(self._get(path)))
 
     def keys(self, path: KeyPath = ()) -> list[str]:
         return [each.name for each in self.entries(path)]
@@ -153,7 +153,6 @@ class YamlText:
         It stands after the key `after`, else last. An empty mapping gets braces, or with `in_block` lines of its own;
         one that is absent is added.
         """
-        node: Any = self._root if not path else self._get(path)
         if path and not self.has(path):
             block = f"{path[-1]}:\n{textwrap.indent(entry, '  ')}"
             return self.add(path[:-1], block if in_block else f"{path[-1]}: {{{entry}}}", in_block=in_block)
@@ -166,7 +165,7 @@ class YamlText:
                 return self._set_value(found, self._newline + self._indent(entry, indent))
             return self._set_value(found, f" {{{entry}}}")
         last = next((each for each in entries if each.name == after), entries[-1])
-        if node.flow_style:
+        if last.is_flow:
             if "\n" in entry:
                 raise EditError(f"{' '.join(path)} is written in braces; write it on lines of its own first")
             return self._replace(last.end, last.end, f", {entry}")
@@ -243,7 +242,7 @@ class YamlText:
 
     def _get(self, path: KeyPath) -> Any:
         found = self._find(path)
-        return None if found is None else found.value
+        return found.value if found is not None else None if path else self._root
 
     def _find(self, path: KeyPath) -> TextEntry | None:
         node: Any = self._root
@@ -344,15 +343,12 @@ class YamlText:
 
 def _walk(node: Any) -> Iterator[Any]:
     """Yield all nodes, one that several aliases name once for each."""
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            yield from _walk(key)
-            yield from _walk(value)
-    elif isinstance(node, yaml.SequenceNode):
-        for each in node.value:
+    if node is None:
+        return
+    yield node
+    if not isinstance(node, yaml.ScalarNode):
+        for each in chain.from_iterable(node.value) if isinstance(node, yaml.MappingNode) else node.value:
             yield from _walk(each)
-    if node is not None:
-        yield node
 
 
 # --- geometry file
