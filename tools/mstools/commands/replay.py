@@ -229,11 +229,13 @@ def replay_to_bus(
     if not url and config is not None:
         url = load_config(config).lcm.url
     player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
-    with read_with_progress("replaying", log) as (recording, events):
+    with read_with_progress("replaying", log) as (recording, tracked):
+        events: Iterable[LogEvent] = tracked
         if channels is not None:
-            events = _filter_channels(events, log, channels) if channels else _exclude_service_messages(events)
+            events = _filter_channels(tracked, log, channels) if channels else _exclude_service_messages(tracked)
         try:
-            player.play(events)
+            with closing(tracked):
+                player.play(events)
         finally:
             report = {"sent": player.sent, "seconds": player.duration, "max_delay": player.max_delay}
             words = (
@@ -275,8 +277,8 @@ def replay_offline(
         require_extra("report", NEEDS_PLOTLY)
     _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
     seen: set[str] = set()
-    with read_with_progress("replaying", log) as (recording, events):
-        events = _filter_channels(events, log, channels, seen)
+    with read_with_progress("replaying", log) as (recording, tracked):
+        events = _filter_channels(tracked, log, channels, seen)
         run = OfflineRun(vehicle, events, frame or vehicle.config.base_frame)
         collector = None
         if report:
@@ -293,6 +295,7 @@ def replay_offline(
         with (
             _open_output(poses) if poses else nullcontext() as out,
             _open_output(decisions) if decisions else nullcontext() as ledger,
+            closing(tracked),
         ):
 
             def on_decision(decision: Decision) -> None:

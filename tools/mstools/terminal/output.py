@@ -10,7 +10,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from pathlib import Path
@@ -313,20 +313,24 @@ def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]
 
 
 @contextmanager
-def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Iterator[LogEvent]]]:
-    """Open a log; give it with its events, and show how much of them is read, at most ten times a second."""
+def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Generator[LogEvent, None, None]]]:
+    """Open a log; give it with its events, and show how much of them is read, at most ten times a second.
+
+    The progress bar, which redirects standard output, lasts from the first event until they are read, or closed.
+    """
     from modelserver.wire.eventlog import LogFile
 
-    def track() -> Iterator[LogEvent]:
-        updated = 0.0
-        for event in log:
-            if (now := time.monotonic()) > updated + 0.1:
-                updated = now
-                show(event.end)
-            yield event
+    def track() -> Generator[LogEvent, None, None]:
+        with show_progress(f"{label} {path.name}", log.size) as show:
+            updated = 0.0
+            for event in log:
+                if (now := time.monotonic()) > updated + 0.1:
+                    updated = now
+                    show(event.end)
+                yield event
 
-    with LogFile(path) as log, show_progress(f"{label} {path.name}", log.size) as show:
-        yield log, track()
+    with LogFile(path) as log, contextlib.closing(track()) as events:
+        yield log, events
 
 
 def open_screen() -> Live:
