@@ -159,7 +159,7 @@ def measure_open(log: Path) -> float:
     from mstools.view.sources import open_log
 
     begin = time.process_time()
-    open_log(log, "", None, lambda part: None)
+    open_log(log)
     return time.process_time() - begin
 
 

@@ -15,7 +15,7 @@ from support_lcm import reserved_url
 from support_view import follow_drive, record_drive
 
 from mstools.commands.demo import find_vehicle_file
-from mstools.edit.document import EditedFile, EditSession
+from mstools.edit import EditedFile, EditSession
 from mstools.report import charts
 from mstools.view.editor import Editing
 from mstools.view.sources import Source, open_geometry, open_log
@@ -34,9 +34,9 @@ def main() -> int:
     take_editor("view-edit.png")
     with tempfile.TemporaryDirectory() as folder:
         log = record_drive(Path(folder), DRIVE_S)
-        source = open_log(log, "", None, lambda part: None)
+        source = open_log(log)
         take("view-log.png", source, "Time", "Play", 12.0)
-        take("view-state.png", open_log(log, "", None, lambda part: None), "Time", "Play", 20.0)
+        take("view-state.png", open_log(log), "Time", "Play", 20.0)
     with tempfile.TemporaryDirectory() as folder, reserved_url() as url, follow_drive(url, Path(folder)) as source:
         take("view-live.png", source, seconds=25.0)
     return 0

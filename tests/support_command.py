@@ -26,7 +26,6 @@ _FORKS.set_forkserver_preload(
         "modelserver.simulation",
         "msdrivers.settings",
         "mstools.commands.driver",
-        "mstools.commands.run",
         "mstools.launch.drive",
     ]
 )

@@ -42,9 +42,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeAlias, TypeVar
-
-T = TypeVar("T")
+from typing import Final, TypeAlias
 
 CODES: Final = {
     "int8_t": "b",
@@ -124,7 +122,6 @@ class Struct:
 
     @property
     def base(self) -> str:
-        """Its name without the ending."""
         return self.name.removesuffix("_t")
 
     @property
@@ -134,7 +131,6 @@ class Struct:
 
     @property
     def is_tuple(self) -> bool:
-        """Whether its value is a NamedTuple."""
         return self.options.get("value", "").endswith(" tuple")
 
     @property
@@ -142,18 +138,14 @@ class Struct:
         """The module of a codec written by hand; empty for a generated one."""
         return self.options.get("codec", "")
 
-    def in_order(self, values: Mapping[str, T]) -> list[T]:
-        """Return values by the name of their attribute in the order of the attributes."""
-        order = self.options.get("order", "").split()
-        return [values[name] for name in order] if order else list(values.values())
+    @property
+    def order(self) -> list[str]:
+        """The attributes in their order, empty for that of the fields."""
+        return self.options.get("order", "").split()
 
     def count_of(self, name: str) -> Field | None:
         is_counted = any(name in each.dimensions for each in self.fields)
         return next((each for each in self.fields if is_counted and each.name == name), None)
-
-    def is_column_of_rows(self, each: Field) -> bool:
-        """Return whether a field is an array that is a column of rows in the value."""
-        return any((count := self.count_of(dimension)) and count.rows for dimension in each.dimensions)
 
     @property
     def answer(self) -> Struct | None:
@@ -212,7 +204,6 @@ def parse_struct(text: str, source: str = "") -> Struct:
 
 
 def read_structs(folder: Path) -> dict[str, Struct]:
-    """Return the structs of the .lcm files in a folder by name."""
     structs = [parse_struct(path.read_text(encoding="utf-8"), str(path)) for path in sorted(folder.glob("*.lcm"))]
     return {each.name: each for each in structs}
 
@@ -254,7 +245,10 @@ class _Values:
         self.names.append(name)
         about = each.comment.partition(": one of")[0].partition(". ")[0].rstrip(".:")
         lines = [f"class {name}(IntEnum):", _docstring(f"{about}."), ""]
-        lines += [f"    {_strip_prefix(constant.name, prefix)} = {constant.value}" for constant in each.constants]
+        for constant in each.constants:
+            # with the prefix where only a number would be left
+            plain = constant.name.removeprefix(prefix)
+            lines.append(f"    {plain if plain.isidentifier() else constant.name} = {constant.value}")
         return ["\n".join(lines)]
 
     def _write_classes(self, struct: Struct) -> list[str]:
@@ -276,7 +270,7 @@ class _Values:
                     parts.append(self._write_class(row, False, f"One row of `{name}` of {struct.value}.", entries))
                 element = row or f"tuple[{', '.join(self.annotation(column, element=True) for column in columns)}]"
                 attributes[name] = (f"tuple[{element}, ...]", count.options.get("default", ""))
-            elif count is None and not struct.is_column_of_rows(each):
+            elif count is None and not any((rows := struct.count_of(one)) and rows.rows for one in each.dimensions):
                 name = each.value_name
                 kind = each.of.partition(" ")[2] or self.annotation(each)
                 if name in attributes and not each.of.endswith(kind):
@@ -285,7 +279,7 @@ class _Values:
         if answer is not None:
             parts += self._write_classes(answer)
             attributes["answer"] = (f"{answer.value} | None", "None")
-        ordered = [(name, *attributes[name]) for name in struct.in_order({name: name for name in attributes})]
+        ordered = [(name, *attributes[name]) for name in struct.order or attributes]
         lines = [self._write_class(struct.value, struct.is_tuple, struct.comment, ordered)]
         for each in struct.fields:
             if "property" in each.options:
@@ -346,7 +340,6 @@ class _Codecs:
         return self._formats.setdefault(code, f"_S{len(self._formats)}")
 
     def formats(self) -> str:
-        """Return the definitions of the formats that were used."""
         return "\n".join(f'{name} = struct.Struct(">{code}")' for code, name in self._formats.items())
 
     def write_constants(self, struct: Struct) -> list[str]:
@@ -497,7 +490,6 @@ class _Reader:
         self._offset = 0
 
     def position(self) -> str:
-        """Return the expression of where the next field begins."""
         return f"at + {self._offset}" if self._offset else "at"
 
     def flush(self) -> None:
@@ -522,6 +514,11 @@ class _Reader:
         self.flush()
         position, self._offset = self.position(), 0
         return position
+
+    def _read(self, name: str, function: str, more: str = "") -> str:
+        """Write the reading of a part of any length; return its name. `function` is a call up to the data."""
+        self.lines.append(f"{name}, at = {function}data, {self._settle()}{more})")
+        return name
 
     def read_struct(self, struct: Struct, prefix: str) -> str:
         """Write the reading of a struct; return the expression of its value."""
@@ -549,13 +546,12 @@ class _Reader:
                 arguments[each.value_name] = value
             if each.type == "reply_header_t":
                 status = f"{name}.status"
-        return f"{struct.value}({', '.join(struct.in_order(arguments))})"
+        return f"{struct.value}({', '.join(arguments[name] for name in struct.order or arguments)})"
 
     def _read_count(self, each: Field, name: str, prefix: str) -> None:
         self._pending.append((CODES[each.type], name))
         self.flush()
-        limit = each.options.get("max") or each.options.get("limit", "")
-        bounds = [limit, each.options["least"]] if "least" in each.options else [limit] if limit else []
+        bounds = [each.options[name] for name in ("max", "limit", "least") if name in each.options]
         if "triangle" in each.options:
             rows = f"{prefix}{each.options['triangle']}"
             bounds = [f"{rows} * ({rows} + 1) // 2"] * 2
@@ -567,17 +563,13 @@ class _Reader:
             return self._read_nested(self._codecs.structs[each.type], each, name, prefix, status)
         count = f"{prefix}{each.dimensions[0]}" if each.is_variable else ""
         if each.type == "string":
-            position = self._settle()
-            read = f"read_each(read_text, data, {position}, {count})" if count else f"read_text(data, {position})"
-            self.lines.append(f"{name}, at = {read}")
+            self._read(name, *(("read_each(read_text, ", f", {count}") if count else ("read_text(",)))
             return self._check_expression(each, name, plural=bool(count))
         if count:
-            position = self._settle()
             if each.type == "byte":
-                self.lines.append(f"{name}, at = read_bytes(data, {position}, {count})")
-                return name
+                return self._read(name, "read_bytes(", f", {count}")
             total = " * ".join(f"{prefix}{d}" for d in each.dimensions)
-            self.lines.append(f'{name}, at = read_numbers("{CODES[each.type]}", data, {position}, {total})')
+            self._read(name, f'read_numbers("{CODES[each.type]}", ', f", {total}")
             counting = struct.count_of(each.dimensions[0])
             if counting is not None and "triangle" in counting.options:
                 return f"read_triangle({name}, {prefix}{counting.options['triangle']})"
@@ -603,10 +595,9 @@ class _Reader:
         if each.size > 9:
             # a star takes the rest: nothing may follow it in the same reading
             self.flush()
-            if {"optional", "empty_nan"} & each.options.keys():
-                absent = "None" if "optional" in each.options else "()"
-                return f"{absent} if {name}[0] != {name}[0] else {self._check_expression(each, f'tuple({name})')}"
-            return self._check_expression(each, f"tuple({name})")
+            whole = self._check_expression(each, f"tuple({name})")
+            absent = "None" if "optional" in each.options else "()" if "empty_nan" in each.options else ""
+            return f"{absent} if {name}[0] != {name}[0] else {whole}" if absent else whole
         numbers = [f"{name}_{n}" for n in range(each.size)]
         if "pose" in each.options:
             return f"Pose(({', '.join(numbers[:3])}), ({', '.join(numbers[3:])}))"
@@ -642,31 +633,19 @@ class _Reader:
     def _read_nested(self, nested: Struct, each: Field, name: str, prefix: str, status: str) -> str:
         unpacker = f"unpack_{nested.base}"
         if each.dimensions:
-            position = self._settle()
-            self.lines.append(f"{name}, at = read_each({unpacker}, data, {position}, {prefix}{each.dimensions[0]})")
-            return name
+            return self._read(name, f"read_each({unpacker}, ", f", {prefix}{each.dimensions[0]}")
         if "if_ok" in each.options:
             position = self._settle()
-            self.lines.append(f"if {status} is Status.OK:")
-            self.lines.append(f"    {name}, at = {unpacker}(data, {position})")
-            self.lines.append("else:")
+            self.lines += [f"if {status} is Status.OK:", f"    {name}, at = {unpacker}(data, {position})", "else:"]
             self.lines.append(f"    {name}, at = None, skip_{nested.base}(data, {position})")
             return name
         if nested.codec:
-            position = self._settle()
-            self.lines.append(f"{name}, at = {unpacker}(data, {position})")
-            return name
+            return self._read(name, f"{unpacker}(")
         value = self.read_struct(nested, f"{name}_")
         return f"verify_{nested.base}({value})" if "verify" in nested.options else value
 
 
 # --- text ---------------------------------------------------------------------------------------------------
-
-
-def _strip_prefix(name: str, prefix: str) -> str:
-    """Return a constant's name without the prefix; with it where only a number would be left."""
-    stripped = name.removeprefix(prefix)
-    return stripped if stripped.isidentifier() else name
 
 
 def _docstring(text: str) -> str:
@@ -730,14 +709,8 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
             constants += codecs.write_constants(each)
             functions += [codecs.write_packer(each), codecs.write_unpacker(each)]
         if "part" not in each.options:
-            row = (
-                f'"{each.name}"',
-                f'FINGERPRINTS["{each.name}"]',
-                each.value,
-                f"pack_{each.base}",
-                f"unpack_{each.base}",
-            )
-            table.append(f"    Codec({', '.join(row)}),")
+            verbs = f"pack_{each.base}, unpack_{each.base}"
+            table.append(f'    Codec("{each.name}", FINGERPRINTS["{each.name}"], {each.value}, {verbs}),')
     body = "\n\n\n".join(["\n".join(constants), *functions, "\n".join(["CODECS = (", *table, ")"])])
     used = set(_WORD.findall(body))
     here = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip") for each in structs.values()}

@@ -20,7 +20,7 @@ from modelserver.transforms.transformation import Transformation
 from modelserver.wire import fields
 from modelserver.wire.channels import CHANNELS
 from modelserver.wire.codec import encode, get_type_names
-from mstools.lcm_wheel import find_type_files
+from mstools.commands.status import find_type_files
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = ROOT / "lcmtypes"

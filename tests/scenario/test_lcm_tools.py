@@ -14,7 +14,7 @@ from support_lcm import Listener, run_process, running_daemon, wait_until
 from modelserver.messages import Health, PoseAnswer
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
-from mstools.lcm_wheel import find_binary
+from mstools.commands.status import find_binary
 
 RAPTOR = Path(__file__).resolve().parents[2] / "config" / "raptor" / "vehicle.yaml"
 POSES = 20

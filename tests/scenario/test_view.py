@@ -113,7 +113,7 @@ def test_given_a_geometry_file_when_a_joint_is_moved_then_the_picture_and_the_an
 def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow(
     browser: Browser, drive_log: Path
 ) -> None:
-    source = open_log(drive_log, "", None, lambda part: None)
+    source = open_log(drive_log)
     seconds = (source.drive.end - source.drive.begin) * 1e-6
     with show(browser, source) as page:
         page.get_by_role("tab", name="Time").click()

@@ -15,7 +15,7 @@ import pytest
 
 from modelserver import extras
 from modelserver.extras import describe_missing, make_install_command, make_requirement, make_system_command
-from mstools import lcm_wheel
+from mstools.commands import status
 
 ROOT = Path(__file__).parents[2]
 Install = Callable[..., None]
@@ -98,10 +98,10 @@ def test_given_the_debian_package_then_its_missing_pip_is_not_used(install: Inst
 def test_given_the_debian_package_then_lcms_programs_have_advice_without_its_pip(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(lcm_wheel, "read_installation", lambda: ("dpkg", {}))
-    monkeypatch.setattr(lcm_wheel, "_get_site_packages", lambda: tmp_path)
-    with pytest.raises(lcm_wheel.MissingToolError) as caught:
-        lcm_wheel.find_binary("lcm-spy")
+    monkeypatch.setattr(status, "read_installation", lambda: ("dpkg", {}))
+    monkeypatch.setattr(status, "_get_site_packages", lambda: tmp_path)
+    with pytest.raises(status.MissingToolError) as caught:
+        status.find_binary("lcm-spy")
     assert str(caught.value) == (
         "lcm-spy is missing: the Debian package does not have it; in a folder with the source: "
         + make_system_command(".")

@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
+from mstools.terminal.options import option
 from mstools.terminal.output import escape, print_problems, suggest_path
 
 GROUPS = {
@@ -69,6 +70,7 @@ _MODULES = {
     "key": "control",
     "mode": "control",
     "reload": "control",
+    "run": "driver",
     "set-pose": "control",
 }
 """Modules that hold more commands than that of their own name, each as a function of its name. Else a command is
@@ -219,15 +221,7 @@ def _show_version(wanted: bool) -> None:
 
 
 def _options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            help="Print the version.",
-            callback=_show_version,
-            is_eager=True,
-        ),
-    ] = False,
+    version: Annotated[bool, option("--version", "Print the version.", callback=_show_version, is_eager=True)] = False,
 ) -> None:
     pass
 

@@ -143,7 +143,6 @@ def read_ekf_settings(path: Path) -> EkfSettings:
 
 
 def _find_nodes(node: YamlNode) -> Iterator[dict[str, YamlNode]]:
-    """Yield the parameters of each node of the file."""
     if node.kind is not NodeKind.MAPPING:
         return
     pairs = {key.text: value for key, value in node.pairs}
@@ -227,7 +226,6 @@ def _read_datum(found: EkfSettings, node: YamlNode) -> Iterator[tuple[Outcome, s
 
 
 def _read_fields(config: YamlNode | None) -> set[str]:
-    """Return the names of the quantities that a source gives."""
     flags = [] if config is None else [each.text.lower() == "true" for each in config.items]
     return {name for name, flag in zip(FIELDS, flags, strict=False) if flag}
 

@@ -9,7 +9,7 @@ import pytest
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 from mstools.calibration import CalibrationError
-from mstools.calibration.report import MAX_TILT, aligned_rotations, axis_name, check_mount
+from mstools.commands.calibrate import MAX_TILT, aligned_rotations, axis_name, check_mount
 
 
 def create_mount(*rpy_deg: float) -> Quaternion:

@@ -13,7 +13,7 @@ from support_formats import YAML
 from modelserver.config.vehicle_file import load_config
 from modelserver.errors import ModelServerError
 from mstools.cli import main
-from mstools.commands.driver import DriveOptions, load_driver, simulate
+from mstools.commands.driver import load_driver, simulate
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 
@@ -85,12 +85,8 @@ def test_given_a_name_with_nothing_after_it_then_driver_and_emulate_report_it(ru
         assert "vehicle.yaml:8: error: drivers.later is empty: device is missing" in err
 
 
-def make_options(start: int | None = None, seconds: float = 60.0) -> DriveOptions:
-    return DriveOptions(start, seconds, "eight", 1, (0.0, 0.0, 0.0))
-
-
 def test_given_a_drive_that_ends_then_it_is_reported_once(raptor: Path, caplog: pytest.LogCaptureFixture) -> None:
-    samples = simulate(*load_driver("gps", raptor), make_options(seconds=1.0))
+    samples = simulate(*load_driver("gps", raptor), seconds=1.0)
     assert len(list(samples)) == pytest.approx(4, abs=1)
     assert list(samples) == []
     assert [record.message for record in caplog.records] == [
@@ -107,9 +103,9 @@ def raptor(tmp_path: Path) -> Path:
 
 def test_given_a_drive_that_is_over_then_it_is_reported_before_a_line_is_opened(raptor: Path) -> None:
     with pytest.raises(ModelServerError, match=r"--start 1 is \d+ s ago, and the drive lasts 60 s: it is over"):
-        list(simulate(*load_driver("gps", raptor), make_options(start=1)))
+        list(simulate(*load_driver("gps", raptor), start=1, seconds=60.0))
     # it does not drive along
-    assert list(simulate(*load_driver("front_axis", raptor), make_options(start=1))) == []
+    assert list(simulate(*load_driver("front_axis", raptor), start=1, seconds=60.0)) == []
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:

@@ -15,8 +15,7 @@ from modelserver.formats import parse_content, parse_model
 from modelserver.geometry import Joint, JointType, Mimic, Model
 from modelserver.geometry.model import describe_changes
 from modelserver.transforms import Pose
-from mstools.edit.document import GeometryDocument, GeometryItem, ItemKind
-from mstools.edit.yaml_text import EditError, YamlText
+from mstools.edit import EditError, GeometryDocument, GeometryItem, ItemKind, YamlText
 
 CONFIG = Path(__file__).resolve().parents[3] / "config"
 RAPTOR = (CONFIG / "raptor" / "geometry.yaml").read_text()

@@ -10,8 +10,7 @@ import pytest
 
 from modelserver.errors import GeometryError
 from modelserver.formats import load_model
-from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
-from mstools.edit.yaml_text import EditError
+from mstools.edit import EditedFile, EditError, EditSession, GeometryItem, ItemKind
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")

@@ -16,8 +16,7 @@ from support_wire import EXAMPLES
 
 from modelserver.errors import ModelServerError
 from modelserver.messages import DriverHealth, Health, Invalid
-from mstools.terminal import health_metrics
-from mstools.terminal.health_metrics import CONTENT_TYPE, MAX_AGE_S, format_metrics, serve_metrics
+from mstools.terminal.health import CONTENT_TYPE, MAX_AGE_S, REQUEST_TIMEOUT_S, format_metrics, serve_metrics
 
 BARE, FULL = EXAMPLES["health_t"]
 DRIVERS: tuple[DriverHealth, ...] = EXAMPLES["driver_health_t"][1:]
@@ -188,4 +187,4 @@ def test_given_the_rules_then_the_parser_of_these_tests_rejects_what_breaks_them
     ):
         with pytest.raises(AssertionError):
             parse(bad)
-    assert health_metrics.REQUEST_TIMEOUT_S > 0.0
+    assert REQUEST_TIMEOUT_S > 0.0

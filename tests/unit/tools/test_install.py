@@ -18,13 +18,11 @@ from modelserver import extras
 from modelserver.config import vehicle_file
 from modelserver.errors import ConfigError, ModelServerError, Severity
 from modelserver.key_files import generate_key, write_key
-from mstools import deployment as install_steps
 from mstools.cli import main
 from mstools.commands import install
 from mstools.commands.check import check_vehicle
-from mstools.deployment import (
+from mstools.commands.install import (
     SYSCTL,
-    SerialDriver,
     SystemFacts,
     check_drivers,
     check_serial,
@@ -49,10 +47,10 @@ Output = tuple[int, str, str]
 @pytest.fixture
 def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Output]:
     """Return a function that runs a command on a system below a folder, with a valid installation."""
-    monkeypatch.setattr(install_steps, "check_installation", lambda: None)
-    monkeypatch.setattr(install_steps, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
+    monkeypatch.setattr(install, "check_installation", lambda: None)
+    monkeypatch.setattr(install, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
     # there may be no systemd here; other tests check its commands
-    monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/true")
+    monkeypatch.setattr(install.shutil, "which", lambda name, path: "/bin/true")
     root = tmp_path / "root"
     (root / "etc").mkdir(parents=True)
 
@@ -198,7 +196,7 @@ def test_given_a_user_without_rights_then_the_command_with_sudo_is_reported(
     for command in (["install"], ["install", "--remove", "--purge"]):
         with pytest.raises(SystemExit):
             main(command)
-        assert f"needs root: sudo {install_steps.get_command_path()} {' '.join(command)}" in capsys.readouterr().err
+        assert f"needs root: sudo {install.get_command_path()} {' '.join(command)}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--purge"], ["--remove", "--vehicle", "x.yaml"], ["--remove", "--no-start"]])
@@ -212,7 +210,7 @@ def test_given_options_that_exclude_each_other_then_it_is_wrong_usage(
 def test_given_a_command_that_fails_then_it_is_reported_which_and_what_it_reported(
     run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/false")
+    monkeypatch.setattr(install.shutil, "which", lambda name, path: "/bin/false")
     code, _, err = run("install", "--vehicle", str(vehicle))
     assert code == 1
     assert "/bin/false --root=" in err
@@ -236,12 +234,12 @@ def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> Non
 
 def test_given_an_installation_that_the_units_do_not_see_then_it_is_rejected_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.make_install_hint())
+        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install.make_install_hint())
 
 
 def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
     with pytest.raises(ConfigError) as caught:
-        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.make_install_hint())
+        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install.make_install_hint())
     (problem,) = caught.value.problems
     assert problem.message == (
         "its Python is /root/x, its package is /tmp/y, which the hardened units cannot access "
@@ -253,8 +251,8 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
 
 @pytest.mark.parametrize("port", ["/dev/ttyTHS1", "/dev/ttymxc0", "/dev/ttyAMA10", "/dev/ttySC0", "/dev/ttyS0"])
 def test_given_a_uart_of_the_board_then_nobody_is_asked_to_plug_it_in(port: str) -> None:
-    assert render_udev_rules([SerialDriver("gps", port)], {}, SystemFacts()) == ([], [])
-    writes, _ = render_udev_rules([SerialDriver("gps", port)], {"gps": "usb-A"}, SystemFacts())
+    assert render_udev_rules({"gps": port}, {}, SystemFacts()) == ([], [])
+    writes, _ = render_udev_rules({"gps": port}, {"gps": "usb-A"}, SystemFacts())
     assert len(writes) == 1
 
 
@@ -262,7 +260,7 @@ def test_given_a_uart_of_the_board_then_nobody_is_asked_to_plug_it_in(port: str)
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
     way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
-    assert way in install_steps.make_install_hint()
+    assert way in install.make_install_hint()
     # the README has the Debian package only
     assert way in text or page == "README.md"
     assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
@@ -275,12 +273,12 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
     python.parent.mkdir()
     python.write_text("")
     python.parent.chmod(0o700)
-    monkeypatch.setattr(install_steps.sys, "executable", str(python))
-    monkeypatch.setattr(install_steps.sys, "base_prefix", "/home/me/python")
-    monkeypatch.setattr(install_steps, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
-    monkeypatch.setattr(install_steps, "files", lambda name: tmp_path)
+    monkeypatch.setattr(install.sys, "executable", str(python))
+    monkeypatch.setattr(install.sys, "base_prefix", "/home/me/python")
+    monkeypatch.setattr(install, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
+    monkeypatch.setattr(install, "files", lambda name: tmp_path)
     with pytest.raises(ConfigError) as caught:
-        install_steps.check_installation()
+        install.check_installation()
     output = "\n".join(problem.message for problem in caught.value.problems)
     assert "its Python's library is /home/me/python, which the hardened units cannot access" in output
     assert f"there is no {tmp_path}/bin/modelserver" in output
@@ -290,7 +288,7 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
 def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
     run: Callable[..., Output], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     good = vehicle.read_text()
     vehicle.write_text(good.replace("Raptor:CG", "Raptor:GC"))
     words = ("install", "--vehicle", str(vehicle), "--dry-run", "--drivers", "none,gsp,imu")
@@ -321,7 +319,7 @@ def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
 def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_reported_too(
     run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install_steps, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     vehicle.write_text("[")
     for file in (vehicle, vehicle.parent / "none.yaml"):
         code, _, err = run("install", "--vehicle", str(file), "--dry-run")
@@ -398,9 +396,9 @@ def test_given_a_driver_that_cannot_be_then_it_is_reported_why(wanted: str, know
 def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_rejected(
     program: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install_steps, "get_command_path", lambda: program)
+    monkeypatch.setattr(install, "get_command_path", lambda: program)
     with pytest.raises(ModelServerError, match="cannot be written in a unit"):
-        install_steps.check_installation()
+        install.check_installation()
 
 
 @pytest.mark.parametrize(
@@ -463,7 +461,7 @@ BY_ID = {"usb-FTDI_A1-if00-port0": "/dev/ttyUSB0"}
 def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
     port: str, given: dict[str, str], facts: SystemFacts, device: str
 ) -> None:
-    (write,), notes = render_udev_rules([SerialDriver("gps", port)], given, facts)
+    (write,), notes = render_udev_rules({"gps": port}, given, facts)
     line = write.content.decode().splitlines()[1]
     assert line == (
         f'SUBSYSTEM=="tty", SYMLINK=="serial/by-id/{device}", ENV{{ID_MM_DEVICE_IGNORE}}="1", '
@@ -471,12 +469,12 @@ def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
     )
     assert bool(notes) == (port == "/dev/ttyUSB0")
     # unplugged at the next installation it keeps its name
-    again, _ = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts(rules=write.content.decode()))
+    again, _ = render_udev_rules({"gps": "/dev/ttyUSB0"}, {}, SystemFacts(rules=write.content.decode()))
     assert again == [write]
 
 
 def test_given_a_device_that_nobody_knows_then_a_note_reports_what_to_do() -> None:
-    writes, (note,) = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts())
+    writes, (note,) = render_udev_rules({"gps": "/dev/ttyUSB0"}, {}, SystemFacts())
     assert writes == []
     assert "--serial gps=/dev/serial/by-id/..." in note
 
@@ -484,12 +482,12 @@ def test_given_a_device_that_nobody_knows_then_a_note_reports_what_to_do() -> No
 @pytest.mark.parametrize("device", ['x", RUN+="/bin/sh', "a b", "a*", "../x"])
 def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_rejected(device: str) -> None:
     with pytest.raises(ModelServerError, match="is not a name below"):
-        render_udev_rules([SerialDriver("gps", f"/dev/serial/by-id/{device}")], {"gps": device}, SystemFacts())
+        render_udev_rules({"gps": f"/dev/serial/by-id/{device}"}, {"gps": device}, SystemFacts())
 
 
 def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_rejected() -> None:
     with pytest.raises(ModelServerError, match="is not a driver on a serial port"):
-        check_serial({"imu": "usb-Y"}, [SerialDriver("gps", "/dev/ttyUSB0")])
+        check_serial({"imu": "usb-Y"}, {"gps": "/dev/ttyUSB0"})
 
 
 def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> None:
@@ -572,8 +570,8 @@ def test_given_a_vehicle_of_new_then_it_is_installed_as_it_is(run: Callable[...,
 def test_given_the_installed_vehicle_file_then_relative_folders_are_the_units_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert vehicle_file.files.INSTALLED_FOLDER == install_steps.CONFIGURATION
-    assert install_steps.STATE[0] == vehicle_file.files.STATE_FOLDER
+    assert vehicle_file.files.INSTALLED_FOLDER == install.CONFIGURATION
+    assert install.STATE[0] == vehicle_file.files.STATE_FOLDER
     vehicle = write_state_folders(tmp_path / "etc", "state", "journal")
     beside = vehicle_file.load_config(vehicle)
     assert (beside.state_directory, beside.journal.directory) == (f"{tmp_path}/etc/state", f"{tmp_path}/etc/journal")
@@ -637,9 +635,9 @@ def test_given_a_clone_that_the_units_cannot_access_then_the_advice_in_one_comma
     source = Path(__file__).parents[3]
     clone = {"url": source.as_uri(), "dir_info": {"editable": True}}
     monkeypatch.setattr(extras, "read_installation", lambda: ("pip", clone))
-    monkeypatch.setattr(install_steps, "HIDDEN_FOLDERS", {os.path.dirname(sys.executable): "ProtectHome"})
+    monkeypatch.setattr(install, "HIDDEN_FOLDERS", {os.path.dirname(sys.executable): "ProtectHome"})
     with pytest.raises(ConfigError) as caught:
-        install_steps.check_installation()
+        install.check_installation()
     fixes = {problem.fix for problem in caught.value.problems}
     (command,) = (fix.partition("install the units from there: ")[2] for fix in fixes if "/opt" in fix)
     root, sudo = tmp_path / "root", tmp_path / "bin" / "sudo"

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import ModelServerError
-from mstools.deployment import (
+from mstools.commands.install import (
     CONFIGURATION,
     MANIFEST,
     RULES,

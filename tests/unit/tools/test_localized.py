@@ -11,7 +11,7 @@ from support_recordings import HUSKY, drive, write_forward_vehicle, write_log
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
 from mstools import cli
-from mstools.recordings.localized import open_localized
+from mstools.commands.replay import open_localized
 from mstools.recordings.log_platform import LogPlatform
 
 SECONDS = 15.0

@@ -16,6 +16,7 @@ from support_recordings import HUSKY, drive, write_log
 from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
 from benchmarks.rough_simulation import EncoderModel
+from modelserver import extras
 from modelserver.errors import ModelServerError
 from modelserver.extras import make_install_command
 from modelserver.simulation import WheelsModel
@@ -211,9 +212,6 @@ def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
 
 
 def test_given_no_plotly_then_the_error_has_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    def find(name: str) -> object:
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr(charts, "files", find)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "plotly" else name)
     with pytest.raises(ModelServerError, match=re.escape(make_install_command("report"))):
         charts.render_page("a", "b")

@@ -12,8 +12,8 @@ from support_samples import VEHICLE, write_vehicle
 from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
 from modelserver.server.supervision import FAILED_START_S, Notifier
 from mstools.cli import main
-from mstools.commands import run
-from mstools.commands.run import ServiceStart, format_status
+from mstools.commands import driver
+from mstools.commands.driver import format_status, wait_on_error
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")
@@ -28,7 +28,7 @@ PROBLEMS = [
 def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Return the seconds of each wait; waits end at once."""
     found: list[float] = []
-    monkeypatch.setattr(run.time, "sleep", found.append)
+    monkeypatch.setattr(driver.time, "sleep", found.append)
     return found
 
 
@@ -37,13 +37,12 @@ class Manager:
 
     def __init__(self, is_active: bool = True):
         self.notifications: list[str] = []
-        notifier = (
+        self.notifier = (
             Notifier(lambda datagram: self.notifications.append(datagram.decode())) if is_active else Notifier(None)
         )
-        self.start = ServiceStart(CONFIG, notifier)
 
     def fail(self, error: Exception) -> None:
-        with self.start.wait_on_error():
+        with wait_on_error(CONFIG, self.notifier):
             raise error
 
 
@@ -94,7 +93,7 @@ def test_given_an_error_that_is_not_of_a_file_then_it_propagates(waits: list[flo
 
 def test_given_a_start_that_goes_well_then_nothing_is_reported(waits: list[float]) -> None:
     manager = Manager()
-    with manager.start.wait_on_error():
+    with wait_on_error(CONFIG, manager.notifier):
         pass
     assert (manager.notifications, waits) == ([], [])
 

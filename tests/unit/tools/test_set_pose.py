@@ -17,7 +17,7 @@ from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
 from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.control import SetPoseListener, SetPoseResult, describe_set_pose, to_covariance, to_pose
+from mstools.commands.control import SetPoseListener, describe_set_pose, to_covariance, to_pose
 
 CURRENT = Pose.from_rpy((100.0, 50.0, 5.0), 0.1, -0.2, 1.0)
 UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)
@@ -126,10 +126,10 @@ def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
 USED = Decision(5, "operator", 1, "absolute_pose", Verdict.USED, "", (0.0,) * 6, statistic=3.25, limit=22.5)
 
 
-def result(decision: Decision | None, reasons: int = 0) -> SetPoseResult:
+def result(decision: Decision | None, reasons: int = 0) -> str:
     request = Transformation("Cart:Base", "World:UTM", Pose((30.0, 40.0, 2.0)))
     after = PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose((30.5, 40.0, 2.0)), None, 9, reasons))
-    return SetPoseResult(request, (1.0, 5.0), decision, after)
+    return describe_set_pose(request, (1.0, 5.0), decision, after)
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,8 @@ def result(decision: Decision | None, reasons: int = 0) -> SetPoseResult:
         ),
     ],
 )
-def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: SetPoseResult, line: str) -> None:
-    lines = describe_set_pose(shown).splitlines()
+def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: str, line: str) -> None:
+    lines = shown.splitlines()
     assert lines[0].startswith("Cart:Base in World:UTM: position (30.000, 40.000, 2.000) m")
     assert lines[1] == "  sigma 1 m, 5 deg"
     assert lines[2] == line

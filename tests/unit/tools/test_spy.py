@@ -16,7 +16,7 @@ from support_lcm import MODELSERVER
 from modelserver.wire.channels import DEFAULT_URL
 from mstools.cli import main
 from mstools.commands import status
-from mstools.lcm_wheel import MissingToolError, find_type_files
+from mstools.commands.status import MissingToolError, find_type_files
 
 BUILD = "from mstools.commands.status import get_types_jar; print(get_types_jar())"
 

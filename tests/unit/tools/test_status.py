@@ -29,7 +29,7 @@ from modelserver.messages import (
 )
 from modelserver.wire.codec import encode
 from mstools.commands import status
-from mstools.terminal.health_text import (
+from mstools.terminal.health import (
     MAX_ROWS,
     as_data,
     format_clock,

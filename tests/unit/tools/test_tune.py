@@ -26,8 +26,16 @@ from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import GpsModel, Timing, WheelsModel
 from mstools import cli
-from mstools.commands.tune import TUNABLES, choose_parameters
-from mstools.tuning import EvaluationJob, Parameter, Score, evaluate, mixture_log_density, search
+from mstools.commands.tune import (
+    TUNABLES,
+    EvaluationJob,
+    Parameter,
+    Score,
+    choose_parameters,
+    evaluate,
+    mixture_log_density,
+    search,
+)
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -125,7 +133,7 @@ def test_given_residuals_then_the_true_covariance_is_the_most_likely() -> None:
 def test_given_the_settings_that_are_tuned_then_all_are_the_filters_and_within_bounds() -> None:
     settings = load_config(RAPTOR).localization.filter
     for each in TUNABLES:
-        assert each.parameter.low <= getattr(settings, each.parameter.name) <= each.parameter.high
+        assert each.low <= getattr(settings, each.name) <= each.high
 
 
 # --- the command --------------------------------------------------------------------------------------------
@@ -254,14 +262,13 @@ import time
 from pathlib import Path
 from mstools import cli
 from mstools.commands import tune
-from mstools.tuning import EvaluationJob
 
-def read_pipe(job: EvaluationJob) -> None:
+def read_pipe(job: tune.EvaluationJob) -> None:
     job.config.read_bytes()
 
 def command(log: Path, config: Path) -> None:
     with tune._open_pool() as runs:
-        runs([EvaluationJob(log, config, "half", ())] * 2)
+        runs([tune.EvaluationJob(log, config, "half", ())] * 2)
 
 # in the workers too: each imports this file
 tune.evaluate = read_pipe

@@ -17,8 +17,8 @@ from modelserver.errors import Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
-from mstools.edit.document import EditedFile, EditSession, GeometryItem, ItemKind
-from mstools.view.editor import Editing, Editor, Snap
+from mstools.edit import EditedFile, EditSession, GeometryItem, ItemKind
+from mstools.view.editor import SNAPS, Editing, Editor
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import VehicleScene
 
@@ -255,13 +255,13 @@ def test_given_a_drag_then_the_fields_follow_and_its_end_is_one_change(page: Edi
     assert body == "Raptor"
     assert parent == page.model.frame("Raptor:CabFrontRailCenter").pose
     dragged = Pose((0.0123456, 0.0, 0.0)) @ pose
-    page.fields.set_dragged(dragged, Snap.NONE, is_end=False)
+    page.fields.set_dragged(dragged, SNAPS["none"], is_end=False)
     assert page.fields._fields["xyz"].value == (0.0123, 0.0, 0.0)
     assert not page.session.is_changed
-    page.fields.set_dragged(dragged, Snap.FINE, is_end=True)
+    page.fields.set_dragged(dragged, SNAPS["1 mm, 1 deg"], is_end=True)
     assert page.constraint("FrontNoddingSICKFixed").pose == Pose((0.012, 0.0, 0.0))
     turned = Pose.from_rpy((0.012, 0.0, 0.0), 0.0, 0.0, math.radians(44.0))
-    page.fields.set_dragged(turned, Snap.MEDIUM, is_end=True)
+    page.fields.set_dragged(turned, SNAPS["1 cm, 5 deg"], is_end=True)
     assert np.degrees(page.constraint("FrontNoddingSICKFixed").pose.rpy) == pytest.approx([0.0, 0.0, 45.0])
     page.editor._step(page.session.undo)
     page.editor._step(page.session.undo)

@@ -21,8 +21,7 @@ from modelserver.errors import ModelServerError, RecordingError, WireError, find
 from modelserver.messages import FixType
 from modelserver.transforms.so3 import Array, Vector3
 from modelserver.wire.codec import decode
-from modelserver.wire.eventlog import LogFile
-from mstools.terminal.output import format_count, show_progress
+from mstools.terminal.output import format_count, read_with_progress
 
 
 class CalibrationError(ModelServerError, ValueError):
@@ -70,13 +69,11 @@ def read_recording(log: Path, channel: str, begin: float, end: float) -> ImuReco
     fixes: list[Vector3] = []
     counts: Counter[str] = Counter()
     errors: list[str] = []
-    with LogFile(log) as recording, show_progress(f"reading {log.name}", recording.size) as show:
+    with read_with_progress("reading", log) as (recording, events):
         first: int | None = None
-        for number, event in enumerate(recording):
+        for event in events:
             first = event.utime if first is None else first
             counts[event.channel] += 1
-            if number % 4096 == 0:
-                show(event.end)
             at = (event.utime - first) * 1e-6
             if event.channel not in (channel, GPS_CHANNEL) or not begin <= at < end:
                 continue

@@ -208,7 +208,6 @@ def _fit_random_walk(
 
 
 def _slopes(taus: Array, deviations: Array) -> Array:
-    """Return the logarithmic slope at each point, between its neighbors."""
     x, y = np.log(taus), np.log(deviations)
     between = np.diff(y) / np.diff(x)
     if between.size == 0:

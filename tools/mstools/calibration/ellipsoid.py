@@ -102,7 +102,8 @@ def fit_level(
     found = fit_ellipse(level)
     used, weights = found.is_inlier, found.weights[found.is_inlier]
     unit = found.normalize(level[used])
-    sectors = _covered_sectors(unit[:, 0], unit[:, 1])
+    # a single outlier does not cover 30 degrees
+    sectors = tuple((np.bincount(_find_sectors(unit, SECTORS), minlength=SECTORS) >= 3).tolist())
     if sum(sectors) < MIN_SECTORS:
         raise CalibrationError(
             f"the samples cover {sum(sectors)} of {SECTORS} sectors of 30 degrees, {MIN_SECTORS} are needed: turn the "
@@ -156,11 +157,10 @@ def _level_axes(up: Vector3) -> Array:
     return np.column_stack((x, np.cross(z, x), z))
 
 
-def _covered_sectors(x: Array, y: Array) -> tuple[bool, ...]:
-    sectors = np.floor(np.arctan2(y, x) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
-    counts = np.bincount(sectors, minlength=SECTORS)
-    # a single outlier does not cover 30 degrees
-    return tuple(bool(count >= 3) for count in counts)
+def _find_sectors(points: Array, count: int) -> npt.NDArray[np.int64]:
+    """Return the sector about the origin, of so many, in which each point (n, 2) is."""
+    turns = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi)
+    return np.floor(turns * count).astype(np.int64) % count
 
 
 def _check_axis_ratio(A: Array, known: bool) -> None:
@@ -297,8 +297,7 @@ def _refine(points: Array, weights: Array, center: Array, matrix: Array) -> tupl
 
 def _balance_weights(points: Array) -> Array:
     """Return weights, mean 1, with equal sums in all directions about the origin, however many samples each has."""
-    turns = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
-    sectors = np.floor(turns * WEIGHT_SECTORS).astype(int) % WEIGHT_SECTORS
+    sectors = _find_sectors(points, WEIGHT_SECTORS)
     weights = 1.0 / np.bincount(sectors)[sectors]
     balanced: Array = weights * (len(weights) / weights.sum())
     return balanced

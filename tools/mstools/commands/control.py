@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -122,7 +122,6 @@ def find_rejection(before: Health | None, now: Health, sources: Collection[str])
 
 
 def parse_mode(text: str) -> Mode:
-    """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest name."""
     name = text.strip().replace("-", "_").lower()
     return Mode[(name if name in MODES else choose_name(text, MODES, "mode", "MODE")).upper()]
 
@@ -254,22 +253,12 @@ def set_pose(
     decision = listener.decisions.get(accepted.header.utime)
     listener.pose = None
     listener.listen(timeout, lambda: listener.pose is not None)
-    result = SetPoseResult(request, (sigma, sigma_deg), decision, listener.pose)
-    typer.echo(describe_set_pose(result))
+    typer.echo(describe_set_pose(request, (sigma, sigma_deg), decision, listener.pose))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
             f"localization rejected the pose: {escape(decision.reason or 'it contradicts the estimate')}; if the "
             "pose is right, check axes and units, and give larger sigmas (--sigma, --sigma-deg)"
         )
-
-
-class SetPoseResult(NamedTuple):
-    """The pose that was set, `decision` on it if one was received, and the next pose that the daemon published."""
-
-    request: Transformation
-    sigmas: tuple[float, float]
-    decision: Decision | None
-    after: PoseAnswer | None
 
 
 def check_target(positions: Mapping[str, Any], orientations: Mapping[str, Any], height: float | None) -> None:
@@ -355,13 +344,14 @@ class SetPoseListener(DaemonListener):
 _VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RESET: "set"}
 
 
-def describe_set_pose(result: SetPoseResult) -> str:
-    sigma, sigma_deg = result.sigmas
+def describe_set_pose(
+    request: Transformation, sigmas: tuple[float, float], decision: Decision | None, after: PoseAnswer | None
+) -> str:
+    """Describe the pose that was set, the decision on it, and the next pose that the daemon published."""
     lines = [
-        f"{escape(result.request.frame_of_interest)} in World:UTM: {result.request.pose}",
-        f"  sigma {sigma:g} m, {sigma_deg:g} deg",
+        f"{escape(request.frame_of_interest)} in World:UTM: {request.pose}",
+        f"  sigma {sigmas[0]:g} m, {sigmas[1]:g} deg",
     ]
-    decision = result.decision
     if decision is not None:
         text = _VERDICTS[decision.verdict] + (f": {escape(decision.reason)}" if decision.reason else "")
         if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
@@ -369,8 +359,8 @@ def describe_set_pose(result: SetPoseResult) -> str:
     else:
         text = "accepted for localization; no decision on it was received (publish.decisions: false?)"
     lines.append(f"decision: {text}")
-    if result.after is not None:
-        now = result.after.transformation
+    if after is not None:
+        now = after.transformation
         state = "valid" if now.is_valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"
         lines.append(f"now: {now.pose}; {state}")
     return "\n".join(lines)

@@ -15,8 +15,8 @@ from modelserver.extras import describe_missing
 from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.install import get_examples_folder
 from mstools.commands.status import HealthListener
-from mstools.deployment import get_examples_folder
 from mstools.launch.processes import (
     ChildProcesses,
     EmulatedConnections,

@@ -22,7 +22,7 @@ from modelserver.server import diagnostics
 from modelserver.server.diagnostics import ERROR, NOTE, OK, WARNING, Diagnosis, NetworkInterface
 from modelserver.server.journal.writer import get_journal_directory, get_max_bytes, list_segments
 from modelserver.server.persistence import get_state_directory
-from mstools.deployment import SERVICE, STATE, UNITS, VEHICLE
+from mstools.commands.install import SERVICE, STATE, UNITS, VEHICLE
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import escape, format_count
 

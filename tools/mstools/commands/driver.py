@@ -1,33 +1,35 @@
-"""`modelserver driver`: publish the samples of a device, and check its section; `emulate`: the device itself."""
+"""`modelserver run`: the daemon; `driver`: publish the samples of a device; `emulate`: the device itself."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
 from modelserver.errors import (
     ConfigError,
+    GeometryError,
+    Location,
     ModelServerError,
     Problem,
+    Severity,
     find_nearest_names,
     quote,
 )
-from modelserver.server.log import set_up_logging
-from modelserver.server.supervision import Notifier
-from mstools.commands.run import LEVELS, FormatOption, ServiceStart, check_log_options
-from mstools.terminal.completion import complete_driver
-from mstools.terminal.options import UrlOption, argument, choose_name, option
-from mstools.terminal.output import escape
+from modelserver.server.log import FORMATS, set_up_logging
+from modelserver.server.supervision import FAILED_START_S, Notifier
+from mstools.terminal.options import UrlOption, argument, choose_name, complete_driver, option
+from mstools.terminal.output import escape, print_problems
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -37,6 +39,98 @@ if TYPE_CHECKING:
     from msdrivers.links import Link
     from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
+
+
+LEVELS = ("debug", "info", "warning", "error")
+
+FormatOption: TypeAlias = Annotated[
+    str, option("--log-format", f"One of {', '.join(FORMATS)}; auto: journal where systemd reads the log.")
+]
+
+
+def run(
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
+    url: UrlOption = "",
+    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
+    log_format: FormatOption = "auto",
+) -> None:
+    """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
+
+    Loads the geometry, subscribes to the sensors, publishes POSE and answers requests. Does not start with a wrong
+    vehicle file or geometry, and reports all problems; under a service manager, which would restart it at once, it then
+    exits after 10 s. Logs go to stderr. SIGHUP reloads the geometry file:
+    the whole file is used, or, if it is wrong, nothing changes and the log has the reason.
+
+    Example: modelserver run -c config/raptor/vehicle.yaml
+    """
+    check_log_options(log_level, log_format)
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.server import daemon
+    from modelserver.server.vehicle import load_vehicle
+
+    set_up_logging(log_level, log_format)
+    notifier = Notifier.from_environment()
+    notifier.notify_starting(f"reading {config}")
+    with wait_on_error(config, notifier):
+        settings = load_config(config)
+        vehicle = load_vehicle(settings, str(config))
+        vehicle.make_command_verifier(0, str(config))
+    for problem in vehicle.model.problems:
+        level = logging.INFO if problem.severity is Severity.NOTE else logging.WARNING
+        logging.getLogger("modelserver").log(level, "%s", problem)
+    daemon.run(vehicle, url, str(config), notifier)
+
+
+def check_log_options(level: str, log_format: str) -> None:
+    """Raise typer.BadParameter, a usage error, for an unknown level or format of the log."""
+    for name, given, known in (("--log-level", level, LEVELS), ("--log-format", log_format, FORMATS)):
+        if given not in known:
+            raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=name)
+
+
+@contextmanager
+def wait_on_error(config: Path, notifier: Notifier) -> Iterator[None]:
+    """Run the block, the start of a service; where its files are wrong, report that and wait before the process exits.
+
+    Without a service manager errors propagate. With one they are printed at once, the first is its status, and the
+    process exits with the same code, after `FAILED_START_S`.
+    """
+    if not notifier.is_active:
+        yield
+        return
+    code, problems = 1, tuple[Problem, ...]()
+    try:
+        yield
+        return
+    except (ConfigError, GeometryError) as error:
+        text, problems = "", error.problems
+    except OSError as error:
+        if error.filename is None or Path(error.filename) != config:
+            raise
+        text = f"the vehicle file cannot be read: {error.strerror}"
+    except typer.BadParameter as error:
+        text, code = error.message, error.exit_code
+    except ModelServerError as error:
+        text = str(error)
+    problems = problems or (Problem(Severity.ERROR, text, Location(str(config))),)
+    print_problems(problems)
+    # also extends the start timeout of systemd
+    notifier.notify_starting(format_status(problems))
+    time.sleep(FAILED_START_S)
+    raise typer.Exit(code)
+
+
+def format_status(problems: Iterable[Problem]) -> str:
+    """Return the problems in one line: the first error, and the number of others."""
+    errors = [problem for problem in problems if problem.severity is Severity.ERROR]
+    first = errors[0] if errors else None
+    place = f"{first.file}:{first.line}: " if first is not None and first.line else ""
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    message = first.message if first is not None else "the vehicle file or its geometry is wrong"
+    return f"start failed, waiting for the file to be fixed: {place}{message}{more}"
+
+
+# --- drivers
 
 
 def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
@@ -110,13 +204,12 @@ def command(
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
     if record_raw is not None and play_raw is not None:
         raise typer.BadParameter("a replayed recording is not recorded again", param_hint="--record-raw")
-    start = ServiceStart(config, Notifier.from_environment())
-    with start.wait_on_error():
+    with wait_on_error(config, Notifier.from_environment()):
         vehicle, settings = load_driver(name, config)
     set_up_logging(log_level, log_format)
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         link = _make_link(stack, settings, record_raw, play_raw)
-        run(vehicle, settings, link, config.parent, url, start)
+        run_driver(vehicle, settings, link, config, url)
 
 
 def show_ports() -> None:
@@ -198,9 +291,7 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
     return channels
 
 
-def _make_link(
-    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, play: Path | None
-) -> Link[Any]:
+def _make_link(stack: ExitStack, settings: DriverSettings, record: Path | None, play: Path | None) -> Link[Any]:
     """Return the driver's connection, with a recorder, or a recording in its place."""
     from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
     from msdrivers.registry import SerialSettings, TcpSettings
@@ -218,17 +309,15 @@ def _make_link(
     return RecordingLink(link, stack.enter_context(open_for_writing(record)), *names, SystemTimeSource())
 
 
-def run(
-    vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: ServiceStart
-) -> None:
+def run_driver(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], config: Path, url: str) -> None:
     """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.runner import DriverPublisher, Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_driver
 
-    kind = settings.kind
-    with start.wait_on_error():
-        station = make_driver(settings, folder)
+    kind, notifier = settings.kind, Notifier.from_environment()
+    with wait_on_error(config, notifier):
+        station = make_driver(settings, config.parent)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
     publisher = DriverPublisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
     options = RunnerSettings(settings.name, kind.name)
@@ -254,7 +343,6 @@ def run(
         attend = corrections.feed_runner(runner)
         corrections.start()
     stop_on_signal(runner)
-    notifier = Notifier.from_environment()
     try:
         runner.run(supervise(runner, notifier, attend))
     finally:
@@ -264,7 +352,6 @@ def run(
 
 
 def stop_on_signal(runner: Runner[Any]) -> None:
-    """Let SIGTERM and Ctrl-C end a runner."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
 
@@ -286,32 +373,28 @@ def subscribe_commands(
     prefix, config = vehicle.lcm.channel_prefix, vehicle.commands
     plain = f"{prefix}{channel}"
 
-    def handle(_: str, data: bytes) -> None:
-        try:
-            runner.send_command(decode(COMMAND_TYPE, data))
-        except WireError as error:
-            runner.reject_command(error.reason, f"a command on {plain} rejected: {error}")
+    def handle(channel: str, read: Callable[[bytes], Any]) -> None:
+        """Subscribe to a channel: its commands are sent as they are read, or rejected."""
 
-    def reject_unsigned(_: str, data: bytes) -> None:
-        text = (
-            f"a command on {plain} rejected: it is not signed; use modelserver.VehicleCommander with the vehicle's key"
-        )
-        runner.reject_command("unsigned", text)
+        def send(_: str, data: bytes) -> None:
+            try:
+                runner.send_command(read(data))
+            except (WireError, CommandDeniedError) as error:
+                runner.reject_command(error.reason, f"a command on {channel} rejected: {error}")
+
+        bus.subscribe(to_subscription_pattern(channel), send)
+
+    def reject_unsigned(_: bytes) -> None:
+        text = "it is not signed; use modelserver.VehicleCommander with the vehicle's key"
+        raise CommandDeniedError("unsigned", text)
 
     if config.is_drive_signed:
-        signed = f"{prefix}{DRIVE_SIGNED}"
-        verifier = DriveVerifier(
-            read_keys(config.key_file), prefix, channel, config.window_s, time_source.now().monotonic_ns
-        )
-
-        def verify(_: str, data: bytes) -> None:
-            try:
-                runner.send_command(verifier.verify(data, time_source.now()))
-            except CommandDeniedError as error:
-                runner.reject_command(error.reason, f"a command on {signed} rejected: {error}")
-
-        bus.subscribe(to_subscription_pattern(signed), verify)
-    bus.subscribe(to_subscription_pattern(plain), reject_unsigned if config.is_drive_signed else handle)
+        now = time_source.now().monotonic_ns
+        verifier = DriveVerifier(read_keys(config.key_file), prefix, channel, config.window_s, now)
+        handle(f"{prefix}{DRIVE_SIGNED}", lambda data: verifier.verify(data, time_source.now()))
+        handle(plain, reject_unsigned)
+    else:
+        handle(plain, partial(decode, COMMAND_TYPE))
 
     def attend() -> None:
         while handle_message(bus):
@@ -341,7 +424,7 @@ def supervise(
 
     progress, passes = StallDetector(), count(1)
 
-    def format_status() -> str:
+    def describe_phase() -> str:
         phase, text = runner.state
         return f"{phase.name.lower()}: {text}" if text else phase.name.lower()
 
@@ -349,9 +432,9 @@ def supervise(
         attend()
         if not notifier.is_ready:
             if next(passes) >= READY_PASSES:
-                notifier.notify_ready(format_status())
+                notifier.notify_ready(describe_phase())
             return
-        notifier.update_status(format_status)
+        notifier.update_status(describe_phase)
         failures = sum(number for name, number in runner.counts.items() if name.startswith("errors."))
         if progress.is_progressing(runner.samples, failures, monotonic_ns()):
             notifier.ping_watchdog()
@@ -371,24 +454,19 @@ GPS_HZ = 4.0
 """Default rate of a receiver."""
 
 
-@dataclass(frozen=True, slots=True)
-class DriveOptions:
-    """The simulated drive of `seconds` that a device measures.
+def simulate(
+    vehicle: VehicleConfig,
+    settings: DriverSettings,
+    start: int | None = None,
+    seconds: float = MAX_DRIVE_S,
+    scenario: str = "eight",
+    seed: int = 1,
+    own_field: Vector3 = (0.0, 0.0, 0.0),
+) -> Iterator[Sample]:
+    """Return the samples that the emulator of a driver's device measures in a drive; their end is logged.
 
-    start: its start, microseconds of UTC; None: now. own_field: hard iron, tesla along the sensor's axes.
-    """
-
-    start: int | None
-    seconds: float
-    scenario: str
-    seed: int
-    own_field: Vector3
-
-
-def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
-    """Return the samples that the emulator of a driver's device measures; their end is logged.
-
-    A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
+    The drive starts at `start`, microseconds of UTC, None for now; `own_field` is hard iron, tesla along the sensor's
+    axes. A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
     wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a drive that is already
     over, and a sensor without a section in the vehicle file.
     """
@@ -397,15 +475,15 @@ def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOpti
     from mstools.launch.drive import WHEELS_HZ, make_simulation
 
     now = time.time_ns() // 1000
-    start = now + START_DELAY_US if wanted.start is None else wanted.start
+    begin = now + START_DELAY_US if start is None else start
     sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
     sensors, kind = vehicle.sensors, settings.kind.sample
-    follows_commands = not settings.kind.follows_samples or (wanted.start is None and settings.kind.command_channel)
+    follows_commands = not settings.kind.follows_samples or (start is None and settings.kind.command_channel)
     if follows_commands or kind not in sections:
         return
-    if start + round(wanted.seconds * 1e6) < now:
-        ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
-        raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
+    if begin + round(seconds * 1e6) < now:
+        ago = f"{(now - begin) * 1e-6:.0f} s ago, and the drive lasts {seconds:g} s"
+        raise ModelServerError(f"--start {start} is {ago}: it is over, so there are no samples")
     if getattr(sensors, sections[kind]) is None:
         raise ModelServerError(
             f"the vehicle file has no section sensors.{sections[kind]}, which has the sensor's frame"
@@ -413,20 +491,20 @@ def simulate(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOpti
     steered = sensors.steering.wheels if sensors.steering is not None else ()
     mapped = getattr(settings.device_settings, "wheels", {})
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
-    run = make_simulation(
+    drive = make_simulation(
         vehicle,
-        start,
-        wanted.seconds,
-        wanted.scenario,
-        wanted.seed,
+        begin,
+        seconds,
+        scenario,
+        seed,
         (kind,),
         gps_model=GpsModel(Timing(getattr(settings.device_settings, "rate_hz", GPS_HZ))),
-        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=wanted.own_field)),
+        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
         wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
     # samples before now are skipped, also those of the time that making the drive took
     now = time.time_ns() // 1000
-    for sample in run.events(wanted.seconds):
+    for sample in drive.events(seconds):
         if isinstance(sample, kind) and sample.header.utime >= now:
             yield sample
     log.warning("%s: the simulated drive is over, there are no more measurements", settings.name)
@@ -485,7 +563,7 @@ def emulate(
     own_field = _parse_field(iron)
     line = _make_device_link(settings, link, tcp, can)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    samples = simulate(vehicle, settings, DriveOptions(start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
+    samples = simulate(vehicle, settings, start, seconds or MAX_DRIVE_S, scenario, seed, own_field)
 
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
     from msdrivers.settings import make_emulator
@@ -502,7 +580,6 @@ def emulate(
 
 
 def _make_device_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str) -> Link[Any]:
-    """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
     from msdrivers.links import TcpServerLink
     from msdrivers.links.serial_port import PtyLink
     from msdrivers.registry import CanSettings, ModbusSettings, SerialSettings

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from modelserver.errors import quote
 from mstools.terminal.options import (
     JsonOption,
     ModelOption,
@@ -22,17 +22,19 @@ from mstools.terminal.options import (
     UrlOption,
     Variables,
     argument,
+    list_given,
     option,
+    parse_pairs,
     parse_variables,
 )
 from mstools.terminal.output import escape, load_given_model, to_json
 
 if TYPE_CHECKING:
     from modelserver.dynamics import CenterOfMass, Dynamics, Stability
-    from modelserver.geometry.model import Model
 
 
 def command(
+    ctx: typer.Context,
     frame: Annotated[str, argument("FRAME", "Frame of center of mass and inertia. Default: the base frame.")] = "",
     model: ModelOption = None,
     config: Annotated[
@@ -50,12 +52,9 @@ def command(
         list[str] | None,
         option("--contact FRAME", "Contact with the ground, or a pattern like Cart:*Wheel. May be repeated."),
     ] = None,
-    tilt: Annotated[
-        tuple[float, float], typer.Option("--tilt-deg", metavar="ROLL PITCH", help="Attitude of the root frame.")
-    ] = (0.0, 0.0),
+    tilt: Annotated[tuple[float, float], option("--tilt-deg ROLL PITCH", "Attitude of the root frame.")] = (0.0, 0.0),
     acceleration: Annotated[
-        tuple[float, float, float],
-        typer.Option("--acceleration", metavar="X Y Z", help="Acceleration of the root frame in the world, m/s2."),
+        tuple[float, float, float], option("--acceleration X Y Z", "Acceleration of the root frame in the world, m/s2.")
     ] = (0.0, 0.0, 0.0),
     floating: Annotated[bool, option("--floating", "Six coordinates for the base, too.")] = False,
     equations: Annotated[bool, option("--equations", "Print coordinates, gravity and mass matrix.")] = False,
@@ -77,22 +76,12 @@ def command(
       modelserver dynamics --model config/raptor/geometry.yaml --joint FLEALateral=0.5 --equations
     """
     if model is None and config is None:
-        for name, given in (
-            ("--set", settings),
-            ("--joint", joints),
-            ("--payload", payload),
-            ("--mass", masses),
-            ("--contact", contacts),
-            ("--tilt-deg", any(tilt)),
-            ("--acceleration", any(acceleration)),
-            ("--allow-massless", allow_massless),
-            ("--cut-loops", cut_loops),
-        ):
-            if given:
-                raise typer.BadParameter(
-                    "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
-                    param_hint=name,
-                )
+        of_file = {"settings", "joints", "payload", "masses", "contacts", "tilt", "acceleration"}
+        if wrong := list_given(ctx, of_file | {"allow_massless", "cut_loops"}):
+            raise typer.BadParameter(
+                "has no effect on the running daemon, which has its own; add --model FILE or --config FILE",
+                param_hint=next(iter(wrong.values())),
+            )
         _show(*_query_daemon(frame, floating, equations, npy is not None, url, prefix, timeout), npy, as_json)
         return
     from modelserver.dynamics import MassUncertainty, assess_stability
@@ -113,12 +102,13 @@ def command(
         "cut_loops": cut_loops or known.cut_loops,
         "uncertainty": MassUncertainty(known.mass_sigma, known.center_sigma, unstated_is_exact=True),
     }
-    changes = {"masses": _parse_numbers(masses, "--mass"), "payload": _parse_numbers(payload, "--payload")}
+    parse = partial(parse_pairs, form="NAME=NUMBER", parse=float)
+    changes = {"masses": parse(masses, hint="--mass"), "payload": parse(payload, hint="--payload")}
     dynamics: Dynamics = geometry.dynamics("floating", root, **options, **changes)
     root = dynamics.tree.root
     attitude = so3.logarithm(so3.from_rpy(math.radians(tilt[0]), math.radians(tilt[1]), 0.0))
     base = {f"{root}.{name}": value for name, value in zip(("rx", "ry", "rz"), attitude, strict=True)}
-    moved = _parse_numbers(joints, "--joint")
+    moved = parse(joints, hint="--joint")
     a = (
         {f"{root}.{name}": value for name, value in zip("xyz", acceleration, strict=True)}
         if any(acceleration)
@@ -138,7 +128,10 @@ def command(
     inertia = dynamics.inertia(q, frame or root)
     data = _describe_mass(center.mass, frame or root, center.position, center.covariance, inertia)
     data |= {"massless": list(dynamics.massless), "cut": list(dynamics.cut)}
-    names = _match_frames(geometry, contacts) if contacts else list(known.contacts)
+    frames = [each.full_name for body in geometry.bodies for each in body]
+    # a pattern without a wildcard is a name, known or not
+    matched = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in contacts or ())
+    names = list(dict.fromkeys(chain.from_iterable(matched))) or list(known.contacts)
     if names:
         v = None if a is None else dict[str, float]()
         found = assess_stability(dynamics, q, names, v, a, sigma=sigma)
@@ -178,27 +171,6 @@ def _show(data: dict[str, Any], D: Any, npy: Path | None, as_json: bool) -> None
     if npy is not None:
         np.save(npy, D)
     typer.echo(json.dumps(to_json(data), indent=2) if as_json else format_dynamics(data))
-
-
-def _match_frames(model: Model, patterns: Sequence[str]) -> list[str]:
-    """Return the frames that the patterns name; one without a wildcard is a name, known or not."""
-    frames = [frame.full_name for body in model.bodies for frame in body]
-    found = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in patterns)
-    return list(dict.fromkeys(chain.from_iterable(found)))
-
-
-def _parse_numbers(given: Sequence[str] | None, hint: str) -> dict[str, float]:
-    """Return the numbers of NAME=NUMBER by name. Raises typer.BadParameter."""
-    found = {}
-    for text in given or ():
-        name, _, value = text.rpartition("=")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            name = ""
-        if not name:
-            raise typer.BadParameter(f"{quote(text)} is not NAME=NUMBER", param_hint=hint)
-    return found
 
 
 def _describe_mass(mass: float, frame: str, center: Any, covariance: Any, inertia: Any) -> dict[str, Any]:

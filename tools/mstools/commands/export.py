@@ -11,20 +11,17 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from modelserver.wire.eventlog import LogFile
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.terminal.options import PrefixOption, UrlOption, option
+from mstools.terminal.options import PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import (
     catch_signals,
     check_writable,
     format_count,
     load_given_model,
+    read_with_progress,
     require_extra,
-    show_progress,
     write_beside,
 )
-
-PROGRESS_EVENTS = 5_000
 
 NEEDS_FOXGLOVE = "this needs foxglove-sdk"
 
@@ -33,14 +30,14 @@ DEFAULT_PORT = 8765
 
 
 def command(
-    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="LCM log of the service.")] = None,
-    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="MCAP file to write.")] = None,
+    log: Annotated[Path | None, argument("[LOG]", "LCM log of the service.")] = None,
+    out: Annotated[Path | None, argument("[OUT]", "MCAP file to write.")] = None,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log that has none of the service.")] = None,
     config: Annotated[
         Path | None, option("--config -c FILE", "Vehicle file: run the localization on a log that has no poses.")
     ] = None,
     live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
-    raw: Annotated[bool, typer.Option("--raw/--no-raw", help="Include the LCM messages as they are.")] = True,
+    raw: Annotated[bool, option("--raw/--no-raw", "Include the LCM messages as they are.")] = True,
     force: Annotated[bool, option("--force", "Replace OUT if it exists.")] = False,
     bind: Annotated[str, option("--bind ADDRESS", "With --live: serve at this address.")] = "127.0.0.1",
     port: Annotated[int, option("--port N", "With --live: port; 0 is any free one.", min=0, max=65535)] = DEFAULT_PORT,
@@ -78,7 +75,7 @@ def command(
     if model is not None and config is not None:
         raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
     require_extra("foxglove", NEEDS_FOXGLOVE)
-    from mstools.recordings.localized import open_localized
+    from mstools.commands.replay import open_localized
 
     check_writable(str(out), force)
     with open_localized(log, config) as localized:
@@ -92,22 +89,21 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
     """
     import foxglove
 
-    from mstools.recordings.foxglove_messages import FoxgloveWriter, find_definitions
+    from mstools.commands.status import find_type_files
+    from mstools.recordings.foxglove_messages import FoxgloveWriter
 
     count = 0
     with write_beside(out) as draft:
         context = foxglove.Context()
         with (
-            LogFile(log) as events,
-            show_progress(f"exporting {log.name}", events.size) as show,
+            read_with_progress("exporting", log) as (recording, events),
             foxglove.open_mcap(draft, context=context),
         ):
             given = None if model is None else load_given_model(model, {})
-            writer = FoxgloveWriter(context, prefix, find_definitions() if raw else None, given)
-            for count, event in enumerate(events, 1):
+            writer = FoxgloveWriter(context, prefix, find_type_files()[0].parent if raw else None, given)
+            for event in events:
+                count += 1
                 writer.feed(event.channel, event.data, event.utime)
-                if count % PROGRESS_EVENTS == 0:
-                    show(event.end)
             if not writer.has_geometry:
                 raise RecordingError(
                     f"{log}: no complete geometry on {prefix}MODEL_SNAPSHOT, so there are no frames. The service "
@@ -116,7 +112,7 @@ def write_mcap(log: Path, out: Path, raw: bool, prefix: str, model: Path | None 
                     "with which the localization runs too: -c FILE"
                 )
     typer.echo(f"{out}: {format_count(count, 'message')}, {out.stat().st_size / 1e6:.1f} MB")
-    for damage in events.damage:
+    for damage in recording.damage:
         typer.echo(f"modelserver: note: {log}: {damage}", err=True)
     if writer.skipped:
         typer.echo(f"modelserver: note: {format_count(writer.skipped, 'message')} could not be read", err=True)

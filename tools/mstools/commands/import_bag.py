@@ -7,6 +7,7 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,7 +16,6 @@ import lcm
 import typer
 
 from modelserver.errors import RecordingError, find_nearest_names, quote
-from modelserver.files import check_links
 from modelserver.formats import save_model
 from modelserver.messages import MAX_CHANNEL_LENGTH, JointsSample, SensorHeader
 from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
@@ -24,10 +24,12 @@ from mstools.recordings.bags import (
     CONVERTERS,
     DEFAULT_OPTIONS,
     ROS_TYPES,
+    TF_TYPES,
     Altitude,
     Bag,
     BagOptions,
     ImuOrientation,
+    TfTree,
     Topic,
     TopicKind,
     is_lcm_mcap,
@@ -35,16 +37,13 @@ from mstools.recordings.bags import (
     open_mcap,
     read_stamp,
 )
-from mstools.recordings.tf_tree import TF_TYPES, TfTree
 from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, show_progress, write_beside, write_file
 
 
 def command(
     bag: Annotated[Path, argument("BAG", "ROS 1 file, folder of a ROS 2 recording, or MCAP file of export.")],
-    log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="LCM event log to write. Without: show what would be taken.")
-    ] = None,
+    log: Annotated[Path | None, argument("[LOG]", "LCM event log to write. Without: show what would be taken.")] = None,
     topic: Annotated[
         list[str] | None,
         option(
@@ -103,7 +102,6 @@ def command(
             _, topics = choose_topics(opened.topics, kinds, str(bag), has_tf=geometry is not None)
         report = ImportReport("", list(topics.values()))
     else:
-        check_writable(str(log))
         if geometry is not None:
             check_writable(str(geometry), replace=force)
         options = BagOptions(altitude, undulation, imu_orientation, track_width)
@@ -163,11 +161,7 @@ def import_bag(
     """
     if log_path.exists() and not force:
         raise RecordingError(f"{log_path}: already exists; --force replaces it")
-    if log_path.is_dir():
-        raise RecordingError(f"{log_path}: is a folder; give a file in it")
-    if not log_path.parent.is_dir():
-        raise RecordingError(f"{log_path}: missing folder {log_path.parent}")
-    check_links(log_path)
+    check_writable(str(log_path))
     with write_beside(log_path) as part:
         if is_lcm_mcap(bag_path):
             reports, seconds = _copy_messages(bag_path, part, prefix, bool(kinds))
@@ -191,11 +185,10 @@ def _read_tf(bag: Bag, reports: Mapping[str, TopicReport]) -> TfTree:
     for name, _, message in bag.messages(of_tf):
         tree.add(message)
         reports[name].written += 1
-    for name in of_tf:
-        if tree.conflicts:
-            reports[name].notes.append(
-                f"frames with two parents, of which the last counts: {', '.join(tree.conflicts)}"
-            )
+    if tree.conflicts:
+        note = f"frames with two parents, of which the last counts: {', '.join(tree.conflicts)}"
+        for name in of_tf:
+            reports[name].notes.append(note)
     return tree
 
 
@@ -214,20 +207,18 @@ def _copy_messages(mcap_path: Path, path: Path, prefix: str, has_kinds: bool) ->
         if has_kinds:
             raise RecordingError(f"{mcap_path}: --topic goes with a ROS bag; this file has the messages as they were")
         first = last = 0
-        out = lcm.EventLog(str(path), "w", overwrite=True)
-        try:
-            with show_progress(
-                f"importing {mcap_path.name}", sum(count for _, count in mcap.channels.values())
-            ) as show:
-                for number, (utime, channel, data) in enumerate(mcap.read(), 1):
-                    report = reports[channel]
-                    out.write_event(utime, report.channel, data)
-                    report.written += 1
-                    first, last = first or utime, utime
-                    if number % 512 == 0:
-                        show(number)
-        finally:
-            out.close()
+        total = sum(count for _, count in mcap.channels.values())
+        with (
+            closing(lcm.EventLog(str(path), "w", overwrite=True)) as out,
+            show_progress(f"importing {mcap_path.name}", total) as show,
+        ):
+            for number, (utime, channel, data) in enumerate(mcap.read(), 1):
+                report = reports[channel]
+                out.write_event(utime, report.channel, data)
+                report.written += 1
+                first, last = first or utime, utime
+                if number % 512 == 0:
+                    show(number)
     return list(reports.values()), (last - first) * 1e-6
 
 
@@ -305,40 +296,39 @@ def _write(
     for name, kind in chosen.items():
         reports[name].channel = f"{prefix}{kind.upper()}"
     first = last = done = num_joints = 0
-    out = lcm.EventLog(str(path), "w", overwrite=True)
-    try:
-        with show_progress(f"importing {path.name}", total) as show:
-            for name, received_ns, message in bag.messages(chosen.keys() | moving):
-                report = reports[name]
-                arrived = received_ns // 1000
-                if name in moving:
-                    for stamp, joints in tree.read_joints(message):
-                        header = SensorHeader(stamp or arrived, TF, num_joints, arrived)
-                        out.write_event(arrived, f"{prefix}JOINTS", codec.encode(JointsSample(header, joints)))
-                        num_joints += 1
-                    continue
-                utime = read_stamp(message)
-                if utime <= 0:
-                    utime = arrived
-                    unstamped[name] += 1
-                elif len(offsets[name]) < LOOKED_AT:
-                    offsets[name].append((utime - arrived) * 1e-6)
-                header = SensorHeader(utime, chosen[name].value, report.written, arrived)
-                try:
-                    sample = converters[name].convert(header, message)
-                except AttributeError as error:
-                    raise RecordingError(
-                        f"topic {name}: {error}: the file defines {report.type_name} otherwise than ROS does: "
-                        "it is damaged, or this is another type of that name"
-                    ) from None
-                out.write_event(arrived, report.channel, codec.encode(sample))
-                report.written += 1
-                first, last = first or arrived, arrived
-                done += 1
-                if done % 512 == 0:
-                    show(done)
-    finally:
-        out.close()
+    with (
+        closing(lcm.EventLog(str(path), "w", overwrite=True)) as out,
+        show_progress(f"importing {path.name}", total) as show,
+    ):
+        for name, received_ns, message in bag.messages(chosen.keys() | moving):
+            report = reports[name]
+            arrived = received_ns // 1000
+            if name in moving:
+                for stamp, joints in tree.read_joints(message):
+                    header = SensorHeader(stamp or arrived, TF, num_joints, arrived)
+                    out.write_event(arrived, f"{prefix}JOINTS", codec.encode(JointsSample(header, joints)))
+                    num_joints += 1
+                continue
+            utime = read_stamp(message)
+            if utime <= 0:
+                utime = arrived
+                unstamped[name] += 1
+            elif len(offsets[name]) < LOOKED_AT:
+                offsets[name].append((utime - arrived) * 1e-6)
+            header = SensorHeader(utime, chosen[name].value, report.written, arrived)
+            try:
+                sample = converters[name].convert(header, message)
+            except AttributeError as error:
+                raise RecordingError(
+                    f"topic {name}: {error}: the file defines {report.type_name} otherwise than ROS does: "
+                    "it is damaged, or this is another type of that name"
+                ) from None
+            out.write_event(arrived, report.channel, codec.encode(sample))
+            report.written += 1
+            first, last = first or arrived, arrived
+            done += 1
+            if done % 512 == 0:
+                show(done)
     if not done:
         raise RecordingError("the bag has no messages")
     axis = StampAxis({name: statistics.median(values) for name, values in offsets.items() if values}, last * 1e-6)

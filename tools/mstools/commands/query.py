@@ -40,7 +40,6 @@ from modelserver.messages import (
 )
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from mstools.terminal.completion import complete_frame
 from mstools.terminal.options import (
     JsonOption,
     ModelOption,
@@ -50,6 +49,7 @@ from mstools.terminal.options import (
     Variables,
     argument,
     choose_name,
+    complete_frame,
     option,
     parse_variables,
 )

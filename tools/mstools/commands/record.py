@@ -17,7 +17,7 @@ from modelserver.files import check_links
 from modelserver.wire.codec import decode, type_name_of
 from modelserver.wire.eventlog import encode_event
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.recordings.drive import follow_bus
+from mstools.recordings.drive import ChannelCount, follow_bus
 from mstools.terminal.options import ChannelsOption, JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, check_writable, escape, format_count, format_table
 
@@ -88,7 +88,7 @@ def command(
     else:
         typer.echo(escape(recorder.describe(time.monotonic() - started_at)))
         typer.echo(recorder.format_channels())
-    if missing := sorted(channel or []) and [each for each in channel or () if each not in recorder.channels]:
+    if missing := [each for each in channel or () if each not in recorder.channels]:
         near = find_nearest_names(missing[0], recorder.others)
         hint = f"; did you mean {near[0]}?" if near else ""
         typer.echo(escape(f"modelserver: note: nothing was received on {', '.join(missing)}{hint}"), err=True)
@@ -100,19 +100,11 @@ def command(
 
 
 @dataclass(slots=True)
-class RecordedChannel:
+class RecordedChannel(ChannelCount):
     """What was recorded of a channel; `damaged`: messages of a known type that cannot be decoded."""
 
-    type_name: str
-    count: int = 0
+    type_name: str = ""
     damaged: int = 0
-    first: int = 0
-    last: int = 0
-
-    @property
-    def rate(self) -> float:
-        """Messages per second; nan for less than two."""
-        return (self.count - 1) * 1e6 / (self.last - self.first) if self.last > self.first else math.nan
 
 
 @dataclass(slots=True)
@@ -159,8 +151,8 @@ class Recorder:
             self.others.add(channel)
             return
         type_name = type_name_of(data)
-        found = self.channels.setdefault(channel, RecordedChannel(type_name, first=now))
-        found.count, found.last = found.count + 1, now
+        found = self.channels.setdefault(channel, RecordedChannel(type_name=type_name))
+        found.add(now)
         if type_name:
             try:
                 decode(type_name, data)
@@ -192,7 +184,6 @@ class Recorder:
         return path.open("wb")
 
     def close(self) -> None:
-        """Finish the file."""
         if self._file is not None:
             self._file.close()
             self.parts.append((self._name_part(self._number - 1), self._size))
@@ -207,13 +198,12 @@ class Recorder:
         )
 
     def format_channels(self) -> str:
-        """Format channels, types and rates as a table."""
         rows = [
             (
                 name,
                 each.type_name or "foreign",
                 str(each.count),
-                "-" if math.isnan(each.rate) else f"{each.rate:.1f}",
+                "-" if math.isnan(each.mean_rate) else f"{each.mean_rate:.1f}",
                 str(each.damaged) if each.damaged else "",
             )
             for name, each in sorted(self.channels.items())

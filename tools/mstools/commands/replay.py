@@ -6,10 +6,11 @@ import gc
 import json
 import math
 import os
+import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,13 +23,15 @@ from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.completion import complete_frame
-from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, option
+from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, complete_frame, list_given, option
 from mstools.terminal.output import (
     check_writable,
     escape,
     format_count,
+    guess_time_unit,
     open_atomic,
+    read_with_progress,
+    require_extra,
     show_progress,
     to_json,
     write_beside,
@@ -46,6 +49,7 @@ TIMES_LIMIT = 64 << 20
 
 
 def command(
+    ctx: typer.Context,
     log: Annotated[Path, argument("LOG", "LCM event log; with --verify a journal, or its folder.")],
     config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     poses: Annotated[
@@ -110,54 +114,53 @@ def command(
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --log localized.lcm
       modelserver replay --verify /var/lib/modelserver/journal-Husky --key /etc/modelserver/commands.key
     """
-    if verify:
-        if any(
-            (config, poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")
-        ):
-            raise typer.BadParameter("--verify accepts only --json and --key: everything else is in the journal")
-
-        run_verification(log, as_json, key)
-        return
-    if key is not None:
-        raise typer.BadParameter("--key needs --verify")
+    _check_options(list_given(ctx))
     channels = frozenset(channel or ())
-    if out is not None:
-        if config is None:
-            raise typer.BadParameter("needs the vehicle file: -c FILE", param_hint="--log")
-        if any((poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")):
-            raise typer.BadParameter("goes with -c and --json alone: run twice for more", param_hint="--log")
+    if verify:
+        run_verification(log, as_json, key)
+    elif out is not None and config is not None:
         localize(log, config, out, as_json)
-    elif poses or report:
-        if config is None:
-            raise typer.BadParameter(f"{'--poses' if poses else '--report'} needs the vehicle file: -c FILE")
+    elif (poses or report) and config is not None:
         if rate is not None and not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
             raise typer.BadParameter(f"a rate must be above 0 and at most 10000 Hz, got {rate:g}")
-        if rate is not None and at_times is not None:
-            raise typer.BadParameter("--rate and --at-times exclude each other")
-        if speed != "1" or restamp or url or everything:
-            raise typer.BadParameter(
-                "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline"
-            )
-        if not poses and (frame or at_times is not None or rate is not None):
-            raise typer.BadParameter("--frame, --rate and --at-times need --poses CSV")
         if (poses, decisions, report).count("-") > 1:
             raise typer.BadParameter("only one of --poses, --decisions and --report can be standard output")
         replay_offline(log, config, poses, decisions, report, frame, rate or RATE_HZ, at_times, channels, as_json)
     else:
-        if frame or decisions or at_times is not None or rate is not None:
-            raise typer.BadParameter(
-                "--frame, --rate and --at-times need --poses CSV, --decisions needs that or --report"
-            )
         factor = _parse_speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp needs --speed 1: stamps must not run faster than the clock")
         replay_to_bus(log, config, factor, None if everything else channels, url, as_json, restamp)
 
 
+def _check_options(options: dict[str, str]) -> None:
+    """Raise typer.BadParameter, a usage error, where options do not go together; they are by parameter."""
+    given = options.keys() - {"log", "as_json"}
+    of_poses, offline = given & {"frame", "rate", "at_times"}, given & {"out", "poses", "report"}
+    rules: list[tuple[object, str]] = [
+        (
+            "verify" in given and given - {"verify", "key"},
+            "--verify accepts only --json and --key: everything else is in the journal",
+        ),
+        ("key" in given and "verify" not in given, "--key needs --verify"),
+        ("out" in given and given - {"out", "config"}, "--log goes with -c and --json alone: run twice for more"),
+        (
+            offline and given & {"speed", "restamp", "everything", "url"},
+            "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline",
+        ),
+        (of_poses and "poses" not in given, "--frame, --rate and --at-times need --poses CSV"),
+        ("decisions" in given and not offline, "--decisions needs --poses CSV or --report"),
+        (of_poses >= {"rate", "at_times"}, "--rate and --at-times exclude each other"),
+    ]
+    for is_broken, text in rules:
+        if is_broken:
+            raise typer.BadParameter(text)
+    if offline and "config" not in given:
+        raise typer.BadParameter(f"{options[min(offline)]} needs the vehicle file: -c FILE")
+
+
 def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
     """Write a log with the service's messages, whole or not at all."""
-    from mstools.recordings.localized import write_localized
-
     _check_outputs({"log": str(out)}, [log, config])
     with write_beside(out) as draft:
         counts = write_localized(log, config, draft)
@@ -167,6 +170,44 @@ def localize(log: Path, config: Path, out: Path, as_json: bool) -> None:
     typer.echo(escape(f"{out}: {format_count(sum(counts.values()), 'message')}"))
     for name, count in sorted(counts.items()):
         typer.echo(escape(f"  {name} {count}"))
+
+
+def write_localized(log: Path, config: Path, out: Path) -> Counter[str]:
+    """Write the log with the service's messages; return the number of messages by channel.
+
+    Notes of the log go to stderr. Raises ConfigError, GeometryError, RecordingError, OSError.
+    """
+    import lcm
+
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.server.recordings import StampAxis, serve
+    from modelserver.server.vehicle import load_vehicle
+
+    vehicle = load_vehicle(load_config(config), str(config))
+    axis = StampAxis()
+    counts: Counter[str] = Counter()
+    with (
+        closing(lcm.EventLog(str(out), "w", overwrite=True)) as writer,
+        read_with_progress("localizing", log) as (recording, events),
+    ):
+        for event in serve(vehicle, events, axis):
+            writer.write_event(event.utime, event.channel, event.data)
+            counts[event.channel] += 1
+    for note in (*axis.describe(), *map(str, recording.damage)):
+        typer.echo(escape(f"modelserver: {log}: {note}"), err=True)
+    return counts
+
+
+@contextmanager
+def open_localized(log: Path, config: Path | None) -> Iterator[Path]:
+    """Give the log itself, or with a vehicle file a temporary one with what the service makes of it."""
+    if config is None:
+        yield log
+        return
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        out = Path(folder) / log.name
+        write_localized(log, config, out)
+        yield out
 
 
 def replay_to_bus(
@@ -186,14 +227,14 @@ def replay_to_bus(
 
     if not url and config is not None:
         url = load_config(config).lcm.url
-    with LogFile(log) as recording:
-        player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
-        events: Iterable[LogEvent] = recording
+    player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
+    with read_with_progress("replaying", log) as (recording, tracked):
+        events: Iterable[LogEvent] = tracked
         if channels is not None:
-            events = _filter_channels(recording, channels) if channels else _exclude_service_messages(recording)
+            events = _filter_channels(tracked, log, channels) if channels else _exclude_service_messages(tracked)
         try:
-            with show_progress(f"replaying {log.name}", recording.size) as show:
-                player.play(_track_progress(events, show, set()))
+            with closing(tracked):
+                player.play(events)
         finally:
             report = {"sent": player.sent, "seconds": player.duration, "max_delay": player.max_delay}
             words = (
@@ -230,12 +271,14 @@ def replay_offline(
     times = None if at_times is None else read_times(at_times)
     inputs = [log, config, Path(vehicle.config.geometry), *([] if at_times is None else [at_times])]
     if report:
-        from mstools.report import charts
+        from mstools.report.charts import NEEDS_PLOTLY
 
-        charts.check_installed()
+        require_extra("report", NEEDS_PLOTLY)
     _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
-    with LogFile(log) as recording:
-        run = OfflineRun(vehicle, _filter_channels(recording, channels), frame or vehicle.config.base_frame)
+    seen: set[str] = set()
+    with read_with_progress("replaying", log) as (recording, tracked):
+        events = _filter_channels(tracked, log, channels, seen)
+        run = OfflineRun(vehicle, events, frame or vehicle.config.base_frame)
         collector = None
         if report:
             from mstools.report.replay_data import ReplayCollector
@@ -248,11 +291,10 @@ def replay_offline(
         gc.set_threshold(50_000, 20, 100)
         started = time.monotonic()
         counts = ReplayCounts()
-        seen: set[str] = set()
         with (
             _open_output(poses) if poses else nullcontext() as out,
             _open_output(decisions) if decisions else nullcontext() as ledger,
-            show_progress(f"replaying {log.name}", recording.size) as show,
+            closing(tracked),
         ):
 
             def on_decision(decision: Decision) -> None:
@@ -263,7 +305,6 @@ def replay_offline(
                 if collector is not None:
                     collector.on_decision(decision)
 
-            run.log = _track_progress(run.log, show, seen)
             run.on_decision = on_decision
             if out is not None:
                 out.write(CSV_HEADER + "\n")
@@ -292,26 +333,15 @@ def replay_offline(
             from mstools.report import replay_report
             from mstools.report.findings import collect_findings
 
-            replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, seen, run.axis)
+            replayed = collector.finish(
+                log.name, run.first_utime, run.last_utime, run.rejected, channels & seen or seen, run.axis
+            )
             with _open_output(report) as out:
                 out.write(replay_report.render_page(replayed))
             if not as_json:
                 findings = replay_report.format_summary(collect_findings(replayed), report)
                 typer.echo("\n".join(findings), err=report == "-")
         _report_damage(recording)
-
-
-def _track_progress(
-    events: Iterable[LogEvent], show: Callable[[float], object], channels: set[str]
-) -> Iterator[LogEvent]:
-    """Yield events, update the progress bar, and collect their channels."""
-    updated = 0.0
-    for event in events:
-        channels.add(event.channel)
-        if (now := time.monotonic()) > updated + 0.1:
-            updated = now
-            show(event.end)
-        yield event
 
 
 @dataclass
@@ -382,19 +412,13 @@ class ReplayCounts:
         return "\n".join(lines)
 
 
-UNITS = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
-"""Units that times may be in by mistake, with the factor to microseconds."""
-
-
 def _warn_of_times(times: list[int], run: OfflineRun, path: Path | None) -> None:
     """Warn if no time lies within the log, with the unit that the times may have."""
     if any(run.first_utime <= each <= run.last_utime for each in times):
         return
     hint = f"the log lasts from {run.first_utime} to {run.last_utime}, in microseconds since 1970"
-    for unit, factor in UNITS:
-        if any(run.first_utime <= each * factor <= run.last_utime + 1e6 for each in times):
-            hint += f"; these look like {unit}"
-            break
+    if unit := guess_time_unit(times, run.first_utime, run.last_utime):
+        hint += f"; these look like {unit}"
     typer.echo(f"modelserver: {path}: none of {format_count(len(times), 'time')} lies within the log: {hint}", err=True)
 
 
@@ -422,19 +446,22 @@ def read_times(path: Path) -> list[int]:
     return times
 
 
-def _filter_channels(recording: LogFile, channels: frozenset[str]) -> Iterator[LogEvent]:
-    """Yield the events of some channels, or of all. Raises RecordingError at the end if there were none."""
-    seen: dict[str, None] = {}
-    found = not channels
-    for event in recording:
-        seen[event.channel] = None
+def _filter_channels(
+    events: Iterable[LogEvent], log: Path, channels: frozenset[str], seen: set[str] | None = None
+) -> Iterator[LogEvent]:
+    """Yield the events of some channels, or of all, and collect their channels in `seen`.
+
+    Raises RecordingError at the end if there were none.
+    """
+    seen = set() if seen is None else seen
+    for event in events:
+        seen.add(event.channel)
         if not channels or event.channel in channels:
-            found = True
             yield event
-    if not found:
+    if channels and channels.isdisjoint(seen):
         near = [name for each in sorted(channels) for name in find_nearest_names(each, seen)]
         hint = f"Nearest: {', '.join(near)}" if near else f"The log has: {_join_sorted(seen)}"
-        raise RecordingError(f"{recording.path}: no message on {_join_sorted(channels)}. {hint}")
+        raise RecordingError(f"{log}: no message on {_join_sorted(channels)}. {hint}")
 
 
 def _join_sorted(names: Iterable[str]) -> str:

@@ -17,22 +17,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
-from threading import Event
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
-from modelserver.errors import NoServerError, RecordingError, WireError, find_nearest_names, quote
+from modelserver.errors import ModelServerError, NoServerError, RecordingError, WireError, find_nearest_names, quote
+from modelserver.extras import DEBIAN_INSTALLER, make_system_command, read_installation
 from modelserver.messages import DriverHealth, Health
 from modelserver.wire.channels import BY_NAME, DEFAULT_URL, to_subscription_pattern
 from modelserver.wire.codec import decode
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
-from mstools.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
-from mstools.terminal import health_metrics
-from mstools.terminal.health_text import as_data, format_report, is_healthy
-from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
+from mstools.terminal.health import MAX_AGE_S, as_data, format_metrics, format_report, is_healthy, serve_metrics
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, argument, option
 from mstools.terminal.output import catch_signals, open_screen, replace_unencodable
 
 if TYPE_CHECKING:
@@ -60,9 +59,7 @@ HEALTH = "MODELSERVER_HEALTH"
 
 
 def command(
-    log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="Show the last report in this LCM log instead.")
-    ] = None,
+    log: Annotated[Path | None, argument("[LOG]", "Show the last report in this LCM log instead.")] = None,
     config: Annotated[
         Path | None,
         option("--config -c FILE", "The vehicle file, for its bus and prefix; with LOG: run the localization on it."),
@@ -119,7 +116,7 @@ def command(
     if metrics:
         if watch or as_json:
             raise typer.BadParameter("excludes --watch and --json", param_hint="--metrics")
-        follow_metrics(MetricsListener(open_lcm(provider), prefix), metrics)
+        follow_metrics(HealthListener(open_lcm(provider), prefix), metrics)
         return
     listener = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
@@ -148,7 +145,7 @@ def show_report(health: Health, reports: Iterable[DriverHealth], drivers: tuple[
 def show_last_report(log: Path, config: Path | None, prefix: str, as_json: bool) -> None:
     """Print the last report in a log, with a vehicle file after the localization. Raises RecordingError, OSError."""
     from modelserver.wire.eventlog import LogFile
-    from mstools.recordings.localized import open_localized
+    from mstools.commands.replay import open_localized
 
     health: Health | None = None
     drivers: dict[str, DriverHealth] = {}
@@ -214,33 +211,31 @@ def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> b
 
 
 class HealthListener(DaemonListener):
-    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's."""
+    """Receive the health reports of one daemon and its drivers, with `more` handlers; `reports` counts the daemon's.
+
+    `times` are those when the last reports were received, seconds of the monotonic clock, by channel or driver.
+    """
 
     def __init__(self, bus: lcm.LCM, prefix: str, more: Mapping[str, Callable[[Any], object]] = MappingProxyType({})):
         self.health: Health | None = None
         self.reports = 0
         self.drivers: dict[str, DriverHealth] = {}
+        self.times: dict[str, float] = {}
         super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver, **more})
 
     def _on_health(self, health: Health) -> None:
-        self.health = health
+        self.health, self.times[HEALTH] = health, time.monotonic()
         self.reports += 1
 
     def _on_driver(self, health: DriverHealth) -> None:
         if health.source in self.drivers or len(self.drivers) < MAX_NAMES:
-            self.drivers[health.source] = health
+            self.drivers[health.source], self.times[f"driver {health.source}"] = health, time.monotonic()
 
     @property
     def report(self) -> Health:
         """The last report, after one was received."""
         assert self.health is not None
         return self.health
-
-    def wait_for_report(self, seconds: float, stop: Event) -> bool:
-        """Wait up to `seconds`, or until `stop`, for another report; return whether there was one."""
-        before = self.reports
-        self.listen(seconds, lambda: stop.is_set() or self.reports > before)
-        return self.reports > before
 
     def has_drivers(self, drivers: tuple[str, ...]) -> bool:
         """Return whether all these drivers have reported; False for none, as others may exist."""
@@ -285,11 +280,14 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
 def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
     """Show each report until Ctrl-C, and warn when there is none: in place on a terminal, else one after the other."""
     is_screen = sys.stdout.isatty() and not as_json
-    last = time.monotonic()
     with catch_signals() as stop, open_screen() if is_screen else nullcontext() as live:
-        is_new = True
+        shown = 0
+
+        def is_over() -> bool:
+            return stop.is_set() or listener.reports > shown
+
         while not stop.is_set():
-            silent = time.monotonic() - last
+            silent = time.monotonic() - listener.times[HEALTH]
             reports = (listener.report, listener.drivers.values())
             text = json.dumps(as_data(*reports)) if as_json else replace_unencodable(format_report(*reports, drivers))
             if silent > SILENT_S:
@@ -298,49 +296,28 @@ def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: b
                 from rich.text import Text
 
                 live.update(Text(text, overflow="crop", no_wrap=True), refresh=True)
-            elif is_new:
+            elif listener.reports > shown:
                 typer.echo(text)
                 sys.stdout.flush()
             elif silent > SILENT_S:
                 typer.echo(f"no report for {silent:.0f} s", err=True)
-            is_new = listener.wait_for_report(1.0 if is_screen else SILENT_S, stop)
-            last = time.monotonic() if is_new else last
+            shown = listener.reports
+            listener.listen(1.0 if is_screen else SILENT_S, is_over)
 
 
 # --- metrics
 
 
-class MetricsListener(HealthListener):
-    """Receive health reports with the times when they were received, so that old ones are not taken for current."""
+def follow_metrics(listener: HealthListener, address: str) -> None:
+    """Serve the metrics of current reports until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
 
-    def __init__(self, bus: lcm.LCM, prefix: str):
-        self._times: dict[str, float] = {}
-        super().__init__(bus, prefix)
+    def render() -> str:
+        # copies: the listener changes them in another thread
+        now, times, drivers = time.monotonic(), dict(listener.times), dict(listener.drivers)
+        current = [each for name, each in drivers.items() if now - times.get(f"driver {name}", -math.inf) <= MAX_AGE_S]
+        return format_metrics(listener.health, now - times.get(HEALTH, -math.inf), current)
 
-    def _on_health(self, health: Health) -> None:
-        super()._on_health(health)
-        self._times[HEALTH] = time.monotonic()
-
-    def _on_driver(self, health: DriverHealth) -> None:
-        super()._on_driver(health)
-        self._times[f"driver {health.source}"] = time.monotonic()
-
-    def render(self) -> str:
-        """Return the metrics of the current reports."""
-        now = time.monotonic()
-        age = now - self._times.get(HEALTH, -math.inf)
-        times = dict(self._times)
-        drivers = [
-            each
-            for name, each in dict(self.drivers).items()
-            if now - times.get(f"driver {name}", -math.inf) <= health_metrics.MAX_AGE_S
-        ]
-        return health_metrics.format_metrics(self.health, age, drivers)
-
-
-def follow_metrics(listener: MetricsListener, address: str) -> None:
-    """Serve metrics until Ctrl-C. Raises ModelServerError for an address that cannot be used."""
-    server = health_metrics.serve_metrics(address, listener.render)
+    server = serve_metrics(address, render)
     host, port = server.server_address[:2]
     typer.echo(f"http://{host!s}:{port}/metrics (Ctrl-C ends it)")
     sys.stdout.flush()
@@ -368,20 +345,22 @@ def run_spy(url: str) -> NoReturn:
 
 def check_java() -> None:
     """Raise MissingToolError if lcm-spy cannot open its window."""
-    wrong = ""
     if shutil.which("java") is None:
-        wrong = "needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
-    elif not os.environ.get("DISPLAY"):
-        ways = "Over ssh use ssh -X, or modelserver status --watch"
-        wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
-    if wrong:
-        raise MissingToolError(f"lcm-spy {wrong}")
+        raise MissingToolError(
+            "lcm-spy needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
+        )
+    if not os.environ.get("DISPLAY"):
+        raise MissingToolError(
+            "lcm-spy opens a window, but there is no display (DISPLAY is empty). Over ssh use ssh -X, or modelserver "
+            "status --watch"
+        )
 
 
 def get_types_jar() -> Path:
     """Return the jar of the wire types, compiled once for each version of them."""
     files = find_type_files()
-    folder = get_cache_folder() / hash_contract(files)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "modelserver" / hash_contract(files)
     jar = folder / "mslcm.jar"
     if not jar.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -389,13 +368,7 @@ def get_types_jar() -> Path:
     return jar
 
 
-def get_cache_folder() -> Path:
-    """Return this program's folder in the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "modelserver"
-
-
 def hash_contract(files: Sequence[Path]) -> str:
-    """Return a hash of these types and of the version of lcm."""
     digest = hashlib.sha256(version("lcm").encode())
     for path in files:
         digest.update(b"\0%b\0%b" % (path.name.encode(), path.read_bytes()))
@@ -413,7 +386,8 @@ def _build_jar(files: Sequence[Path], jar: Path) -> None:
         work = Path(scratch)
         _run([find_binary("lcm-gen"), "--java", "--jpath", work / "src", *files])
         sources = sorted((work / "src").rglob("*.java"))
-        _run([compiler, "-nowarn", "-cp", find_java_library(), "-d", work / "classes", *sources])
+        java_library = _check_file(_get_site_packages() / "share" / "java" / "lcm.jar")
+        _run([compiler, "-nowarn", "-cp", java_library, "-d", work / "classes", *sources])
         finished = work / jar.name
         with zipfile.ZipFile(finished, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted((work / "classes").rglob("*.class")):
@@ -427,3 +401,45 @@ def _run(arguments: Sequence[str | Path]) -> None:
     if done.returncode:
         output = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
         raise MissingToolError(f"{Path(arguments[0]).name} failed: {output[0]}")
+
+
+class MissingToolError(ModelServerError):
+    """A program or a file that a tool needs is missing; the message is how to install it."""
+
+
+def find_binary(name: str) -> Path:
+    """Return the path of the lcm wheel's program `name`, e.g. lcm-gen. Raises MissingToolError.
+
+    It is the wheel's binary, not its `lcm-*` console script: that starts the binary as a child process and leaves it
+    running when it gets SIGTERM.
+    """
+    return _check_file(_get_site_packages() / "bin" / name)
+
+
+def find_type_files() -> tuple[Path, ...]:
+    """Return the .lcm files: of the checkout, or as installed with the package mslcm. Raises MissingToolError."""
+    spec = find_spec("mslcm")
+    if spec is None or spec.origin is None:
+        raise MissingToolError("the package mslcm is missing; reinstall modelserver")
+    package = Path(spec.origin).parent
+    for folder in (package / "lcm", package.parent):
+        files = tuple(sorted(folder.glob("*_t.lcm")))
+        if files:
+            return files
+    raise MissingToolError(f"no .lcm files beside {package}; reinstall modelserver")
+
+
+def _get_site_packages() -> Path:
+    spec = find_spec("lcm")
+    if spec is None or spec.origin is None:
+        raise MissingToolError("the package lcm is missing: pip install lcm")
+    return Path(spec.origin).resolve().parent.parent
+
+
+def _check_file(path: Path) -> Path:
+    if not path.is_file():
+        if read_installation()[0] == DEBIAN_INSTALLER:
+            fix = f"the Debian package does not have it; in a folder with the source: {make_system_command('.')}"
+            raise MissingToolError(f"{path.name} is missing: {fix}")
+        raise MissingToolError(f"{path} is missing; reinstall the wheel: pip install --force-reinstall lcm")
+    return path

@@ -8,8 +8,7 @@ import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,8 +32,6 @@ from mstools.terminal.output import (
 
 if TYPE_CHECKING:
     from modelserver.client.mirror_state import MirrorState
-
-NO_NOTES: Final[Mapping[str, str]] = MappingProxyType({})
 
 TIMEOUT_S = 11.0
 """Timeout for MODEL_SNAPSHOT, seconds; it is published every 5 s by default."""
@@ -155,7 +152,6 @@ class BodyNode:
     """
 
     body: str
-    depth: int
     is_last: tuple[bool, ...]
     crossing: Crossing | None
     frames: tuple[str, ...]
@@ -185,10 +181,11 @@ def _build_assembly(model: Model, topology: Topology, root: str, loops: dict[str
         body, last, crossing, parent = waiting.pop()
         children = below.get(body, [])
         frames, closures = tuple(model.get_body_frame_list(body)), tuple(loops.get(body, ()))
-        drawn.append(BodyNode(body, len(last), last, crossing, frames, closures, parent, bool(children)))
-        number = len(drawn) - 1
-        for place, each in reversed(list(enumerate(children))):
-            waiting.append((names.split(each.far_frame)[0], (*last, place == len(children) - 1), each, number))
+        waiting += [
+            (names.split(each.far_frame)[0], (*last, each is children[-1]), each, len(drawn))
+            for each in reversed(children)
+        ]
+        drawn.append(BodyNode(body, last, crossing, frames, closures, parent, bool(children)))
     return drawn
 
 
@@ -205,7 +202,6 @@ def _describe_loop(closing: LoopClosure, model: Model) -> str:
 
 
 def describe_joint(constraint: Constraint) -> str:
-    """Describe a constraint's joint: type, and limits in degrees and meters."""
     joint = constraint.joint
     if not joint.is_movable:
         return "fixed"
@@ -240,11 +236,9 @@ def _format_number(value: float, joint: Joint, number: int, signed: bool = False
     return text + ((" deg" if angle else " m") if unit else "")
 
 
-def describe_crossing(crossing: Crossing, notes: Mapping[str, str] = NO_NOTES) -> str:
-    """Describe the constraint between a body and its parent, with its note by its name."""
+def describe_crossing(crossing: Crossing, note: str = "") -> str:
     direction = "" if crossing.forward else ", from here"
-    constraint = crossing.constraint
-    return f"{constraint.name}: {describe_joint(constraint)}{notes.get(constraint.name, '')}{direction}"
+    return f"{crossing.constraint.name}: {describe_joint(crossing.constraint)}{note}{direction}"
 
 
 ROW, STEP, MARGIN, GAP = 24, 26, 16, 14
@@ -268,14 +262,20 @@ def draw_svg(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: 
             y += GAP
         places: list[int] = []
         for node in assembly:
-            x = MARGIN + STEP * node.depth
+            x = MARGIN + STEP * len(node.is_last)
             places.append(y)
+            color, words = FIXED, "orphan" if number else "root"
             if node.crossing is not None:
+                color = MOVING if node.crossing.constraint.joint.is_movable else FIXED
+                words = describe_crossing(node.crossing)
                 branch = f"M{x - STEP + 6} {places[node.parent] + 6}V{y}H{x - 4}"
-                parts.append(f'<path d="{branch}" fill="none" stroke="{_get_color(node)}" stroke-width="1.4"/>')
-            words = "orphan" if number else "root"
-            words = words if node.crossing is None else describe_crossing(node.crossing)
-            parts.append(_draw_body(x, y, node, words))
+                parts.append(f'<path d="{branch}" fill="none" stroke="{color}" stroke-width="1.4"/>')
+            ring, dashed = (LOOP, ' stroke-dasharray="3 2"') if node.loops else (color, "")
+            parts.append(
+                f'<circle cx="{x + 6}" cy="{y}" r="5" fill="#fff" stroke="{ring}" stroke-width="1.8"{dashed}/>'
+                f'<text x="{x + 18}" y="{y + 4}"><tspan font-weight="bold">{html.escape(node.body)}</tspan>'
+                f'<tspan dx="10" fill="{color}">{html.escape(words)}</tspan></text>'
+            )
             width = max(width, x + LETTER_WIDTH * (len(node.body) + len(words) + 4) + MARGIN)
             lines = [(each, LOOP) for each in node.loops]
             if with_frames:
@@ -298,23 +298,8 @@ def draw_svg(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: 
     return "\n".join((*head, *parts, "</svg>", ""))
 
 
-def _get_color(node: BodyNode) -> str:
-    return MOVING if node.crossing is not None and node.crossing.constraint.joint.is_movable else FIXED
-
-
-def _draw_body(x: int, y: int, node: BodyNode, words: str) -> str:
-    color = _get_color(node)
-    dashed = ' stroke-dasharray="3 2"' if node.loops else ""
-    ring = LOOP if node.loops else color
-    return (
-        f'<circle cx="{x + 6}" cy="{y}" r="5" fill="#fff" stroke="{ring}" stroke-width="1.8"{dashed}/>'
-        f'<text x="{x + 18}" y="{y + 4}"><tspan font-weight="bold">{html.escape(node.body)}</tspan>'
-        f'<tspan dx="10" fill="{color}">{html.escape(words)}</tspan></text>'
-    )
-
-
 def draw_lines(
-    assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False, notes: Mapping[str, str] = NO_NOTES
+    assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False, notes: Mapping[str, str] | None = None
 ) -> Iterator[str]:
     """Yield the lines of the drawing, with notes of constraints by name; unconnected assemblies come last."""
     for number, assembly in enumerate(assemblies):
@@ -322,18 +307,14 @@ def draw_lines(
             yield ""
             yield f"{format_count(len(assemblies) - 1, 'orphan')}, not connected to the root:"
         for node in assembly:
-            yield from _draw_node(node, with_frames, notes)
-
-
-def _draw_node(node: BodyNode, with_frames: bool, notes: Mapping[str, str]) -> Iterator[str]:
-    trunk = "".join("   " if last else "│  " for last in node.is_last[:-1])
-    elbow = ("└─ " if node.is_last[-1] else "├─ ") if node.is_last else ""
-    label = f"  ({describe_crossing(node.crossing, notes)})" if node.crossing is not None else ""
-    yield f"{trunk}{elbow}{escape(node.body)}{escape(label)}"
-    inside = trunk + (("   " if node.is_last[-1] else "│  ") if node.is_last else "")
-    inside += "│  " if node.has_children else "   "
-    for each in node.loops:
-        yield f"{inside}⟲ {escape(each)}"
-    if with_frames:
-        for frame in node.frames:
-            yield f"{inside}· {escape(frame)}"
+            levels = ["   " if last else "│  " for last in node.is_last]
+            elbows = ["└─ " if last else "├─ " for last in node.is_last[-1:]]
+            label = ""
+            if node.crossing is not None:
+                note = (notes or {}).get(node.crossing.constraint.name, "")
+                label = f"  ({describe_crossing(node.crossing, note)})"
+            yield "".join((*levels[:-1], *elbows, escape(node.body), escape(label)))
+            inside = "".join((*levels, "│  " if node.has_children else "   "))
+            yield from (f"{inside}⟲ {escape(each)}" for each in node.loops)
+            if with_frames:
+                yield from (f"{inside}· {escape(frame)}" for frame in node.frames)

@@ -32,7 +32,7 @@ from mstools.launch.processes import (
     start_devices,
     start_programs,
 )
-from mstools.terminal.health_text import describe_pose
+from mstools.terminal.health import describe_pose
 from mstools.terminal.options import UrlOption, choose_name, option
 from mstools.terminal.output import catch_signals, escape, print_problems
 

@@ -20,10 +20,11 @@ from mstools.terminal.options import (
     TimeoutOption,
     UrlOption,
     Variables,
+    argument,
     option,
     parse_variables,
 )
-from mstools.terminal.output import catch_signals, check_writable, escape, require_extra, show_progress
+from mstools.terminal.output import catch_signals, check_writable, escape, require_extra
 
 if TYPE_CHECKING:
     from mstools.view.editor import Editing
@@ -35,9 +36,7 @@ SHOWN_NOTES = 5
 
 
 def command(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A geometry file, vehicle file, or LCM log.")
-    ] = None,
+    file: Annotated[Path | None, argument("[FILE]", "A geometry file, vehicle file, or LCM log.")] = None,
     live: Annotated[bool, option("--live", "Follow the running service.")] = False,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log, in place of its own.")] = None,
     config: Annotated[
@@ -90,7 +89,7 @@ def command(
     with ExitStack() as stack:
         shown = file
         if config is not None and file is not None:
-            from mstools.recordings.localized import open_localized
+            from mstools.commands.replay import open_localized
 
             shown = stack.enter_context(open_localized(file, config))
         source = open_source(shown, model, settings, url, prefix, timeout, editing)
@@ -122,7 +121,6 @@ def has_screen() -> bool:
 
 
 def check_installed() -> None:
-    """Raise ModelServerError if the extra `view` is not installed."""
     require_extra("view", "the viewer needs viser")
 
 
@@ -131,7 +129,7 @@ def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, 
 
     Bus and prefix of the service are those given, else of the vehicle file.
     """
-    from mstools.edit.document import EditedFile, EditSession
+    from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing
 
     if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
@@ -159,9 +157,7 @@ def open_source(
         return open_live(url, prefix, timeout)
     kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
     if kind is FileKind.LOG:
-        size = file.stat().st_size
-        with show_progress(f"reading {file.name}", size) as show:
-            return open_log(file, prefix, model, lambda part: show(round(part * size)))
+        return open_log(file, prefix, model)
     if model is not None:
         raise typer.BadParameter(f"goes with a log, but {file} is none: {kind.value}", param_hint="--model")
     session = None if editing is None else editing.session

@@ -16,7 +16,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -84,17 +84,13 @@ POSITION: Final = "gps_position"
 """The kind of decisions that are about the position of a fix."""
 
 
-class FixColor(StrEnum):
-    """What became of a fix."""
+class FixColor(IntEnum):
+    """What became of a fix, by which it is colored."""
 
-    USED = "used"
-    REJECTED = "rejected"
-    MONITORED = "monitored"
-    NO_DECISION = "no decision"
-
-
-FIX_COLORS: Final = tuple(FixColor)
-_NO_DECISION: Final = FIX_COLORS.index(FixColor.NO_DECISION)
+    USED = 0
+    REJECTED = 1
+    MONITORED = 2
+    NO_DECISION = 3
 
 
 class EventKind(StrEnum):
@@ -135,7 +131,6 @@ class Table:
 
     @property
     def utimes(self) -> npt.NDArray[np.int64]:
-        """The times (n,), microseconds."""
         return self._utimes[: self.count]
 
     @property
@@ -188,15 +183,14 @@ class ChannelCount:
     rate: float = math.nan
     _first: int = 0
     _since: int = 0
-    _counted: int = 0
+    _counted: int = 1
 
     def add(self, now: int) -> None:
+        if not self.count:
+            self._first = self._since = now
         self.count += 1
         self.last = now
-        self._first = self._first or now
-        if not self._since:
-            self._since, self._counted = now, self.count
-        elif now - self._since >= 1_000_000:
+        if now - self._since >= 1_000_000:
             self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
             self._since, self._counted = now, self.count
 
@@ -210,15 +204,13 @@ class ChannelCount:
 class Picture(NamedTuple):
     """The vehicle at `utime`: pose of the base frame in World:UTM, None where it is unknown, and what is known of it.
 
-    `covariance` is that of the position (3, 3), m2, and `heading_sigma` in radians, nan where unknown; `joints` gives
-    the position of each coordinate that was received.
+    `covariance` is that of the position (3, 3), m2; `joints` gives the position of each coordinate that was received.
     """
 
     utime: int
     pose: Pose | None = None
     invalid: Invalid = VALID
     covariance: Array | None = None
-    heading_sigma: float = math.nan
     horizontal_protection_level: float = math.nan
     heading_protection_level: float = math.nan
     joints: Mapping[str, float] = {}
@@ -226,8 +218,8 @@ class Picture(NamedTuple):
 
 # columns of the table of poses
 _POSITION, _QUATERNION, _COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 13)
-_HEADING_SIGMA, _HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 18)
-_POSE_COLUMNS: Final = 18
+_HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 17)
+_POSE_COLUMNS: Final = 17
 _UPPER: Final = np.triu_indices(3)
 MAX_INTERPOLATION_US: Final = 1_000_000
 """Longest time between two poses that is interpolated."""
@@ -347,20 +339,17 @@ class Drive:
             *found.pose.xyz,
             *found.pose.wxyz,
             *upper,
-            math.nan if covariance is None else math.sqrt(max(covariance[5, 5], 0.0)),
             answer.horizontal_protection_level,
             answer.heading_protection_level,
             found.invalid_reasons,
             found.pose_epoch,
         )
-        self._add_validity_events(stamp, Invalid(found.invalid_reasons), found.pose_epoch)
-
-    def _add_validity_events(self, utime: int, invalid: Invalid, epoch: int) -> None:
+        invalid, epoch = Invalid(found.invalid_reasons), found.pose_epoch
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
-            self._add_event(utime, kind, invalid.explain() if invalid else "the pose is valid")
+            self._add_event(stamp, kind, invalid.explain() if invalid else "the pose is valid")
         if self._epoch >= 0 and epoch != self._epoch:
-            self._add_event(utime, EventKind.RESET, f"the position was reset: epoch {epoch}")
+            self._add_event(stamp, EventKind.RESET, f"the position was reset: epoch {epoch}")
         self._invalid, self._epoch = invalid, epoch
 
     def _process_joints(self, name: str, stamp: int, data: bytes) -> None:
@@ -376,7 +365,6 @@ class Drive:
                 self.set_joint(joint.name, sample.header.utime, joint.position)
 
     def set_joint(self, name: str, utime: int, position: float) -> None:
-        """Set a coordinate, radians or meters."""
         self.joints.setdefault(name, Table(1)).append(utime, position)
 
     def _process_gps(self, sample: GpsSample) -> None:
@@ -396,7 +384,7 @@ class Drive:
             return
         geodesy = geodesy_of(self.origin)
         position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
-        self._fixes.setdefault(source, Table(4)).append(utime, *position, _NO_DECISION)
+        self._fixes.setdefault(source, Table(4)).append(utime, *position, FixColor.NO_DECISION)
 
     def _process_decisions(self, name: str, stamp: int, data: bytes) -> None:
         for decision in decode("decisions_t", data).decisions:
@@ -405,14 +393,12 @@ class Drive:
     def _process_decision(self, decision: Decision) -> None:
         if not 0 < decision.utime < MAX_STAMP:
             raise WireError("malformed", f"{decision.utime} is no stamp")
-        table = self._fixes.get(decision.source)
+        table, is_reset = self._fixes.get(decision.source), decision.verdict is Verdict.RESET
         if decision.kind == POSITION and table is not None:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
-                is_used = decision.verdict is Verdict.RESET
-                table.rows[row, 3] = FIX_COLORS.index(FixColor.USED if is_used else FixColor[decision.verdict.name])
-        if decision.verdict in (Verdict.REJECTED, Verdict.RESET):
-            is_reset = decision.verdict is Verdict.RESET
+                table.rows[row, 3] = FixColor.USED if is_reset else FixColor[decision.verdict.name]
+        if is_reset or decision.verdict is Verdict.REJECTED:
             verb = "reset by" if is_reset else "rejected"
             reason = f": {decision.reason}" if decision.reason else ""
             kind = EventKind.RESET if is_reset else EventKind.REJECTION
@@ -434,7 +420,6 @@ class Drive:
             del stored[1::2]
 
     def _add_mode_event(self, utime: int, data: bytes) -> None:
-        """Add an event for a change of the mode, which is the first field after the stamp."""
         try:
             mode = Mode(int.from_bytes(data[16:17], "big", signed=True))
         except ValueError:
@@ -488,7 +473,7 @@ class Drive:
         return f"{since}; is it running (modelserver run -c vehicle.yaml), on this bus and with this channel prefix?"
 
     def get_fixes(self, utime: int) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the positions in World:UTM (n, 3) of the fixes until a time, and indexes into `FIX_COLORS` (n,)."""
+        """Return the positions in World:UTM (n, 3) of the fixes until a time, and their `FixColor` (n,)."""
         rows = [table.rows[: table.find(utime) + 1] for table in self._fixes.values()]
         found = np.concatenate([np.zeros((0, 4)), *rows])
         return found[:, :3], found[:, 3].astype(np.int64)
@@ -522,11 +507,10 @@ class Drive:
             covariance = np.zeros((3, 3))
             covariance[_UPPER] = row[_COVARIANCE]
             covariance = covariance + np.triu(covariance, 1).T
-        levels = float(row[_HEADING_SIGMA]), float(row[_HORIZONTAL]), float(row[_HEADING])
+        levels = float(row[_HORIZONTAL]), float(row[_HEADING])
         return Picture(utime, pose, Invalid(int(row[_INVALID])), covariance, *levels, joints)
 
     def get_joints(self, utime: int) -> dict[str, float]:
-        """Return the last position of each coordinate at or before a time."""
         found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
         return {name: float(table.rows[row, 0]) for name, (table, row) in found.items() if row >= 0}
 
@@ -611,13 +595,11 @@ class FramePoses:
         }
 
     def move_joints(self, joints: Mapping[str, float]) -> dict[str, Pose]:
-        """Set the coordinates that were received, and return the poses of the bodies that moved."""
         known, self._joints = self._joints, dict(joints)
         moved = {name for name in known.keys() | joints.keys() if known.get(name) != joints.get(name)}
         return self.compute_bodies(moved) if moved else {}
 
     def compute_frames(self, bodies: Mapping[str, Pose]) -> dict[str, Pose]:
-        """Return the poses of the frames of bodies by full name."""
         return {frame.full_name: pose @ frame.pose for name, pose in bodies.items() for frame in self.model.body(name)}
 
     def _get_position(self, joint: str) -> Coordinates:

@@ -18,7 +18,6 @@ base_link:Origin.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,7 +61,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Shape, ShapeKind
 from modelserver.messages import FixType, GpsSample, Health, PoseAnswer
 from modelserver.transforms.pose import Pose
-from modelserver.wire.codec import decode, fingerprint_of, get_type_names
+from modelserver.wire.codec import decode, fingerprint_of, type_name_of
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, FramePoses
 
 FIX_PERIOD_US: Final = 200_000
@@ -72,25 +71,15 @@ STATIC_PERIOD_US: Final = 5_000_000
 BODY_COLOR: Final = (0.42, 0.55, 0.69, 1.0)
 MAX_SOURCES: Final = 100
 
-_LEVELS: Final[Mapping[EventKind, LogLevel]] = {
-    EventKind.INVALID: LogLevel.Warning,
-    EventKind.REJECTION: LogLevel.Warning,
-    EventKind.RESET: LogLevel.Warning,
-}
-_TYPE_OF: Final = {fingerprint_of(name): name for name in get_type_names()}
+_WARNINGS: Final = (EventKind.INVALID, EventKind.REJECTION, EventKind.RESET)
 _OK, _WARN, _ERROR, _STALE = range(4)
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
 
 def _make_schema(**fields: object) -> dict[str, object]:
-    """Return the JSON schema of an object; a list is an array of its item, a text the name of a plain type."""
-
-    def convert(field: object) -> object:
-        if isinstance(field, list):
-            return {"type": "array", "items": convert(field[0])}
-        return {"type": field} if isinstance(field, str) else field
-
-    return {"type": "object", "properties": {name: convert(field) for name, field in fields.items()}}
+    """Return the JSON schema of an object; a text is the name of a plain type."""
+    properties = {name: {"type": field} if isinstance(field, str) else field for name, field in fields.items()}
+    return {"type": "object", "properties": properties}
 
 
 _STATUS: Final = _make_schema(
@@ -98,20 +87,12 @@ _STATUS: Final = _make_schema(
     name="string",
     message="string",
     hardware_id="string",
-    values=[_make_schema(key="string", value="string")],
+    values={"type": "array", "items": _make_schema(key="string", value="string")},
 )
 DIAGNOSTICS_SCHEMA: Final = {"title": "diagnostic_msgs/DiagnosticArray"} | _make_schema(
-    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"), status=[_STATUS]
+    header=_make_schema(stamp=_make_schema(sec="integer", nsec="integer"), frame_id="string"),
+    status={"type": "array", "items": _STATUS},
 )
-
-
-def find_definitions() -> Path:
-    """Return the folder of the .lcm files: in the installed package, or in the source tree beside it."""
-    spec = importlib.util.find_spec("mslcm")
-    assert spec is not None
-    assert spec.origin is not None
-    folder = Path(spec.origin).parent
-    return folder / "lcm" if (folder / "lcm").is_dir() else folder.parent
 
 
 class FoxgloveWriter:
@@ -254,7 +235,7 @@ class FoxgloveWriter:
         self._diagnostics.log({"header": header, "status": status}, log_time=now * 1000)
 
     def _log_event(self, event: DriveEvent) -> None:
-        level = _LEVELS.get(event.kind, LogLevel.Info)
+        level = LogLevel.Warning if event.kind in _WARNINGS else LogLevel.Info
         message = Log(timestamp=_stamp(event.utime), level=level, message=event.text, name=event.kind)
         self._log.log(message, log_time=self._now * 1000)
 
@@ -262,7 +243,7 @@ class FoxgloveWriter:
         if channel not in self._raw:
             if len(self._raw) >= MAX_SOURCES:
                 return
-            name = _TYPE_OF.get(data[:8], "")
+            name = type_name_of(data)
             text = (definitions / f"{name}.lcm").read_bytes() if name else b""
             schema = Schema(name=f"mslcm.{name or 'unknown'}", encoding="lcm", data=text)
             self._raw[channel] = Channel(

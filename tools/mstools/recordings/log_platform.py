@@ -21,6 +21,7 @@ from modelserver.query.view import PlatformView
 from modelserver.wire.codec import SnapshotAssembler, decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.recordings.drive import read_stamp
+from mstools.terminal.output import guess_time_unit
 
 CORRECTION_WINDOW_US: Final = 2_000_000
 """Time after an instant in which delayed samples may still change its pose."""
@@ -33,9 +34,6 @@ OFFSET_PERIOD_US: Final = 5_000_000
 
 OFFSET_MARGIN_US: Final = 20_000_000
 """Time before a query's history from which a log is read: JOINTS_HELD and the geometry come every 5 s by default."""
-
-TIME_UNITS: Final = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
-"""Units in which a time may be given by mistake, with the factor to microseconds."""
 
 
 class LogContents(NamedTuple):
@@ -75,17 +73,13 @@ class LogPlatform(LocalPlatform):
             base = contents.base_frame or names.join(model.root.name, model.root.frames[0].name)
             self._given = ModelSnapshot("", model, base, base, HISTORY_S, f"{prefix}JOINTS")
         elif contents.snapshot is None:
-            raise RecordingError(self._no_geometry())
+            raise RecordingError(
+                f"{path}: no complete geometry on {prefix}MODEL_SNAPSHOT ({contents.parts or 'none'}), which queries "
+                "need. The service publishes it since version 0.1.0, at its start and every few seconds: record all "
+                "its channels for some seconds (modelserver record FILE); for a channel prefix use --prefix. Or give "
+                "the geometry with --model FILE"
+            )
         self._read: tuple[MirrorState, int] = (MirrorState(), 0)
-
-    def _no_geometry(self) -> str:
-        channel = f"{self._prefix}MODEL_SNAPSHOT"
-        found = f"only {self._contents.parts}" if self._contents.parts else "none"
-        return (
-            f"{self._path}: no complete geometry on {channel} ({found}), which queries need. The service publishes it "
-            "since version 0.1.0, at its start and every few seconds: record all its channels for some seconds "
-            "(modelserver record FILE); for a channel prefix use --prefix. Or give the geometry with --model FILE"
-        )
 
     @property
     def revision(self) -> str:
@@ -128,7 +122,8 @@ class LogPlatform(LocalPlatform):
         oldest = (at or end) - history_us
         now = 0
         with LogFile(self._path) as log:
-            for event in log.read_from(self._find_start(oldest)):
+            earlier = [offset for stamp, offset in self._contents.offsets if stamp < oldest - OFFSET_MARGIN_US]
+            for event in log.read_from(earlier[-1] if earlier else 0):
                 if event.channel not in channels:
                     continue
                 stamp = read_stamp(event.data)
@@ -136,10 +131,10 @@ class LogPlatform(LocalPlatform):
                     continue
                 if at and policy is Policy.LATEST and stamp > at:
                     continue
-                if at and stamp > at and self._is_of_other_geometry(event, knowledge.state):
-                    break
-                if at and stamp > at and self._is_complete(knowledge.state, at, ends, history_us):
-                    break
+                if at and stamp > at:
+                    known = knowledge.state
+                    if self._is_of_other_geometry(event, known) or self._is_complete(known, at, ends, history_us):
+                        break
                 now = event.utime
                 knowledge.feed(event.channel, event.data, now)
                 channels.update(knowledge.channels)
@@ -160,11 +155,6 @@ class LogPlatform(LocalPlatform):
             pass
         return False
 
-    def _find_start(self, oldest: int) -> int:
-        """Return the offset in the file from which poses from `oldest` on are read."""
-        earlier = [offset for stamp, offset in self._contents.offsets if stamp < oldest - OFFSET_MARGIN_US]
-        return earlier[-1] if earlier else 0
-
     def _is_complete(self, known: MirrorState, at: int, ends: Sequence[str], history_us: int) -> bool:
         """Return whether later messages cannot change the result at a time."""
         view = known.view
@@ -184,10 +174,8 @@ class LogPlatform(LocalPlatform):
             f"{at} is {away} the log {self._path}, which extends from {begin} to {end}, in microseconds since 1970 "
             f"({(end - begin) * 1e-6:.1f} s)"
         )
-        for unit, factor in TIME_UNITS:
-            if begin <= at * factor <= end + MAX_OUTSIDE_US:
-                return f"{text}; this looks like {unit}"
-        return f"{text}; +SECONDS counts from its start"
+        unit = guess_time_unit([at], begin, end)
+        return f"{text}; this looks like {unit}" if unit else f"{text}; +SECONDS counts from its start"
 
 
 def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -> LogContents:
@@ -218,7 +206,7 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 part: SnapshotPart = decode("model_snapshot_t", event.data)
                 received.add((part.model_revision, part.part))
                 count = sum(revision == part.model_revision for revision, _ in received)
-                parts = f"{count} of {part.parts} parts of revision {part.model_revision}"
+                parts = f"only {count} of {part.parts} parts of revision {part.model_revision}"
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
             else:

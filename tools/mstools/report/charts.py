@@ -19,10 +19,12 @@ from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from modelserver.errors import ModelServerError
-from modelserver.extras import make_install_command
 from modelserver.transforms.so3 import Array
+from mstools.terminal.output import require_extra
+
+NEEDS_PLOTLY = "reports need plotly"
 
 WIDTH = 1060
 """Width of a chart in pixels for which its height is chosen; it follows the page's."""
@@ -113,7 +115,6 @@ def value_range(values: Iterable[float], share: float = 1.0, min_width: float = 
 
 
 def level(name: str, x: Axis, y: float, color: str = GRAY) -> Series:
-    """Return a dashed horizontal line."""
     return Series(name, (x.low, x.high), (y, y), color, shape="dashes")
 
 
@@ -145,7 +146,6 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
-    """Return rows with intervals."""
     traces: list[dict[str, Any]] = [
         {
             "type": "bar",
@@ -241,8 +241,7 @@ def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
         name["hoverinfo"] = "skip" if series.shape == "band" else "y"
     points = np.column_stack([np.asarray(series.x, float), np.asarray(series.y, float)])
     if series.shape == "dots":
-        chosen = _select_dots(points, x, y)
-        points = points[chosen]
+        points = points[_select_dots(points, x, y)]
         points[:, 1] = np.clip(points[:, 1], y.low, y.high)
         style: dict[str, Any] = {"mode": "markers", "marker": {"color": series.color, "size": series.width + 1.0}}
         return [_make_trace(points) | name | style]
@@ -257,13 +256,14 @@ def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
         ]
     line = {"color": series.color, "width": series.width, "dash": "dash" if series.shape == "dashes" else "solid"}
     if series.times:
-        # a track goes to and fro: no column of it can be decimated
         # a point that interrupts a line has no time
         times = [None if math.isnan(each) else round(each, 2) for each in series.times]
         hover = "%{customdata} s<br>%{x:.2f}, %{y:.2f} m<extra>%{fullData.name}</extra>"
         name |= {"customdata": times, "hovertemplate": hover}
-        return [_make_trace(points) | name | {"mode": "lines", "line": line}]
-    return [_make_trace(_decimate(points, x)) | name | {"mode": "lines", "line": line}]
+    else:
+        # a track goes to and fro: no column of it can be decimated
+        points = _decimate(points, x)
+    return [_make_trace(points) | name | {"mode": "lines", "line": line}]
 
 
 def _make_trace(points: Array) -> dict[str, Any]:
@@ -281,14 +281,13 @@ def _to_text(words: str) -> str:
     return html.escape(words, quote=False)
 
 
-def _select_dots(points: Array, x: Axis, y: Axis) -> list[int]:
+def _select_dots(points: Array, x: Axis, y: Axis) -> npt.NDArray[np.intp]:
     """Return the numbers of the finite points, one of each cell of the panel."""
     rows = np.clip(y.fraction(points[:, 1]), 0.0, 1.0) * ROWS
     cells = np.round(np.column_stack([x.fraction(points[:, 0]) * COLUMNS, rows]))
     finite = np.flatnonzero(np.isfinite(cells).all(axis=1) & np.isfinite(points[:, 1]))
     _, first = np.unique(cells[finite], axis=0, return_index=True)
-    chosen: list[int] = finite[np.sort(first)].tolist()
-    return chosen
+    return finite[np.sort(first)]
 
 
 def _decimate(points: Array, x: Axis) -> Array:
@@ -321,19 +320,6 @@ def _render_figure(
 # --- page ---------------------------------------------------------------------------------------------------
 
 
-def check_installed() -> None:
-    """Raise ModelServerError if the extra `report` is not installed."""
-    _find_library()
-
-
-def _find_library() -> Any:
-    try:
-        return files("plotly") / "package_data" / "plotly.min.js"
-    except ModuleNotFoundError:
-        text = f"reports need plotly, which is not installed: {make_install_command('report')}"
-        raise ModelServerError(text) from None
-
-
 def render_text_page(title: str, lines: Sequence[str], figures: Sequence[str]) -> str:
     """Return an HTML page with lines of text above charts. Raises as `render_page`."""
     text = html.escape("\n".join(lines))
@@ -343,7 +329,9 @@ def render_text_page(title: str, lines: Sequence[str], figures: Sequence[str]) -
 
 def render_page(title: str, body: str) -> str:
     """Return an HTML page; `title` is text, `body` HTML. Raises ModelServerError without the extra `report`."""
-    library = base64.b64encode(gzip.compress(_find_library().read_bytes(), 9, mtime=0)).decode()
+    require_extra("report", NEEDS_PLOTLY)
+    script = (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
+    library = base64.b64encode(gzip.compress(script, 9, mtime=0)).decode()
     own = files("mstools.report")
     return f"""<!DOCTYPE html>
 <html lang="en">

@@ -168,7 +168,6 @@ class SensorMotion:
         return DistanceComparison(rolled, fixed)
 
     def _mean_speed(self) -> dict[int, float]:
-        """Return the mean magnitude of the wheels' speeds."""
         means = SecondMeans()
         for speeds in self.wheels.values():
             for second, value in speeds.items():
@@ -337,7 +336,6 @@ class StateSample:
     yaw_rate: float = math.nan
     velocity: tuple[float, float] | None = None
     is_stationary: bool = False
-    mode: Mode | None = None
     phase: Phase | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     sigmas: Mapping[str, float] = field(default_factory=dict)
@@ -435,7 +433,6 @@ class ReplayData:
         return next((len(each.times) for each in self.sensors if each.name == source), 0)
 
     def to_seconds(self, utime: int) -> float:
-        """Return a utime as seconds from the log's first event."""
         return (utime - self.first_utime) * 1e-6
 
 
@@ -443,7 +440,6 @@ class ReplayCollector:
     """Collects `ReplayData`: pass `on_sample` and `on_decision` to the offline run, then call `finish`."""
 
     def __init__(self, vehicle: Vehicle):
-        """Start for a vehicle, which must have localization."""
         assert vehicle.rig is not None
         self._vehicle = vehicle
         self._rig = vehicle.rig
@@ -564,7 +560,6 @@ class ReplayCollector:
                 "yaw_rate": state.angular_velocity[2],
                 "velocity": so3.rotate(state.pose.wxyz, state.linear_velocity)[:2],
                 "is_stationary": state.stationary,
-                "mode": state.mode,
                 "phase": state.phase,
                 "values": dict(zip(state.names, state.values, strict=True)),
                 "sigmas": dict(zip(state.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True)),

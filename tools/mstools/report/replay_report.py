@@ -128,7 +128,6 @@ def _render_key_figures(data: ReplayData) -> str:
 
 
 def _valid_share(data: ReplayData) -> float:
-    """Return the share of the recorded time in which the state was valid."""
     held = [min(b.t - a.t, HOLD_S) for a, b in pairwise(data.snapshots) if not a.invalid and b.t > a.t]
     return min(sum(held) / data.duration, 1.0) if data.duration > 0.0 else 0.0
 

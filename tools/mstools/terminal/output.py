@@ -9,7 +9,8 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from pathlib import Path
@@ -33,6 +34,8 @@ from modelserver.geometry.model import Model
 
 if TYPE_CHECKING:
     from rich.live import Live
+
+    from modelserver.wire.eventlog import LogEvent, LogFile
 
 
 def escape(text: str) -> str:
@@ -67,7 +70,6 @@ def format_count(count: int, one: str, several: str = "") -> str:
 
 
 def describe_size(model: Model) -> str:
-    """Return the numbers of bodies, frames and constraints."""
     frames = sum(len(body.frames) for body in model.bodies)
     bodies, constraints = len(model.bodies), len(model.constraints)
     counts = format_count(bodies, "body", "bodies"), format_count(frames, "frame")
@@ -184,11 +186,14 @@ def require_extra(extra: str, what: str) -> None:
 def write_beside(path: Path) -> Iterator[Path]:
     """Give the path of a draft beside a file, for a library that writes files by itself.
 
-    The draft becomes the file at the end of the block; what is interrupted leaves no half file under that name.
+    The draft becomes the file at the end of the block; what is interrupted, also by a power failure, leaves no half
+    file under that name.
     """
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         draft = Path(folder) / path.name
         yield draft
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())
         draft.replace(path)
 
 
@@ -238,7 +243,6 @@ class ProblemCollector:
         self._errors: list[Problem] = []
 
     def add(self, what: str, why: str, fix: str = "") -> None:
-        """Add an error of a file or an option."""
         self._errors.append(Problem(Severity.ERROR, why, Location(what), fix))
 
     @contextmanager
@@ -260,8 +264,20 @@ class ProblemCollector:
 
 
 def make_error(why: str, place: str | Location, fix: str) -> ConfigError:
-    """Return the error of a file or an option with one problem."""
     return ConfigError([Problem(Severity.ERROR, why, place if isinstance(place, Location) else Location(place), fix)])
+
+
+def suggest_name(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return `did you mean NAME?` with the nearest known name, `otherwise` where none is near."""
+    near = find_nearest_names(name, known)
+    return f"did you mean {near[0]}?" if near else otherwise
+
+
+def guess_time_unit(times: Iterable[int], begin: int, end: int) -> str:
+    """Return the unit in which one of these times would lie between two utimes, empty for none."""
+    units = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
+    times = list(times)
+    return next((name for name, factor in units if any(begin <= each * factor <= end + 1e6 for each in times)), "")
 
 
 def find_nearest_path(path: str | Path) -> str:
@@ -294,6 +310,27 @@ def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Generator[LogEvent, None, None]]]:
+    """Open a log; give it with its events, and show how much of them is read, at most ten times a second.
+
+    The progress bar, which redirects standard output, lasts from the first event until they are read, or closed.
+    """
+    from modelserver.wire.eventlog import LogFile
+
+    def track() -> Generator[LogEvent, None, None]:
+        with show_progress(f"{label} {path.name}", log.size) as show:
+            updated = 0.0
+            for event in log:
+                if (now := time.monotonic()) > updated + 0.1:
+                    updated = now
+                    show(event.end)
+                yield event
+
+    with LogFile(path) as log, contextlib.closing(track()) as events:
+        yield log, events
 
 
 def open_screen() -> Live:

@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +24,7 @@ from modelserver.formats.common import format_number, parse_number
 from modelserver.geometry import names
 from modelserver.geometry.joint import TYPES_WITH_AXIS, Joint, JointType, Mimic
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.placement import (
     DistanceFit,
     Placement,
@@ -39,8 +38,7 @@ from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit.document import SAME_RADIANS, EditSession, GeometryDocument, GeometryItem, ItemKind
-from mstools.edit.yaml_text import EditError
+from mstools.edit import SAME_RADIANS, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.terminal.output import format_count
 from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
@@ -136,7 +134,7 @@ class Editor:
         self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
-            self._snap: Any = gui.add_dropdown("Snap", tuple(Snap), initial_value=Snap.NONE)
+            self._snap: Any = gui.add_dropdown("Snap", tuple(SNAPS), initial_value="none")
             actions.on_update(self._gizmo, self.show_gizmo)
         with gui.add_folder("Add, copy, delete", expand_by_default=False):
             self._new: Any = gui.add_text("New name", "")
@@ -284,29 +282,22 @@ class Editor:
         return True
 
     def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change of what is selected; return whether it could be made."""
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
-        name = self._new.value.strip()
-        item = self._item
-        frames = list_frames(self._session.document)
-        if kind is ItemKind.BODY:
-            self._change(f"add {name}", lambda document: document.add_body(name), GeometryItem(kind, name))
-        elif kind is ItemKind.FRAME:
-            body = item.name.partition(":")[0] if item.kind is not ItemKind.CONSTRAINT else frames[0].partition(":")[0]
-            new = GeometryItem(kind, names.join(body, name))
-            self._change(f"add {new.name}", lambda document: document.add_frame(body, name), new)
-        else:
+        name, item, frames = self._new.value.strip(), self._item, list_frames(self._session.document)
+        body = (frames[0] if item.kind is ItemKind.CONSTRAINT else item.name).partition(":")[0]
+        new, change = name, lambda document: document.add_body(name)
+        if kind is ItemKind.FRAME:
+            new, change = names.join(body, name), lambda document: document.add_frame(body, name)
+        elif kind is ItemKind.CONSTRAINT:
             from_ = item.name if item.kind is ItemKind.FRAME else frames[0]
             others = [each for each in frames if each.partition(":")[0] != from_.partition(":")[0]]
             if not others:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
-            to = others[-1]
-            self._change(
-                f"add {name}", lambda document: document.add_constraint(name, from_, to), GeometryItem(kind, name)
-            )
+            change = lambda document: document.add_constraint(name, from_, others[-1])  # noqa: E731
+        self._change(f"add {new}", change, GeometryItem(kind, new))
 
     def _duplicate(self) -> None:
         item = self._item
@@ -337,7 +328,7 @@ class Editor:
 
     def _drag(self, pose: Pose, is_end: bool) -> None:
         """Follow the gizmo: the fields while it moves, a change when it is released. Called in the page's thread."""
-        self._actions.put(lambda: self._fields.set_dragged(pose, Snap(self._snap.value), is_end))
+        self._actions.put(lambda: self._fields.set_dragged(pose, SNAPS[self._snap.value], is_end))
 
     # --- saving and applying
 
@@ -416,7 +407,6 @@ def _describe_problem(problem: Problem) -> str:
 
 
 def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
-    """Return a name for a copy of an item: its own with the first free number."""
     taken = {each.name for each in document.list_items() if each.kind is item.kind}
     plain = item.name.rpartition(":")[2]
     numbers = (f"{plain}{number}" for number in range(2, len(taken) + 3))
@@ -491,18 +481,13 @@ class NumberFields:
         self._problem.content = problem
 
 
-class Snap(StrEnum):
-    """Steps to which the gizmo rounds."""
-
-    NONE = "none"
-    FINE = "1 mm, 1 deg"
-    MEDIUM = "1 cm, 5 deg"
-    COARSE = "5 cm, 15 deg"
-
-    @property
-    def steps(self) -> tuple[float, float]:
-        """Meters and degrees; without snap what a hand can place."""
-        return {Snap.NONE: (1e-4, 0.01), Snap.FINE: (1e-3, 1.0), Snap.MEDIUM: (0.01, 5.0)}.get(self, (0.05, 15.0))
+SNAPS: Final = {
+    "none": (1e-4, 0.01),
+    "1 mm, 1 deg": (1e-3, 1.0),
+    "1 cm, 5 deg": (0.01, 5.0),
+    "5 cm, 15 deg": (0.05, 15.0),
+}
+"""Steps to which the gizmo rounds, meters and degrees; without snap what a hand can place."""
 
 
 def list_frames(document: GeometryDocument) -> list[str]:
@@ -565,20 +550,19 @@ class ItemFields:
             users = ", ".join(document.list_users(template))
             hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
             self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
-        if isinstance(self._part, Constraint):
-            self._add_ends(self._part)
+        part: BodyFrame | Constraint | Body | None = self._part
+        if isinstance(part, Constraint):
+            frames = tuple(list_frames(document))
+            for key, frame in (("from", part.from_), ("to", part.to)):
+                shown = frame if frame in frames else frames[0]
+                self._add(key, self._gui.add_dropdown(key, frames, initial_value=shown))
         if self._part is not None:
             self._add_pose(self._part.pose, self._part.sigma)
-        if isinstance(self._part, Constraint):
-            self._add_joint(self._part.joint)
-        self._add("description", self._gui.add_text("Description", self._get_description(item)))
+        if isinstance(part, Constraint):
+            self._add_joint(part.joint)
+        part = part or next((each for each in self._session.drawn.bodies if each.name == item.name), None)
+        self._add("description", self._gui.add_text("Description", part.description if part is not None else ""))
         self._actions.add_button(self._gui, "Set", self.set)
-
-    def _get_description(self, item: GeometryItem) -> str:
-        if self._part is not None:
-            return self._part.description
-        bodies = {each.name: each for each in self._session.drawn.bodies}
-        return bodies[item.name].description if item.name in bodies else ""
 
     def _add(self, key: str, field: Any) -> None:
         self._fields[key], self._given[key] = field, field.value
@@ -597,11 +581,6 @@ class ItemFields:
         turns = np.degrees(known.rotation).tolist()
         self._add_vector("sigma_xyz", [f"sigma {axis} (m)" for axis in "xyz"], known.position)
         self._add_vector("sigma_rpy", [f"sigma {axis} (deg)" for axis in ("roll", "pitch", "yaw")], turns)
-
-    def _add_ends(self, constraint: Constraint) -> None:
-        frames = tuple(list_frames(self._session.document))
-        for key, frame in (("from", constraint.from_), ("to", constraint.to)):
-            self._add(key, self._gui.add_dropdown(key, frames, initial_value=frame if frame in frames else frames[0]))
 
     def _add_joint(self, joint: Joint) -> None:
         gui = self._gui
@@ -638,7 +617,6 @@ class ItemFields:
 
     @property
     def in_template(self) -> bool:
-        """Whether all bodies of the template are to change."""
         return "template" in self._fields and bool(self._fields["template"].value)
 
     # --- what is set
@@ -754,11 +732,11 @@ class ItemFields:
             return names.split(self._item.name)[0], Pose.identity(), part.pose
         return names.split(part.from_)[0], model.frame(part.from_).pose, part.pose
 
-    def set_dragged(self, pose: Pose, snap: Snap, is_end: bool) -> None:
+    def set_dragged(self, pose: Pose, steps: tuple[float, float], is_end: bool) -> None:
         """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
         if self._part is None:
             return
-        meters, degrees = snap.steps
+        meters, degrees = steps
         moved, turned = self._part.pose.distance(pose)
         if moved > SAME:
             self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])

@@ -120,7 +120,6 @@ def escape_markdown(text: str) -> str:
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown; the cells are texts."""
     lines = [header, ["---"] * len(header), *[[escape_markdown(cell) for cell in row] for row in rows]]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
@@ -166,7 +165,6 @@ def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool 
 
 
 def _bind(address: str, port: int) -> socket.socket:
-    """Return a socket bound to an address. Raises ViewError where it is in use."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     bound = socket.socket(family, socket.SOCK_STREAM)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

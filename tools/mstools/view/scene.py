@@ -31,7 +31,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.recordings.drive import FIX_COLORS, FixColor, FramePoses, Picture
+from mstools.recordings.drive import FramePoses, Picture
 
 MAX_MESH_BYTES: Final = 50_000_000
 MAX_TRAIL_POINTS: Final = 4_000
@@ -51,13 +51,8 @@ PATH_COLOR: Final[Rgb] = (230, 60, 160)
 TRAIL_COLOR: Final[Rgb] = (70, 150, 250)
 VALID_COLOR: Final[Rgb] = (60, 180, 90)
 INVALID_COLOR: Final[Rgb] = (225, 70, 60)
-COLOR_OF_FIX: Final[Mapping[FixColor, Rgb]] = {
-    FixColor.USED: (60, 180, 90),
-    FixColor.REJECTED: (225, 70, 60),
-    FixColor.MONITORED: (240, 190, 60),
-    FixColor.NO_DECISION: (150, 150, 150),
-}
-_PALETTE: Final = np.array([COLOR_OF_FIX[each] for each in FIX_COLORS], np.uint8)
+FIX_COLORS: Final = np.array([VALID_COLOR, INVALID_COLOR, (240, 190, 60), FIXED_COLOR], np.uint8)
+"""By `FixColor`."""
 
 CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
 """Quantiles of chi-square with three degrees of freedom by confidence in percent (NIST e-Handbook, 1.3.6.7.4)."""
@@ -130,7 +125,8 @@ class VehicleScene:
         # placed by their positions: a browser moves nodes at once, but draws other lines some pictures later
         self._level = self._scene.add_frame("/world/protection_level", show_axes=False, visible=False)
         self._circle = self._add_lines("/world/protection_level/position", VALID_COLOR, 2.0)
-        self._circle.points = _make_circle()
+        angles = np.linspace(0.0, 2.0 * math.pi, 65)
+        self._draw_line(self._circle, np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1))
         self._wedge = [self._add_lines(f"/world/protection_level/heading/{n}", VALID_COLOR, 2.0) for n in range(2)]
         for side in self._wedge:
             side.points = np.array([[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]], np.float32)
@@ -168,7 +164,8 @@ class VehicleScene:
         self._gizmo = None
         self._bodies, self._poses, self._labels, self.unread = {}, {}, [], []
         self._frames = FramePoses(model, base_frame)
-        size = self._size = _measure_model(model)
+        # the largest extent of a body's frames
+        size = self._size = max([0.5, *(float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies)])
         orphans = 0
         for number, body in enumerate(model.bodies):
             root = f"/world/vehicle/body/{number}"
@@ -282,7 +279,6 @@ class VehicleScene:
         return self._poses[body] @ self._frames.model.frame(frame).pose
 
     def highlight_path(self, frames: Sequence[str]) -> None:
-        """Highlight the path through some frames, none to remove it."""
         self._path = tuple(frames)
         self._draw_path()
 
@@ -350,11 +346,11 @@ class VehicleScene:
             lines.points = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
 
     def show_fixes(self, points: Array, colors: npt.NDArray[np.int64]) -> None:
-        """Draw fixes at points (n, 3) in World:UTM, by their index into `FIX_COLORS` (n,)."""
+        """Draw fixes at points (n, 3) in World:UTM, by their `FixColor` (n,)."""
         self._fixes.visible = bool(len(points))
         if len(points):
             self._fixes.points = points[-MAX_FIXES:].astype(np.float32)
-            self._fixes.colors = _PALETTE[colors[-MAX_FIXES:]].reshape(-1, 3)
+            self._fixes.colors = FIX_COLORS[colors[-MAX_FIXES:]].reshape(-1, 3)
 
     def show_uncertainty(self, picture: Picture, confidence: int, is_shown: bool) -> None:
         """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
@@ -395,12 +391,6 @@ class VehicleScene:
                     continue
                 text = f"{easting:.0f} E {northing:.0f} N\n{latitude:.6f}, {longitude:.6f}"
                 self._scene.add_label(f"/world/grid/{i} {k}", text, position=(x, y, 0.0), font_screen_scale=0.6)
-
-
-def _measure_model(model: Model) -> float:
-    """Return the size of a model in meters: the largest extent of a body's frames, at least 0.5."""
-    extents = [float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies]
-    return max([0.5, *extents])
 
 
 def _list_corners(body: Body) -> Array:
@@ -454,10 +444,3 @@ def compute_ellipsoid(covariance: Array, quantile: float) -> tuple[Vector3, Pose
     matrix = np.eye(4)
     matrix[:3, :3] = vectors
     return (x, y, z), Pose.from_matrix(matrix)
-
-
-def _make_circle() -> Array:
-    """Return the segments (64, 2, 3) of the unit circle."""
-    angles = np.linspace(0.0, 2.0 * math.pi, 65)
-    points = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1)
-    return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -18,17 +18,15 @@ from modelserver.geometry.model import Model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
 from modelserver.server.recordings import LOOKED_AT, measure
 from modelserver.wire.codec import encode
-from modelserver.wire.eventlog import LogEvent, LogFile
+from modelserver.wire.eventlog import LogEvent
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.edit.document import EditedFile, EditSession
+from mstools.edit import EditedFile, EditSession
 from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
-from mstools.terminal.output import load_given_model
+from mstools.terminal.output import load_given_model, read_with_progress
 
 FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""
-
-PROGRESS_EVENTS: Final = 20_000
 
 
 @dataclass
@@ -129,15 +127,20 @@ def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession
 # --- log
 
 
-def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callable[[float], None]) -> Source:
+def open_log(path: Path, prefix: str = "", model: Path | None = None) -> Source:
     """Open a log of the service; `model` is a geometry file in place of the log's.
 
-    `show_progress` is called with the part that is read, 0 to 1. Raises RecordingError, GeometryError, OSError.
+    Raises RecordingError, GeometryError, OSError.
     """
     given = None if model is None else load_given_model(model, {})
     drive = Drive(prefix, given, keep_geometry=given is not None)
-    with LogFile(path) as log:
-        contents = scan_log(_feed_events(log, drive, show_progress), prefix, with_geometry=given is None)
+
+    def feed(event: LogEvent) -> LogEvent:
+        drive.feed(event.channel, event.data, event.utime)
+        return event
+
+    with read_with_progress("reading", path) as (log, events):
+        contents = scan_log(map(feed, events), prefix, with_geometry=given is None)
         notes = [*map(str, log.damage)]
         # reads the log from its beginning, and forgets the damage
         notes += measure(islice(log, LOOKED_AT)).describe()
@@ -145,15 +148,6 @@ def open_log(path: Path, prefix: str, model: Path | None, show_progress: Callabl
     drive.base_frame = drive.base_frame or answers.base_frame
     folder = model.resolve().parent if model is not None else None
     return Source(path.name, drive, answers, folder, notes=tuple(notes))
-
-
-def _feed_events(log: LogFile, drive: Drive, show_progress: Callable[[float], None]) -> Iterator[LogEvent]:
-    for number, event in enumerate(log):
-        drive.feed(event.channel, event.data, event.utime)
-        if number % PROGRESS_EVENTS == 0:
-            show_progress(event.end / log.size)
-        yield event
-    show_progress(1.0)
 
 
 # --- running service

@@ -22,9 +22,9 @@ from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
 from modelserver.transforms.so3 import Array
-from mstools.edit.document import GeometryItem, ItemKind
+from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
-from mstools.terminal.health_text import format_body, format_duration
+from mstools.terminal.health import format_body, format_duration
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
@@ -136,13 +136,13 @@ class Viewer:
                 self._time.advance(drive, seconds)
                 utime = self._time.utime
             picture = drive.get_picture(utime)
-            utimes, track = drive.get_track(picture.utime, display.trail_s)
+            utimes, track = drive.get_track(picture.utime, TRAILS[display.trail.value])
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
             origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
             if model is not None and model is not self._model:
                 self._set_model(model, base_frame)
-            if (named := (display.labels, self._query.frames)) != self._named:
+            if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
             self._scene.show(picture, display.follow.value)
@@ -150,7 +150,8 @@ class Viewer:
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
                 self._scene.show_fixes(*fixes)
-            self._scene.show_uncertainty(picture, display.confidence, display.uncertainty.value)
+            confidence = int(display.confidence.value.split()[0])
+            self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
         if now >= self._next_slider and self._time is not None:
             self._next_slider = now + SLIDER_PERIOD_S
@@ -326,7 +327,6 @@ def describe_answer(explanation: Explanation, motion: MotionAnswer | None) -> st
 
 
 def _list_sigmas(covariance: Array) -> list[float]:
-    """Return the standard deviations of a pose, meters and degrees."""
     variances = np.maximum(np.diag(covariance), 0.0)
     return list(map(float, np.sqrt(variances) * np.repeat((1.0, math.degrees(1.0)), 3)))
 
@@ -587,24 +587,12 @@ class DisplayPanel:
     """What the scene shows."""
 
     def __init__(self, gui: viser.GuiApi):
-        self._labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
+        self.labels = gui.add_dropdown("Names", tuple(NameLabels), initial_value=NameLabels.BODIES)
         self.follow = gui.add_checkbox("Follow the vehicle", True)
         self.uncertainty = gui.add_checkbox("Uncertainty", True, hint="Ellipsoid of the position; protection levels")
         confidences = tuple(f"{each} %" for each in CHI_SQUARE_3)
-        self._confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
-        self._trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
-
-    @property
-    def labels(self) -> NameLabels:
-        return NameLabels(self._labels.value)
-
-    @property
-    def confidence(self) -> int:
-        return int(self._confidence.value.split()[0])
-
-    @property
-    def trail_s(self) -> float:
-        return TRAILS[self._trail.value]
+        self.confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
+        self.trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
 
 
 class JointsPanel:
@@ -614,22 +602,21 @@ class JointsPanel:
         self._gui = gui
         self._source = source
         self._actions = actions
-        self._sliders: dict[str, tuple[Any, float]] = {}
-        self._defaults: dict[str, float] = {}
+        self._sliders: dict[str, tuple[Any, float, float]] = {}
         self._folder = gui.add_folder("Positions")
 
     def set_model(self, model: Model) -> None:
         """Offer the coordinates of a model; those that were moved stay where they are."""
         moved = {
             name: slider.value
-            for name, (slider, _) in self._sliders.items()
-            if not math.isclose(slider.value, self._defaults[name], abs_tol=1e-6)
+            for name, (slider, _, default) in self._sliders.items()
+            if not math.isclose(slider.value, default, abs_tol=1e-6)
         }
-        old, self._sliders, self._defaults = self._sliders, {}, {}
+        old, self._sliders = self._sliders, {}
         with self._folder:
             for name, joint, number in list_coordinates(model):
                 self._add_slider(name, joint, number, moved.get(name))
-        for slider, _ in old.values():
+        for slider, *_ in old.values():
             # last: a page hides a folder that was empty for a moment, and may never show it again
             slider.remove()
         if moved.keys() & self._sliders.keys():
@@ -642,13 +629,13 @@ class JointsPanel:
         low = max(joint.lower[number], -free) if joint.lower else -free
         high = min(joint.upper[number], free) if joint.upper else free
         lower, upper = low * scale, max(high, low + 1e-6) * scale
-        self._defaults[name] = default = min(max(joint.default_position[number] * scale, lower), upper)
+        default = min(max(joint.default_position[number] * scale, lower), upper)
         value = default if moved is None else min(max(moved, lower), upper)
         unit, step = ("deg", 0.1) if is_angle else ("m", 0.001)
         slider = self._gui.add_slider(f"{name} ({unit})", lower, upper, step, value)
         self._actions.on_update(slider, self._apply)
-        self._sliders[name] = (slider, scale)
+        self._sliders[name] = (slider, scale, default)
 
     def _apply(self) -> None:
         assert self._source.set_joints is not None
-        self._source.set_joints({name: slider.value / scale for name, (slider, scale) in self._sliders.items()})
+        self._source.set_joints({name: slider.value / scale for name, (slider, scale, _) in self._sliders.items()})

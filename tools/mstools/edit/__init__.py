@@ -1,1 +1,0 @@
-"""Editing a geometry file: its text, what is in it, and the session that checks and saves."""
