@@ -1,8 +1,8 @@
 """Frames that programs add to the bodies of the geometry while the service runs, as tf2's static broadcaster does.
 
 They are beside the geometry file, which stays as it is: a model is the file's with these frames. A reload of the file
-adds them to what it read; one that no longer fits, since its body is gone or the file has a frame of its name, is left
-out. Permanent ones are stored
+adds them to what it read; one that does not fit, since its body is gone or the file has a frame of its name, is left
+out until it does. Permanent ones are stored
 (`persistence.AddedFramesStore`) and are there after a restart.
 """
 

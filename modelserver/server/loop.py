@@ -461,7 +461,13 @@ class Loop:
             )
         elif not loaded.is_dry_run:
             self._subscribe(self._hooks.channels(self.state))
-            log.info("the geometry was changed: revision %s, before %s", loaded.model.revision, before)
+            after = loaded.model.revision
+            log.info(
+                "the geometry %s: revision %s, before %s",
+                "was changed" if after != before else "is the same",
+                after,
+                before,
+            )
 
     def _send_snapshot(self, output: messages.PublishSnapshot) -> None:
         model = self.state.model

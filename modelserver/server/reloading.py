@@ -83,7 +83,6 @@ class GeometryReader:
         """Return the vehicle with the permanent frames of earlier runs, and which could not be added, and why."""
         self._frames, why = ((), "") if self._store is None else self._store.load()
         model, left_out = add_frames(self._of_file.model, self._frames)
-        self._frames = tuple(each for each in self._frames if each.frame not in left_out)
         return self._of_file.with_model(model), "; ".join(filter(None, (why, *left_out.values())))
 
     def begin(self, command: LoadModel, state: CoreState) -> PollReload:
@@ -177,7 +176,7 @@ class GeometryReader:
 
 
 def compare_geometry(of_file: Vehicle, frames: tuple[SetFrame, ...], before: Model) -> NewGeometry:
-    """Return the geometry of a file with the frames that fit, unless it lost bodies that the one before has."""
+    """Return the geometry of a file with the frames that fit it, unless it lost bodies that the one before has."""
     lost = find_disconnected(of_file.model) - find_disconnected(before)
     if lost:
         why = (
@@ -187,9 +186,8 @@ def compare_geometry(of_file: Vehicle, frames: tuple[SetFrame, ...], before: Mod
         return NewGeometry(of_file, why=why)
     model, left_out = add_frames(of_file.model, frames)
     vehicle = of_file if model is of_file.model else of_file.with_model(model)
-    changes = (*describe_changes(before, model), *(f"no longer added: {why}" for why in left_out.values()))
-    fitting = tuple(each for each in frames if each.frame not in left_out)
-    return NewGeometry(of_file, fitting, vehicle, "", changes, vehicle.encode_snapshot(model))
+    changes = (*describe_changes(before, model), *(f"not added: {why}" for why in left_out.values()))
+    return NewGeometry(of_file, frames, vehicle, "", changes, vehicle.encode_snapshot(model))
 
 
 def read_geometry(config: VehicleConfig, file: str) -> Vehicle | str:

@@ -122,7 +122,9 @@ class LogFile:
         try:
             file = open_regular(self.path)
         except NotRegularFileError as error:
-            raise RecordingError(f"{self.path}: this is {error.kind}, not an LCM event log") from None
+            inside = sorted(self.path.glob("*.lcm")) if self.path.is_dir() else []
+            fix = f"; give a log in it, such as {inside[-1]}" if inside else ""
+            raise RecordingError(f"{self.path}: this is {error.kind}, not an LCM event log{fix}") from None
         with file:
             self.size = file.seek(0, 2)
             if self.size == 0:

@@ -42,6 +42,7 @@ from modelserver.messages import (
     PoseAnswer,
     ReloadModel,
     RequestHeader,
+    SetFrame,
     SetHTransform,
     SetStateVector,
     TimeQuery,
@@ -67,6 +68,7 @@ REQUEST_OF: dict[str, Any] = {
         GetExplanation(ME, "Camera:Origin", "Cart:Base"),
         GetDynamics(ME),
         ReloadModel(ME),
+        SetFrame(ME, "Camera:Marker"),
         SetStateVector(ME, THERE),
         SetHTransform(ME, THERE),
     )

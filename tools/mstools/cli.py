@@ -84,7 +84,7 @@ _ALIASES = {
     "up": "launch all",
     "run": "serve server start daemon",
     "check": "validate lint",
-    "replay": "play verify journal",
+    "replay": "play verify journal report",
     "record": "log logger rec",
     "import-bag": "import",
     "export": "mcap foxglove bridge",

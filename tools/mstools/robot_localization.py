@@ -123,6 +123,10 @@ INSTEAD: Final = {
 """Parameters, and suffixes to a source's name, without a counterpart, and what to do instead."""
 
 
+NAVSAT: Final = frozenset(("datum", "magnetic_declination_radians", "wait_for_datum", "yaw_offset", "zero_altitude"))
+"""Parameters of navsat_transform_node alone."""
+
+
 def read_ekf_settings(path: Path) -> EkfSettings:
     """Read a file of parameters. Raises ModelServerError, OSError."""
     try:
@@ -136,6 +140,8 @@ def read_ekf_settings(path: Path) -> EkfSettings:
         )
     found = EkfSettings()
     for parameters in nodes:
+        if parameters.keys() & NAVSAT:
+            found.has_gps = True  # of navsat_transform_node, whose input are fixes
         for key, node in parameters.items():
             for outcome, text in _read_parameter(found, parameters, key, node):
                 found.findings.append(Finding(node.line, key, outcome, text))
@@ -176,7 +182,14 @@ def _read_parameter(
         else:
             yield Outcome.OPEN, "publish.rate_hz is between 0.1 and 1000"
     elif key == "datum":
-        yield from _read_datum(found, node)
+        waits = parameters.get("wait_for_datum")
+        if waits is not None and waits.text.lower() == "true":
+            yield from _read_datum(found, node)
+        else:
+            yield (
+                Outcome.OPEN,
+                "it is not used without wait_for_datum: true; for an origin there write origin into the vehicle file",
+            )
     elif suffix in NOT_NEEDED:
         yield Outcome.NOT_NEEDED, NOT_NEEDED[suffix]
     elif node.text == "false" and suffix in ("differential", "use_control", "zero_altitude", "disabled_at_startup"):
@@ -193,6 +206,9 @@ def _read_source(found: EkfSettings, name: str, topic: str, fields: set[str]) ->
     used = f"{topic} ({', '.join(each for each in FIELDS if each in fields)})" if fields else topic
     words = set(re.findall(r"[a-z]+", topic.lower()))
     if name.startswith("imu"):
+        if found.has_imu:
+            yield Outcome.OPEN, f"a second inertial unit, {used}: sensors.imu is one, which is that named first"
+            return
         found.has_imu = True
         yield Outcome.TAKEN, f"sensors.imu, from {used}: its rates and specific force"
         if "yaw" in fields:
@@ -201,6 +217,10 @@ def _read_source(found: EkfSettings, name: str, topic: str, fields: set[str]) ->
         found.has_gps = True
         yield Outcome.TAKEN, f"sensors.gps instead of {used}: the receiver's own fixes (NavSatFix)"
     elif name.startswith("odom") and not words & {"visual", "vo", "vio", "laser", "lidar"}:
+        if found.has_wheels:
+            what = "publish it as relative_pose_t, under sensors.aiding (docs/publish-samples.md)"
+            yield Outcome.OPEN, f"a second odometry, {used}: sensors.wheels is one, that named first; {what}"
+            return
         found.has_wheels = True
         yield Outcome.TAKEN, f"sensors.wheels, from {used}: the speeds of a left and a right wheel"
         if "vy" in fields:

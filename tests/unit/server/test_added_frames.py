@@ -99,13 +99,12 @@ def test_given_a_reload_then_added_frames_stay_and_those_that_no_longer_fit_are_
     done = rig.send(ReloadModel(ME))
     assert done.changes == dry.changes
     assert done.changes[-1] == (
-        "no longer added: the geometry file has a frame 'Camera:Marker'; give the added one another name"
+        "not added: the geometry file has a frame 'Camera:Marker'; give the added one another name"
     )
     assert rig.height() == pytest.approx(2.0)
-    # and it does not come back
     rig.write(GEOMETRY)
     rig.send(ReloadModel(ME))
-    assert not rig.state.model.body("Camera").has_frame("Marker")
+    assert rig.height() == pytest.approx(1.6)
 
 
 @pytest.mark.parametrize(

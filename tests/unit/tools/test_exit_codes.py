@@ -53,7 +53,7 @@ def test_given_a_wrong_option_then_every_command_exits_with_2_and_its_help_with_
         ("tree", "{}"),
         ("run", "-c", "{}"),
         ("up", "-c", "{}"),
-        ("replay", "{}", "-c", "{}"),
+        ("replay", "{}", "-c", "{}", "--poses", "-"),
         ("import-bag", "{}"),
         ("status", "-c", "{}"),
         ("view", "{}"),

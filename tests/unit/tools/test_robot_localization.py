@@ -44,6 +44,7 @@ ekf_filter_node:
 navsat_transform:
   ros__parameters:
     datum: [42.38, -71.14, 0.5]
+    wait_for_datum: true
     yaw_offset: 1.5708
 ekf_filter_node_map:
   ros__parameters:
@@ -104,6 +105,7 @@ def test_given_any_parameter_then_it_has_an_outcome(tmp_path: Path, key: str) ->
 
 def test_given_parameters_of_ros_1_then_datum_is_a_text_and_there_is_no_node(tmp_path: Path) -> None:
     text = "frequency: 50\nbase_link_frame: chassis\ndatum: 42.38, -71.14, 0.0, map, chassis\nodom0: /odometry/gps\n"
+    text += "wait_for_datum: true\n"
     found = read_ekf_settings(write(tmp_path / "ekf.yaml", text))
     assert (found.base_frame, found.rate_hz, found.has_gps, found.has_wheels) == ("chassis", 50.0, True, False)
     assert found.origin is not None
@@ -126,6 +128,34 @@ def test_given_another_file_then_the_error_names_what_is_expected(tmp_path: Path
 
 @pytest.mark.parametrize("datum", ["[]", "[99, 0, 0]", "[nan, 0, 0]", "here", "{}"])
 def test_given_a_datum_that_is_none_then_it_is_left_open(tmp_path: Path, datum: str) -> None:
-    found = read_ekf_settings(write(tmp_path / "ekf.yaml", f"datum: {datum}\n"))
+    found = read_ekf_settings(write(tmp_path / "ekf.yaml", f"wait_for_datum: true\ndatum: {datum}\n"))
     assert found.origin is None
-    assert [each.outcome for each in found.findings] == [Outcome.OPEN]
+    assert [each.outcome for each in found.findings if each.key == "datum"] == [Outcome.OPEN]
+
+
+@pytest.mark.parametrize("text", ["", "wait_for_datum: false\n"])
+def test_given_a_datum_that_the_node_ignores_then_it_is_no_origin(tmp_path: Path, text: str) -> None:
+    found = read_ekf_settings(write(tmp_path / "ekf.yaml", f"{text}datum: [55.94, -3.18, 0]\n"))
+    assert (found.origin, found.has_gps) == (None, True)
+    assert ["wait_for_datum: true" in each.text for each in found.findings if each.key == "datum"] == [True]
+
+
+def test_given_several_sources_of_a_kind_then_those_that_are_not_used_are_named(tmp_path: Path) -> None:
+    text = "odom0: wheel/odom\nodom1: zed/odom\nimu0: imu/data\nimu1: imu2/data\n"
+    found = read_ekf_settings(write(tmp_path / "ekf.yaml", text))
+    left = {each.key: each.text for each in found.findings if each.outcome is Outcome.OPEN}
+    assert left.keys() == {"odom1", "imu1"}
+    assert "zed/odom" in left["odom1"]
+    assert "imu2/data" in left["imu1"]
+
+
+def test_given_a_base_frame_that_is_not_in_the_geometry_then_it_is_named_with_the_one_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ekf = write(tmp_path / "ekf.yaml", "base_link_frame: base_footprint\nodom0: odom\n")
+    urdf = write(tmp_path / "rover.urdf", URDF)
+    with pytest.raises(SystemExit):
+        cli.main(["new", str(tmp_path / "rover"), "--yes", "--from-ekf", str(ekf), "--from-urdf", str(urdf)])
+    out = capsys.readouterr().out
+    assert "base_link_frame base_footprint is not used: base_frame is base_link:Origin; --base-frame sets it" in out
+    assert "no source of gps, so the vehicle file has no sensors.gps; --gps own adds it" in out

@@ -746,6 +746,15 @@ def command(
     if ekf is not None and from_ekf is not None:
         for line in ekf.to_lines(from_ekf):
             typer.echo(escape(line))
+        if base is not None and ekf.base_frame and names.complete(ekf.base_frame) != base.frame:
+            typer.echo(
+                escape(
+                    f"  base_link_frame {ekf.base_frame} is not used: base_frame is {base.frame}; --base-frame sets it"
+                )
+            )
+        for key, is_there in (("gps", ekf.has_gps), ("imu", ekf.has_imu), ("wheels", ekf.has_wheels)):
+            if not is_there and getattr(wanted, key) is None:
+                typer.echo(f"  no source of {key}, so the vehicle file has no sensors.{key}; --{key} own adds it")
         typer.echo()
     show_result(folder, files, find_next(wanted, model))
 

@@ -21,6 +21,7 @@ import typer
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.files import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.terminal.options import ChannelsOption, JsonOption, UrlOption, argument, complete_frame, list_given, option
@@ -148,6 +149,10 @@ def _check_options(options: dict[str, str]) -> None:
             offline and given & {"speed", "restamp", "everything", "url"},
             "--speed, --restamp, --all and --url are for the bus; --poses and --report are offline",
         ),
+        (
+            "config" in given and not offline,
+            "-c is for an offline replay: give --poses CSV, --report HTML or --log OUT too",
+        ),
         (of_poses and "poses" not in given, "--frame, --rate and --at-times need --poses CSV"),
         ("decisions" in given and not offline, "--decisions needs --poses CSV or --report"),
         (of_poses >= {"rate", "at_times"}, "--rate and --at-times exclude each other"),
@@ -268,6 +273,7 @@ def replay_offline(
         raise RecordingError(
             f"{config}: no localization sensor is configured (section 'sensors' is empty), so there is no pose"
         )
+    prefix = vehicle.config.lcm.channel_prefix
     times = None if at_times is None else read_times(at_times)
     inputs = [log, config, Path(vehicle.config.geometry), *([] if at_times is None else [at_times])]
     if report:
@@ -317,6 +323,9 @@ def replay_offline(
         text = counts.to_text(run, wall, bool(poses))
         on_stderr = "-" in (poses, decisions, report)
         typer.echo(json.dumps(counts.as_data(run, wall)) if as_json else text, err=on_stderr)
+        sensors = {each.name for each in CHANNELS if each.use is ChannelUse.SENSOR}
+        if ignored := sorted(name for name in run.unconfigured_channels if name[len(prefix) :] in sensors):
+            typer.echo(f"not used, since {config} has no sensor on it: {_join_sorted(ignored)}", err=True)
         for sentence in run.axis.describe():
             typer.echo(f"{log}: {sentence}", err=True)
         if times and poses:

@@ -116,7 +116,8 @@ def check_clocks(data: ReplayData) -> Iterable[ReportFinding]:
 
 RANGE_ADVICE = {
     "wheels": "Check the units in the driver: speed in m/s and travel in m; mm are too large by 1000.",
-    "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters.",
+    "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters; and that the origin of "
+    "the vehicle file is in the UTM zone of the drive: without one the first fixes set it.",
     "imu": "Check the units in the driver: rates in rad/s, specific force in m/s2.",
 }
 """What to do about samples of a sensor that are out of range."""
