@@ -98,13 +98,16 @@ class ChildProcesses:
         self._started: list[ChildProcess] = []
         self._before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
         self._signal = 0
+        self._is_starting = False
 
     def __enter__(self) -> ChildProcesses:
         def end(number: int, frame: FrameType | None) -> None:
             # Python drops what is raised in a destructor or a callback of its import system, and makes another error of
             # what is raised in __set_name__: `check` and the end of the block raise it again
             self._signal = number
-            raise SystemExit(128 + number)
+            # a process that is being started is not in the list yet, and would go on
+            if not self._is_starting:
+                raise SystemExit(128 + number)
 
         self._before[signal.SIGTERM] = signal.signal(signal.SIGTERM, end)
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -127,8 +130,12 @@ class ChildProcesses:
 
     def start(self, name: str, *arguments: str, is_last: bool = False) -> None:
         """Start a Python process with these arguments; `is_last`: it ends after those that need it."""
+        self._is_starting = True
         child = ChildProcess(name, arguments, is_last, self._spawn(arguments), time.monotonic())
         self._started.append(child)
+        self._is_starting = False
+        if self._signal:
+            raise SystemExit(128 + self._signal)
         self._read(child)
 
     def check(self) -> None:
