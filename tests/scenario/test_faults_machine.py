@@ -68,7 +68,7 @@ def test_given_nothing_that_may_be_written_then_the_daemon_reports_it_and_serves
         run.wait_until(lambda: "Read-only file system" in run.log, "a message about the file system")
         assert not any((tmp_path / "state").iterdir())
         run.process.send_signal(signal.SIGHUP)
-        run.wait_until(lambda: "the geometry was changed" in run.log, "a reload of the geometry")
+        run.wait_until(lambda: "the geometry is the same" in run.log, "a reload of the geometry")
         run.assert_consistent()
         assert run.health.handler_errors == 0
 
