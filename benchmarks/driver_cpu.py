@@ -9,7 +9,6 @@ python-can's over UDP, which costs more than a socketcan interface.
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import socket
 import sys
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import MODELSERVER, RAPTOR, free_url, print_verdict, run_process
+from benchmarks.support import MODELSERVER, RAPTOR, cpu_seconds, free_url, print_verdict, run_process
 from modelserver.messages import DriverHealth
 from modelserver.wire.codec import decode
 
@@ -76,12 +75,6 @@ KINDS: dict[str, tuple[str, float]] = {
     "axis": ("tcp", 50.0),
 }
 """The line of each driver, and the samples a second that it is to bring."""
-
-
-def cpu_seconds(pid: int) -> float:
-    """Return the CPU time of a process in user and kernel mode."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def free_port() -> int:

@@ -49,6 +49,12 @@ def free_url() -> str:
         return f"udpm://239.255.76.67:{probe.getsockname()[1]}?ttl=0"
 
 
+def cpu_seconds(pid: int) -> float:
+    """Return the CPU time of a process in user and kernel mode."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 @contextlib.contextmanager
 def run_process(*arguments: str, url: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run Python with arguments in a child process, and end it by its pid."""

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.support import MODELSERVER, free_url, run_process
+from benchmarks.support import MODELSERVER, cpu_seconds, free_url, run_process
 from modelserver.client.remote import Platform
 from modelserver.errors import ModelServerError
 
@@ -41,12 +41,12 @@ def main() -> int:
                 url, began, lambda platform: platform.get_transformation("Rover:Base", "World:UTM").is_valid
             )
             processes = {up.pid: "up", **{pid: name_of(pid) for pid in list_children(up.pid)}}
-            before = {pid: read_cpu_s(pid) for pid in processes}
+            before = {pid: cpu_seconds(pid) for pid in processes}
             start = time.monotonic()
             time.sleep(SECONDS)
             seconds = time.monotonic() - start
             rows = [
-                (name, read_memory_mb(pid), 100.0 * (read_cpu_s(pid) - before[pid]) / seconds)
+                (name, read_memory_mb(pid), 100.0 * (cpu_seconds(pid) - before[pid]) / seconds)
                 for pid, name in processes.items()
             ]
     for name, memory, share in (*rows, ("all", sum(row[1] for row in rows), sum(row[2] for row in rows))):
@@ -72,7 +72,7 @@ def list_children(parent: int) -> list[int]:
     found = []
     for each in filter(str.isdigit, os.listdir("/proc")):
         try:
-            if int(read_stat(int(each))[1]) == parent:
+            if int(Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()[1]) == parent:
                 found.append(int(each))
         except OSError:
             continue
@@ -83,15 +83,6 @@ def name_of(pid: int) -> str:
     """Return the command of a child: `run`, `driver NAME` or `emulate NAME`."""
     words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8").split("\0")[3:5]
     return " ".join(word for word in words if not word.startswith("-"))
-
-
-def read_stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the third on (proc(5))."""
-    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-
-
-def read_cpu_s(pid: int) -> float:
-    return sum(map(int, read_stat(pid)[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
 def read_memory_mb(pid: int) -> float:

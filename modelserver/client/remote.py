@@ -633,9 +633,7 @@ class Platform(PlatformClient):
         does not permit it; KeyFileError; RejectedError if the file is wrong or does not fit the vehicle: the geometry
         in force stays. A large file takes seconds, for up to RELOAD_TIMEOUT_S; the server answers from the old one.
         """
-        # without a server this ends at once
-        self.get_body_list()
-        return self._query(ReloadModel(self._header(), dry_run), ReloadReply, timeout=RELOAD_TIMEOUT_S)
+        return self._change_geometry(ReloadModel(self._header(), dry_run))
 
     def add_frame(
         self, frame: str, pose: Pose, sigma: Sigma | None = None, *, is_permanent: bool = False
@@ -650,13 +648,13 @@ class Platform(PlatformClient):
         """
         sigma = sigma or Sigma()
         lifetime = Lifetime.PERMANENT if is_permanent else Lifetime.TEMPORARY
-        return self._set_frame(SetFrame(self._header(), frame, pose, sigma.position, sigma.rotation, lifetime))
+        return self._change_geometry(SetFrame(self._header(), frame, pose, sigma.position, sigma.rotation, lifetime))
 
     def remove_frame(self, frame: str) -> ReloadReply:
         """Remove a frame that `add_frame` added. Raises as `add_frame`; RejectedError with those there are."""
-        return self._set_frame(SetFrame(self._header(), frame, lifetime=Lifetime.REMOVED))
+        return self._change_geometry(SetFrame(self._header(), frame, lifetime=Lifetime.REMOVED))
 
-    def _set_frame(self, request: SetFrame) -> ReloadReply:
+    def _change_geometry(self, request: ReloadModel | SetFrame) -> ReloadReply:
         # without a server this ends at once
         self.get_body_list()
         return self._query(request, ReloadReply, timeout=RELOAD_TIMEOUT_S)

@@ -223,6 +223,17 @@ def describe_error(error: OSError, directory: Path, setting: str) -> str:
     return f"{escape_text(cause)}; {remedy}"
 
 
+def _write_json(path: Path, content: Mapping[str, Any], lock: FileLock | None) -> str:
+    """Write a file of the state directory as the holder of its lock; return why it cannot be done, "" if it was."""
+    try:
+        if lock is not None:
+            lock.claim()
+        write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+    except OSError as error:
+        return describe_error(error, path.parent, "state_directory")
+    return ""
+
+
 VERSION: Final = 1
 """Version of the origin's file."""
 
@@ -254,13 +265,7 @@ class OriginStore:
 
     def save(self, origin: Origin) -> None:
         """Store an origin. An error of the disk is logged: the next start captures a new one."""
-        content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
-        try:
-            if self._lock is not None:
-                self._lock.claim()
-            write_atomically(self.path, (content + "\n").encode())
-        except OSError as error:
-            why = describe_error(error, self.path.parent, "state_directory")
+        if why := _write_json(self.path, {"version": VERSION, **dataclasses.asdict(origin)}, self._lock):
             log.warning("the origin cannot be stored in %s: %s. The next start will capture a new one", self.path, why)
 
 
@@ -305,19 +310,10 @@ class AddedFramesStore:
             return (), f"the added frames in {self.path} cannot be read ({error!r}); none was added"
 
     def save(self, frames: Iterable[SetFrame]) -> str:
-        """Store the permanent ones of the added frames; return why it cannot be done, "" if it was."""
-        stored = [_describe_frame(each) for each in frames if each.lifetime is Lifetime.PERMANENT]
-        if not stored and not self.path.exists():
-            return ""
-        try:
-            if self._lock is not None:
-                self._lock.claim()
-            content = json.dumps({"version": FRAMES_VERSION, "frames": stored}, indent=1)
-            write_atomically(self.path, (content + "\n").encode())
-        except OSError as error:
-            why = describe_error(error, self.path.parent, "state_directory")
-            return f"the permanent frames cannot be stored in {self.path}: {why}"
-        return ""
+        """Store the permanent frames; return why it cannot be done, "" if it was."""
+        content = {"version": FRAMES_VERSION, "frames": list(map(_describe_frame, frames))}
+        why = _write_json(self.path, content, self._lock)
+        return why and f"the permanent frames cannot be stored in {self.path}: {why}"
 
 
 def _describe_frame(frame: SetFrame) -> dict[str, Any]:

@@ -140,15 +140,16 @@ class GeometryReader:
         of_file, frames = self._of_file, self._frames
         try:
             if isinstance(request, SetFrame):
-                frames = change_frames(frames, request, of_file.model)
+                try:
+                    frames = change_frames(frames, request, of_file.model)
+                except ValueError as error:
+                    return NewGeometry(of_file, why=str(error))
             else:
                 read = self._read(of_file.config, self._file)
                 if isinstance(read, str):
                     return NewGeometry(of_file, why=read)
                 of_file = read
             return compare_geometry(of_file, frames, before)
-        except ValueError as error:
-            return NewGeometry(of_file, why=str(error))
         except Exception as error:
             log.exception("changing the geometry failed")
             return NewGeometry(of_file, why=f"internal error while reading it: {error}")
@@ -185,7 +186,7 @@ def compare_geometry(of_file: Vehicle, frames: tuple[SetFrame, ...], before: Mod
         )
         return NewGeometry(of_file, why=why)
     model, left_out = add_frames(of_file.model, frames)
-    vehicle = of_file if model is of_file.model else of_file.with_model(model)
+    vehicle = of_file.with_model(model)
     changes = (*describe_changes(before, model), *(f"not added: {why}" for why in left_out.values()))
     return NewGeometry(of_file, frames, vehicle, "", changes, vehicle.encode_snapshot(model))
 

@@ -117,6 +117,8 @@ class Vehicle:
 
     def with_model(self, model: Model) -> Vehicle:
         """Return the vehicle with another geometry that has all frames of this one, at the same places."""
+        if model is self.model:
+            return self
         return replace(self, model=model, rig=None if self.rig is None else replace(self.rig, model=model))
 
     def make_localizer_setup(self) -> LocalizerConfig | None:

@@ -69,7 +69,7 @@ def find_vehicle_file() -> Path:
 def run_demo(lines: EmulatedConnections, seconds: float, children: ChildProcesses) -> None:
     """Start all processes, query, and print. Raises LaunchError if something is missing."""
     typer.echo("1. Emulated devices, a process each, on one simulated drive")
-    start_utime = get_start_utime(1 + 2 * len(lines.devices))
+    start_utime = get_start_utime(len(lines.devices))
     options = ("--seconds", f"{seconds + EXTRA_SECONDS:g}", "--seed", str(SEED))
     typer.echo("\n".join(map(escape, start_devices(children, lines, start_utime, options))))
 

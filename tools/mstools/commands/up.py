@@ -90,7 +90,7 @@ def command(
     with catch_signals() as stop, ChildProcesses(printer.print) as children:
         began = time.monotonic()
         if emulate:
-            start_devices(children, lines, get_start_utime(1 + 2 * len(vehicle.drivers)), faults=of_devices)
+            start_devices(children, lines, get_start_utime(len(vehicle.drivers)), faults=of_devices)
         start_programs(children, lines.vehicle, vehicle.drivers, ("--url", url) if url else ())
         if view:
             bus = ("--url", url or vehicle.lcm.url, "--prefix", vehicle.lcm.channel_prefix)

@@ -272,13 +272,14 @@ def start_devices(
     return [_start(children, f"{name} device", each, is_last=True) for name, each in words.items()]
 
 
-def get_start_utime(count: int) -> int:
-    """Return when a drive may begin for which `count` processes start now, by the time that this one has taken.
+def get_start_utime(devices: int) -> int:
+    """Return when a drive may begin whose processes start now, by the time that this one has taken to load.
 
     The vehicle is stationary at first: a device that is half a second late misses nothing.
     """
     started_ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
     age = time.clock_gettime(time.CLOCK_BOOTTIME) - started_ticks / os.sysconf("SC_CLK_TCK")
+    count = 1 + 2 * devices  # the service, and for each device a driver and an emulator
     lead = LOADING * age * count / (os.cpu_count() or 1)
     return round((time.time() + min(lead, MOST_LEAD_S)) * 10) * 100_000
 
