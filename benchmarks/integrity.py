@@ -22,7 +22,6 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -49,9 +48,11 @@ from benchmarks.integrity_drives import (
 )
 from benchmarks.requirements import FAULT, GAPS, HEALTHY, MILD_FAULT, Required
 from modelserver.earth.geodesy import Geodesy
+from modelserver.errors import ModelServerError
 from modelserver.estimation.filter.localizer import FilterLocalizer
 from modelserver.estimation.filter.state import Setup
 from modelserver.messages import GpsSample, Invalid
+from mstools.archive.cluster import open_cluster
 
 LOOK_PERIOD: Final = 0.2
 """Seconds between two looks at the pose."""
@@ -866,18 +867,21 @@ def plan_tasks(options: argparse.Namespace) -> list[Task]:
     return tasks
 
 
-def run(tasks: Iterable[Task], jobs: int, events: bool) -> tuple[list[Summary], list[Result]]:
-    """Run the tasks, and print each fault when its last one is done."""
+def run(tasks: Iterable[Task], jobs: int, events: bool, scheduler: str = "") -> tuple[list[Summary], list[Result]]:
+    """Run the tasks, and print each fault when its last one is done. Raises ModelServerError for one that is lost."""
     tasks = list(tasks)
     print(HEADER, flush=True)
     summaries, finished = [], []
     grouped: dict[str, list[Result]] = {}
-    with ProcessPoolExecutor(jobs) as pool:
-        for result in pool.map(run_task, tasks):
+    with open_cluster(scheduler, jobs) as cluster:
+        for _, result in cluster.run(run_task, tasks):
+            if isinstance(result, ModelServerError):
+                raise result
             fault = result.task.fault
             grouped.setdefault(fault, []).append(result)
             finished.append(result)
             if len(grouped[fault]) == sum(task.fault == fault for task in tasks):
+                grouped[fault].sort(key=lambda result: result.task)
                 summaries.append(summarize(BY_NAME[fault], grouped[fault]))
                 print(format_summary(summaries[-1]), flush=True)
                 if events:
@@ -895,6 +899,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--minutes", type=float, help="of each drive; default 60")
     parser.add_argument("--jobs", type=int, default=min(os.cpu_count() or 1, 2))
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster; default: this machine")
     parser.add_argument("--quick", action="store_true", help="one vehicle, one seed, 15 to 24 minutes of each fault")
     parser.add_argument("--list", action="store_true", help="list faults and vehicles")
     parser.add_argument("--events", action="store_true", help="print each time wrong and valid")
@@ -906,7 +911,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"vehicles: {', '.join(VEHICLES)}")
         return 0
     started = time.monotonic()
-    summaries, results = run(plan_tasks(options), options.jobs, options.events)
+    summaries, results = run(plan_tasks(options), options.jobs, options.events, options.scheduler)
     print(LEGEND)
     simulated, spent = sum(each.seconds for each in results), sum(each.cpu for each in results)
     print(f"  {simulated / 3600.0:.1f} h in {time.monotonic() - started:.0f} s, {simulated / spent:.0f} x per core")

@@ -18,6 +18,7 @@ from typing import Final
 from urllib.parse import unquote, urlsplit
 
 EXTRAS: Final = {
+    "archive": ("bokeh", "distributed", "fsspec", "pyarrow"),
     "bags": ("rosbags", "mcap"),
     "dynamics": ("pinocchio",),
     "foxglove": ("foxglove",),

@@ -27,6 +27,7 @@ TOOLS = {
     "edit": {"terminal"},
     "recordings": {"terminal"},
     "report": {"terminal"},
+    "archive": {"terminal", "recordings", "report"},
     "calibration": {"terminal", "report"},
     "tuning": {"terminal", "report"},
     "launch": {"terminal"},
