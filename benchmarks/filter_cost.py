@@ -30,7 +30,7 @@ from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader, WheelSample, WheelsSample
 from modelserver.server.vehicle import Vehicle, load_vehicle
-from mstools.commands.import_bag import import_bag
+from mstools.recordings.bag_log import import_bag
 
 ROOT = Path(__file__).resolve().parent.parent
 HUSKY = ROOT / "config" / "husky" / "vehicle.yaml"

@@ -13,7 +13,7 @@ from modelserver.messages import Decision, Verdict
 from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.eventlog import LogFile
-from mstools.commands.import_bag import import_bag
+from mstools.recordings.bag_log import import_bag
 
 KINDS = ("gps_position", "wheel_speed")
 

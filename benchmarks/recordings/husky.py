@@ -25,7 +25,7 @@ import yaml
 from modelserver.messages import Direction, WheelSample, WheelsSample
 from modelserver.wire import codec
 from modelserver.wire.eventlog import LogEvent
-from mstools.commands.import_bag import import_bag
+from mstools.recordings.bag_log import import_bag
 
 _BACK = {Direction.FORWARD: Direction.BACKWARD, Direction.BACKWARD: Direction.FORWARD}
 

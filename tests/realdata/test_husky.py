@@ -17,7 +17,7 @@ from modelserver.server.recordings import OfflineRun
 from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
-from mstools.commands.import_bag import ImportReport, import_bag
+from mstools.recordings.bag_log import ImportReport, import_bag
 
 pytestmark = pytest.mark.realdata
 

@@ -31,8 +31,8 @@ from modelserver.server.persistence import write_atomically
 from modelserver.wire.eventlog import LogFile
 from msdrivers.raw_log import open_for_reading, open_for_writing
 from msdrivers.settings import SourceMap, make_driver, read_driver
-from mstools.commands.import_bag import import_bag
 from mstools.commands.replay import read_times
+from mstools.recordings.bag_log import import_bag
 from mstools.terminal.output import write_file
 
 

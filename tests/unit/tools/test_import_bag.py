@@ -20,7 +20,7 @@ from modelserver.transforms import Pose
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
-from mstools.commands.import_bag import import_bag
+from mstools.recordings.bag_log import import_bag
 from mstools.recordings.bags import DEFAULT_OPTIONS, Altitude, BagOptions, ImuOrientation, TopicKind
 from mstools.recordings.log_platform import LogPlatform
 
