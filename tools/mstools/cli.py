@@ -48,6 +48,7 @@ GROUPS = {
         "record": "Record the bus as an LCM log, with the types of its messages checked.",
         "replay": "Replay a log on the bus, or offline through the localization.",
         "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
+        "archive": "Replay many logs on a cluster into Parquet tables, and report on them.",
         "export": "Convert an LCM log to an MCAP file for Foxglove, or serve the running service to it.",
     },
     "Tuning": {
@@ -84,6 +85,7 @@ _ALIASES = {
     "up": "launch all",
     "run": "serve server start daemon",
     "check": "validate lint",
+    "archive": "fleet batch campaign dask parquet",
     "replay": "play verify journal report",
     "record": "log logger rec",
     "import-bag": "import",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import math
 import os
@@ -265,7 +264,7 @@ def replay_offline(
     """Write the poses of a frame, the decisions and the report of a log to the given files."""
     # imported before the clock starts: the printed speed is that of the replay
     from modelserver.config.vehicle_file import load_config
-    from modelserver.server.recordings import CSV_HEADER, OfflineRun
+    from modelserver.server.recordings import CSV_HEADER, OfflineRun, relax_garbage_collector
     from modelserver.server.vehicle import load_vehicle
 
     vehicle = load_vehicle(load_config(config), str(config))
@@ -291,10 +290,7 @@ def replay_offline(
 
             collector = ReplayCollector(vehicle)
             run.on_sample = collector.on_sample
-        # searching long-lived tuples for cycles costs a sixth of the time
-        gc.collect()
-        gc.freeze()
-        gc.set_threshold(50_000, 20, 100)
+        relax_garbage_collector()
         started = time.monotonic()
         counts = ReplayCounts()
         with (

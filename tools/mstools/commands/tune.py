@@ -35,7 +35,7 @@ from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from statistics import fmean, median, median_high
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import typer
@@ -56,8 +56,11 @@ from modelserver.server.recordings import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.options import argument, option
+from mstools.terminal.options import SchedulerOption, argument, option
 from mstools.terminal.output import check_outputs, escape, format_count, show_progress, write_file
+
+if TYPE_CHECKING:
+    from mstools.archive.cluster import Cluster
 
 Settings: TypeAlias = Mapping[str, float]
 
@@ -138,13 +141,15 @@ def command(
     output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
     quick: Annotated[bool, option("--quick", "One round over few settings: a first look.")] = False,
     force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
+    scheduler: SchedulerOption = "",
 ) -> None:
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
 
     Every second fix is withheld, and all fixes in four gaps. A search changes each setting by factors of two while the
     likelihood of the withheld fixes increases, the accuracy does not decrease, and the covariance covers the errors at
     the ends of the gaps. It is deterministic for a log, a vehicle file and a version. Nothing is changed: the proposal
-    is part of a vehicle file, to be reviewed and merged.
+    is part of a vehicle file, to be reviewed and merged. With --scheduler the runs are tasks of a cluster; its workers
+    must reach LOG and FILE under the same paths.
 
     \b
     Examples:
@@ -154,6 +159,7 @@ def command(
     if config is None:
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
     check_outputs((log, config), "", output, force)
+    log, config = (each.absolute() if scheduler else each for each in (log, config))
     vehicle = load(config)
     gps_channel(vehicle)
     fixes = read_fixes(log, config)
@@ -168,7 +174,7 @@ def command(
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else ROUNDS
     bound = len(PARTS) * (1 + rounds * len(chosen) * 2)
-    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool() as runs:
+    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(scheduler) as runs:
         trials = Trials(runs, log, config, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
@@ -263,8 +269,14 @@ def format_proposal(log: str, found: SearchResult) -> str:
 
 
 @contextmanager
-def _open_pool() -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
-    """Yield a function that runs jobs in parallel processes, and returns their results in order."""
+def _open_pool(scheduler: str) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+    """Yield a function that runs jobs in parallel processes, or on a cluster, and returns their results in order."""
+    if scheduler:
+        from mstools.archive.cluster import open_cluster
+
+        with open_cluster(scheduler) as cluster:
+            yield lambda jobs: _run_on(cluster, jobs)
+        return
     # at most both steps of a setting run at once
     count = min(os.cpu_count() or 1, 2 * len(PARTS))
     pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
@@ -292,6 +304,16 @@ def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Fu
         return [pool.submit(_run, job) for job in jobs]
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _run_on(cluster: Cluster, jobs: Sequence[EvaluationJob]) -> list[EvaluationResult | None]:
+    """Return the results of jobs on a cluster in order. Raises ModelServerError for one whose workers ended."""
+    found: dict[EvaluationJob, EvaluationResult | None] = {}
+    for job, result in cluster.run(_run, jobs):
+        if isinstance(result, ModelServerError):
+            raise result
+        found[job] = result
+    return [found[job] for job in jobs]
 
 
 def _run(job: EvaluationJob) -> EvaluationResult | None:

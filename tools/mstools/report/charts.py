@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.transforms.so3 import Array
-from mstools.terminal.output import require_extra
+from mstools.terminal.output import escape, require_extra
 
 NEEDS_PLOTLY = "reports need plotly"
 
@@ -129,7 +129,7 @@ def dots(name: str, points: Iterable[Sequence[float]], color: str, size: float) 
 
 def render_panels(label: str, x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]] = ()) -> str:
     """Return panels above one another as HTML; `events` are vertical lines through all of them."""
-    return _render_figure(label, *_make_panels(x, panels, events), is_over_time=x.label.startswith("seconds"))
+    return _render_chart(label, *_make_panels(x, panels, events), is_over_time=x.label.startswith("seconds"))
 
 
 def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tuple[float, float] = (420, 900)) -> str:
@@ -142,7 +142,7 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
     traces, layout = _make_panels(axes[0], [Panel("", axes[1], series, height)], ())
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["hovermode"] = "closest"
-    return _render_figure(label, traces, layout)
+    return _render_chart(label, traces, layout)
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
@@ -176,7 +176,7 @@ def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence
         },
         "shapes": [_make_event_line(when) for when, _ in events],
     }
-    return _render_figure(label, traces, layout, is_over_time=True)
+    return _render_chart(label, traces, layout, is_over_time=True)
 
 
 # --- parts of a figure ---
@@ -305,7 +305,7 @@ def decimate(points: Array, columns: Array) -> Array:
     return points[chosen]
 
 
-def _render_figure(
+def _render_chart(
     label: str, traces: Sequence[dict[str, Any]], layout: dict[str, Any], is_over_time: bool = False
 ) -> str:
     """Return a chart as HTML: an element of its height with the figure in JSON."""
@@ -325,6 +325,32 @@ def render_text_page(title: str, lines: Sequence[str], figures: Sequence[str]) -
     text = html.escape("\n".join(lines))
     drawn = "".join(f"<figure>{each}</figure>" for each in figures)
     return render_page(title, f"<h1>{html.escape(title)}</h1>\n<pre>{text}</pre>\n{drawn}")
+
+
+def escape_text(text: str) -> str:
+    return html.escape(escape(text))
+
+
+def render_figure(chart: str, caption: str) -> str:
+    return f"<figure>{chart}<figcaption>{caption}</figcaption></figure>"
+
+
+def render_table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:
+    right = frozenset(numbers)
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        return "".join(
+            f"<{tag}{' class=n' if n in right else ''}>{escape_text(each)}</{tag}>" for n, each in enumerate(row)
+        )
+
+    body = "\n".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
+    return f"<table><thead><tr>{cells(head, 'th')}</tr></thead>\n<tbody>{body}</tbody></table>"
+
+
+def render_key_figures(figures: Iterable[tuple[str, str]]) -> str:
+    """Return values with what they are, in large type."""
+    cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
+    return f'<div class="figures">{cells}</div>'
 
 
 def render_page(title: str, body: str) -> str:

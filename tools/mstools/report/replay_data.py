@@ -66,6 +66,9 @@ SNAPSHOT_PERIOD_US = 200_000
 PERIOD_SAMPLES = 20
 """Samples over which a period is taken: more than the bursts of recorders and buses have."""
 
+HOLD_S = 1.0
+"""Seconds for which a state holds without a newer one."""
+
 FROZEN_S = 1.0
 """Seconds without change until an IMU counts as frozen."""
 
@@ -653,6 +656,13 @@ class ReplayCollector:
             for each in zip(at.tolist(), names, measured, expected.tolist(), strict=True)
             if each[1] in contacts and times[0] <= each[0] <= times[-1]
         )
+
+
+def integrate_distance(snapshots: Sequence[StateSample]) -> float:
+    """Return the integral of the speed, meters: the noise of positions while stationary does not count."""
+    return sum(
+        abs(b.speed) * (b.t - a.t) for a, b in pairwise(snapshots) if math.isfinite(b.speed) and b.t - a.t < HOLD_S
+    )
 
 
 def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> StateSample | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -12,13 +11,22 @@ from itertools import cycle, pairwise
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
 from mstools.report import charts
-from mstools.report.charts import Axis, Panel, Series, StripRow, decade_axis, level, value_range
+from mstools.report.charts import (
+    Axis,
+    Panel,
+    Series,
+    StripRow,
+    decade_axis,
+    escape_text,
+    level,
+    render_figure,
+    render_key_figures,
+    render_table,
+    value_range,
+)
 from mstools.report.findings import ReportFinding, collect_findings, compute_consistency, compute_running_nis
-from mstools.report.replay_data import ReplayData, StateSample
+from mstools.report.replay_data import HOLD_S, ReplayData, StateSample, integrate_distance
 from mstools.terminal.output import escape, format_count
-
-HOLD_S = 1.0
-"""Seconds for which a state holds without a newer one."""
 
 NIS_WINDOW_S = 20.0
 
@@ -61,9 +69,9 @@ def render_page(data: ReplayData) -> str:
     began = datetime.fromtimestamp(data.first_utime * 1e-6, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     head = f"""<header>
 <p class="kicker">Replay report</p>
-<h1>{_escape(data.vehicle)}</h1>
-<p>{_escape(data.log)}, start {began}, {data.duration:.0f} s</p>
-{_render_key_figures(data)}
+<h1>{escape_text(data.vehicle)}</h1>
+<p>{escape_text(data.log)}, start {began}, {data.duration:.0f} s</p>
+{_list_key_figures(data)}
 <nav>{links}</nav>
 </header>
 """
@@ -80,26 +88,6 @@ def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
 # --- parts of the page --------------------------------------------------------------------------------------
 
 
-def _escape(text: str) -> str:
-    return html.escape(escape(text))
-
-
-def _render_figure(chart: str, caption: str) -> str:
-    return f"<figure>{chart}<figcaption>{caption}</figcaption></figure>"
-
-
-def _render_table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:
-    right = frozenset(numbers)
-
-    def cells(row: Sequence[str], tag: str) -> str:
-        return "".join(
-            f"<{tag}{' class=n' if n in right else ''}>{_escape(each)}</{tag}>" for n, each in enumerate(row)
-        )
-
-    body = "\n".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f"<table><thead><tr>{cells(head, 'th')}</tr></thead>\n<tbody>{body}</tbody></table>"
-
-
 def _time_axis(data: ReplayData) -> Axis:
     return Axis("seconds from the log's first event", 0.0, max(data.duration, 1e-3))
 
@@ -107,12 +95,9 @@ def _time_axis(data: ReplayData) -> Axis:
 # --- key figures and findings -------------------------------------------------------------------------------
 
 
-def _render_key_figures(data: ReplayData) -> str:
+def _list_key_figures(data: ReplayData) -> str:
     states = data.snapshots
-    # integral of the speed: the noise of positions while stationary does not count
-    distance = sum(
-        abs(b.speed) * (b.t - a.t) for a, b in pairwise(states) if math.isfinite(b.speed) and b.t - a.t < HOLD_S
-    )
+    distance = integrate_distance(states)
     sigmas = sorted(each.sigma for each in states if math.isfinite(each.sigma))
     verdicts = Counter(each.verdict for each in data.fixes)
     figures = [
@@ -123,8 +108,7 @@ def _render_key_figures(data: ReplayData) -> str:
         (f"{verdicts['rejected']}", "positions rejected"),
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
     ]
-    cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    return f'<div class="figures">{cells}</div>'
+    return render_key_figures(figures)
 
 
 def _valid_share(data: ReplayData) -> float:
@@ -137,7 +121,7 @@ def _render_findings(found: Sequence[ReportFinding]) -> str:
         return '<p class="good">No findings. Compare the charts below with docs/tuning.md.</p>'
     return "\n".join(
         f'<div class="finding {each.level}"><h3><span>{each.level}</span> '
-        f"{_escape(each.title)}</h3><p>{_escape(each.observation)}</p><p>{_escape(each.advice)}</p></div>"
+        f"{escape_text(each.title)}</h3><p>{escape_text(each.observation)}</p><p>{escape_text(each.advice)}</p></div>"
         for each in found
     )
 
@@ -174,7 +158,7 @@ def _render_track(data: ReplayData) -> str:
             f"{data.origin.zone}{'' if data.origin.north else ' (south)'}."
         )
     chart = charts.render_map("Track", "east of the origin, m", "north of the origin, m", drawn)
-    return _render_figure(chart, words)
+    return render_figure(chart, words)
 
 
 def _track_points(placed: Sequence[StateSample], bad: bool) -> list[tuple[float, float, float]]:
@@ -217,10 +201,10 @@ def _render_validity(data: ReplayData) -> str:
     events = _events(data)
     chart = charts.render_strip("Validity over time", _time_axis(data), rows, events)
     listed = [(f"{when:.1f}", words) for when, words in events[:40]]
-    table = _render_table(("at, s", "what happened"), listed, numbers=(0,)) if events else "<p>No events.</p>"
+    table = render_table(("at, s", "what happened"), listed, numbers=(0,)) if events else "<p>No events.</p>"
     more = f"<p>and {len(events) - 40} more</p>" if len(events) > 40 else ""
     words = "Reasons for which the pose is invalid, each on its row; vertical lines are the events below."
-    return f"{_render_figure(chart, words)}\n{table}{more}"
+    return f"{render_figure(chart, words)}\n{table}{more}"
 
 
 def _intervals(
@@ -289,7 +273,7 @@ def _render_motion(data: ReplayData) -> str:
         axis = decade_axis(unit, [value for line in lines for value in line.y])
         drawn.append(Panel(f"{title}: uncertainty", axis, lines, 110.0))
     chart = charts.render_panels("Heading, speed and uncertainty", x, drawn, _epochs(data))
-    return _render_figure(
+    return render_figure(
         chart,
         "Heading is clockwise from grid north. Below: one sigma, the level exceeded with a probability of 1e-4 at an "
         "instant, and the protection level at the integrity risk localization.filter.risk_per_hour.",
@@ -320,13 +304,13 @@ def _render_consistency(data: ReplayData) -> str:
         drawn.append(Series(each.kind, list(map(data.to_seconds, utimes)), means, color))
     axis = Axis("NIS / dof", 0.01, 100.0, is_logarithmic=True)
     panel = Panel(f"NIS, mean of {NIS_WINDOW_S:.0f} s", axis, drawn, 220.0)
-    figure = _render_figure(
+    figure = render_figure(
         charts.render_panels("NIS over time", x, [panel], _epochs(data)),
         "NIS per degree of freedom: mean 1 and 5 % beyond the 95 % limit are consistent. Below 1 the sigma is larger "
         "than necessary; far above 1 it is too small, or something else is wrong. Time-correlated kinds have their "
         "noise inflated on purpose and lie well below 1.",
     )
-    return f"{_render_table(head, rows, numbers=(1, 2, 3, 4))}\n{figure}"
+    return f"{render_table(head, rows, numbers=(1, 2, 3, 4))}\n{figure}"
 
 
 def _render_innovations(data: ReplayData) -> str:
@@ -341,7 +325,7 @@ def _render_innovations(data: ReplayData) -> str:
     ]
     if not drawn:
         return "<p>No innovations.</p>"
-    return _render_figure(
+    return render_figure(
         charts.render_panels("Innovations", _time_axis(data), drawn),
         "Measured minus predicted, with 2 sigma: 95 % lie within, without a pattern. Points beyond a panel are drawn "
         "at its edge.",
@@ -396,7 +380,7 @@ def _render_states(data: ReplayData) -> str:
         for title, begin, unit, factor in (*KNOWN_STATES, *own)
         if (present := [name for name in names if name.startswith(begin)])
     ]
-    return _render_figure(
+    return render_figure(
         charts.render_panels("States", x, drawn, _epochs(data)),
         "Estimates with one sigma. A bias settles and stays; one that follows the turns of the drive absorbs another "
         "error.",
@@ -432,9 +416,9 @@ def _render_verdicts(data: ReplayData) -> str:
         (kind, verdict.name.lower().replace("_", " "), reason, str(count))
         for (kind, verdict, reason), count in sorted(counts.items())
     ]
-    first = _render_table(("kind", "verdict", "reason", "count"), rows, numbers=(3,)) if rows else ""
+    first = render_table(("kind", "verdict", "reason", "count"), rows, numbers=(3,)) if rows else ""
     rejected = [(source, reason, str(count)) for (source, reason), count in sorted(data.rejected.items())]
-    second = _render_table(("rejected, source", "reason", "count"), rejected, numbers=(2,)) if rejected else ""
+    second = render_table(("rejected, source", "reason", "count"), rejected, numbers=(2,)) if rejected else ""
     return f"{first}\n{second}" if rows or rejected else f"<p>No decisions: {_explain_no_decisions(data)}.</p>"
 
 

@@ -118,6 +118,9 @@ ChannelsOption = Annotated[
     list[str] | None,
     option("--channel NAME", "Only this channel; may be repeated.", autocompletion=complete_channel),
 ]
+SchedulerOption = Annotated[
+    str, option("--scheduler ADDRESS", "Of a Dask cluster (tcp://HOST:PORT). Default: this machine.")
+]
 JsonOption = Annotated[bool, option("--json", "Print JSON, for scripts.")]
 
 

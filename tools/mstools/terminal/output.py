@@ -297,8 +297,10 @@ def suggest_path(error: OSError) -> str:
 
 
 @contextmanager
-def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]:
+def show_progress(label: str, total: float) -> Iterator[Callable[..., None]]:
     """Show a progress bar while the block runs; the block calls the given function with the part of `total` done.
+
+    A second argument of the function is another label.
 
     Nothing is shown where stderr is no terminal.
     """
@@ -309,7 +311,7 @@ def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(label, total=total)
-        yield lambda done: bar.update(task, completed=done)
+        yield lambda done, text=label: bar.update(task, completed=done, description=text)
 
 
 @contextmanager

@@ -1,0 +1,159 @@
+"""Logs of an archive: found by pattern, folder, list or URL, and read as the events of one recording each.
+
+A folder is searched for what begins as a recording does, whatever its name: LCM logs (lcm-logger names them by date),
+ROS 1 bags, MCAP files; and for folders of a ROS 2 recording or a journal, each one log. What is not on this machine is
+fetched to a temporary file for its task. Bags are converted as `modelserver import-bag` does by default.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, Final
+
+from modelserver.errors import ModelServerError
+from modelserver.server.journal.writer import list_segments
+from mstools.recordings.bag_log import import_bag
+
+LCM_MAGIC: Final = b"\xed\xa1\xda\x01"
+BAG_MAGICS: Final = (b"#ROSBAG V", b"\x89MCAP0\r\n")
+SUFFIXES: Final = (".lcm", ".bag", ".mcap")
+"""Names of recordings: one of these is a log also if its beginning is damaged."""
+
+CHUNK: Final = 1 << 20
+
+
+def find_logs(given: Iterable[str]) -> list[str]:
+    """Return the absolute paths and URLs of the logs, each once, in the order given.
+
+    `given`: logs, folders, patterns (* ? [ ] **), fsspec URLs of these, and text files (.txt) with one of them per
+    line. Raises ModelServerError where one of them names no log.
+    """
+    found: dict[str, None] = {}
+    for each in given:
+        logs = list(_expand(each))
+        if not logs:
+            raise ModelServerError(f"{each}: no recording there: an LCM log, a journal, a ROS bag, or an MCAP file")
+        found |= dict.fromkeys(logs)
+    return list(found)
+
+
+def _expand(given: str) -> Iterator[str]:
+    if "://" in given and not given.startswith("file://"):
+        yield from _expand_url(given)
+        return
+    path = Path(given.removeprefix("file://")).absolute()
+    if path.suffix == ".txt" and path.is_file():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if text := line.partition("#")[0].strip():
+                # relative to the list
+                yield from _expand(text if "://" in text else str(path.parent / text))
+    elif path.is_dir():
+        yield from _search(path)
+    elif path.exists():
+        yield str(path)
+    elif glob.has_magic(given):
+        for match in sorted(glob.glob(str(path), recursive=True)):
+            yield from _expand(match)
+    else:
+        raise FileNotFoundError(2, "No such file or directory", given)
+
+
+def _search(folder: Path) -> Iterator[str]:
+    if _is_one(folder):
+        yield str(folder)
+        return
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and not path.name.startswith("."):
+            yield from _search(path)
+        elif path.is_file() and (path.suffix in SUFFIXES or _begins_as_recording(path)):
+            yield str(path)
+
+
+def _is_one(folder: Path) -> bool:
+    return (folder / "metadata.yaml").is_file() or bool(list_segments(folder))
+
+
+def _begins_as_recording(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(16).startswith((LCM_MAGIC, *BAG_MAGICS))
+
+
+def _expand_url(given: str) -> Iterator[str]:
+    fs, path = _open_url(given)
+    if glob.has_magic(path):
+        matches = fs.glob(path)
+    elif fs.isdir(path):
+        matches = fs.find(path)
+    else:
+        matches = [path]
+    for each in sorted(matches):
+        if each == path or each.endswith(SUFFIXES) or fs.cat_file(each, 0, 16).startswith((LCM_MAGIC, *BAG_MAGICS)):
+            yield fs.unstrip_protocol(each)
+
+
+def _open_url(url: str) -> tuple[Any, str]:
+    import fsspec
+
+    try:
+        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
+    except (ValueError, ImportError) as error:
+        raise ModelServerError(f"{url}: {error}; install the package of this file system on all workers") from None
+    return found
+
+
+@contextmanager
+def fetch(log: str) -> Iterator[Path]:
+    """Give the path of a log, of a temporary copy where it is not on this machine. Raises OSError."""
+    if "://" not in log:
+        yield Path(log)
+        return
+    fs, remote = _open_url(log)
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        path = Path(folder) / Path(remote).name
+        fs.get_file(remote, str(path))
+        yield path
+
+
+@contextmanager
+def open_lcm_log(path: Path) -> Iterator[Path]:
+    """Give the LCM log of a recording: itself, or a temporary one for a journal, a bag or an MCAP file.
+
+    Raises RecordingError for what is no recording, OSError.
+    """
+    if path.is_file() and not _is_bag(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        log = Path(folder) / f"{path.stem}.lcm"
+        if path.is_dir() and (segments := list_segments(path)):
+            with log.open("wb") as out:
+                for each in segments:
+                    with each.open("rb") as file:
+                        shutil.copyfileobj(file, out)
+        else:
+            import_bag(path, log)
+        yield log
+
+
+def _is_bag(path: Path) -> bool:
+    with path.open("rb") as file:
+        return path.suffix in SUFFIXES[1:] or file.read(16).startswith(BAG_MAGICS)
+
+
+def compute_content(path: Path) -> str:
+    """Return a digest of a log's bytes, of a folder that of its files. Raises OSError."""
+    found = blake2b(digest_size=16)
+    for each in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if each.is_file():
+            found.update(f"{each.relative_to(path)}\0{os.path.getsize(each)}\0".encode())
+            with each.open("rb") as file:
+                while chunk := file.read(CHUNK):
+                    found.update(chunk)
+    return found.hexdigest()
