@@ -84,13 +84,11 @@ def read_drives(url: str) -> list[Drive]:
         for row in rows
     }
     _add_metrics(drives, _read(url, "metrics"))
-    for row in _read(url, "events", (ds.field("kind") != "invalid")):
+    for row in _read(url, "events", ds.field("kind") == "finding"):
         if row["log"] in drives:
             drive = drives[row["log"]]
-            drive.resets += row["kind"] == "reset"
-            if row["kind"] == "finding":
-                # titles have figures of their own: they are one finding
-                drive.findings[re.sub(r"\d[\d.,]*", "N", row["text"].partition(": ")[0])] += 1
+            # titles have figures of their own: they are one finding
+            drive.findings[re.sub(r"\d[\d.,]*", "N", row["text"].partition(": ")[0])] += 1
     for row in _read(url, "rejections"):
         if row["log"] in drives:
             drives[row["log"]].rejected[f"{row['source']} {row['reason']}"] += row["count"]
@@ -111,6 +109,7 @@ def _add_metrics(drives: Mapping[str, Drive], rows: Iterable[Mapping[str, Any]])
         drive.nis = {
             label: value / found["nis_dof", label] for (name, label), value in list(found.items()) if name == "nis_sum"
         }
+        drive.resets = int(found["resets", ""])
         drive.level = float(np.median(levels[log])) if levels[log] else math.nan
 
 
@@ -327,9 +326,11 @@ def compare(before: Sequence[Drive], after: Sequence[Drive]) -> Comparison:
     found = []
     for figure in FIGURES:
         a, b = (np.array([figure.compute(drives[key]) for key in both]) for drives in (first, second))
-        weights = 0.5 * (a[:, 1] + b[:, 1])
-        if not weights.any():
+        known = (a[:, 1] > 0.0) & (b[:, 1] > 0.0)
+        if not known.any():
             continue
+        a, b = a[known], b[known]
+        weights = 0.5 * (a[:, 1] + b[:, 1])
         difference = b[:, 0] - a[:, 0]
         low, high = compute_ratio_interval(difference, weights, level)
         scale = figure.factor / weights.sum()

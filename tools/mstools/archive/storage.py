@@ -56,9 +56,10 @@ class Storage:
                 try:
                     fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
+                    self._lock.close()
+                    self._lock = None
                     raise ArchiveError(f"{self.url}: another run writes to it; wait for its end") from None
-            for draft in self._list(DRAFTS):
-                self._fs.rm(draft, recursive=True)
+            self._remove_drafts()
             whole = {_name_of(path) for path in self._list(LAST)}
             for table in TABLES:
                 for path in self._list(table):
@@ -66,8 +67,15 @@ class Storage:
                         self._fs.rm(path)
 
     def close(self) -> None:
+        """Remove what killed workers left, and unlock."""
         if self._lock is not None:
+            with suppress(OSError):
+                self._remove_drafts()
             self._lock.close()
+
+    def _remove_drafts(self) -> None:
+        for draft in self._list(DRAFTS):
+            self._fs.rm(draft, recursive=True)
 
     @property
     def filesystem(self) -> Any:

@@ -28,7 +28,7 @@ from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.archive.logs import compute_content, fetch, open_lcm_log
 from mstools.archive.storage import UNREAD, Storage, digest
 from mstools.archive.tables import SCHEMA_VERSION, ArchiveError, TableWriter
-from mstools.report.findings import collect_findings, has_nis
+from mstools.report.findings import collect_findings, has_nis, is_position_reset
 from mstools.report.replay_data import ReplayCollector, integrate_distance
 
 WINDOW_S: Final = 600.0
@@ -117,7 +117,7 @@ def _write(task: Task, folder: Path, path: Path, content: str) -> LogOutcome:
         except ArchiveError:
             raise
         except ModelServerError as error:
-            errors.append(str(error).replace(str(path), task.log))
+            errors.append(str(error).removeprefix(f"{path}: ").replace(str(path), task.log))
         replay.write_drive(content, size, "; ".join(errors[:MAX_ERRORS]))
     return LogOutcome(
         task.log, "failed" if errors else "written", size, replay.seconds, error="; ".join(errors[:MAX_ERRORS])
@@ -191,6 +191,7 @@ class DriveReplay:
             decision.utime,
             *(decision.source, decision.kind, verdict, decision.reason, decision.statistic, decision.dof),
         )
+        self._resets += is_position_reset(decision)
         if decision.verdict is Verdict.RESET:
             self._add_event(decision.utime, 0.0, "reset", "", f"{decision.kind}: {decision.reason}")
         elif has_nis(decision):
@@ -236,6 +237,7 @@ class DriveReplay:
         self._nis: defaultdict[str, float] = defaultdict(float)
         self._dof: Counter[str] = Counter()
         self._verdicts: Counter[str] = Counter()
+        self._resets = 0
 
     def _close_window(self, end: int) -> None:
         """Write the metrics, rejections and findings of the window."""
@@ -254,6 +256,7 @@ class DriveReplay:
             reasons.update({str(flag.name): count for flag in Invalid if bits & flag})
         metrics: list[tuple[str, str, float]] = [
             ("distance", "", distance),
+            ("resets", "", float(self._resets)),
             ("valid_seconds", "", self._flags[0] * period),
             *(("invalid_seconds", name, count * period) for name, count in sorted(reasons.items())),
             *([("horizontal_level", "median", median(self._levels))] if self._levels else []),

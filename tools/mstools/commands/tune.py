@@ -174,7 +174,7 @@ def command(
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else ROUNDS
     bound = len(PARTS) * (1 + rounds * len(chosen) * 2)
-    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(scheduler) as runs:
+    with show_progress(f"tuning on {log.name}", bound) as show, open_pool(scheduler) as runs:
         trials = Trials(runs, log, config, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
@@ -269,7 +269,7 @@ def format_proposal(log: str, found: SearchResult) -> str:
 
 
 @contextmanager
-def _open_pool(scheduler: str) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+def open_pool(scheduler: str) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
     """Yield a function that runs jobs in parallel processes, or on a cluster, and returns their results in order."""
     if scheduler:
         from mstools.archive.cluster import open_cluster

@@ -538,10 +538,15 @@ def _has_diverged(decision: Decision) -> bool:
     return decision.verdict is Verdict.RESET and "diverged" in decision.reason
 
 
+def is_position_reset(decision: Decision) -> bool:
+    """Return whether a decision moved the position, unlike those that begin a localization or change its mode."""
+    return decision.verdict is Verdict.RESET and ("agree" in decision.reason or _has_diverged(decision))
+
+
 def check_divergence(data: ReplayData) -> Iterable[ReportFinding]:
     """Find a filter that restarted after divergence, or that reset its position."""
     restarts = [each for each in data.decisions if _has_diverged(each)]
-    resets = [each for each in data.decisions if each.verdict is Verdict.RESET and "agree" in each.reason]
+    resets = [each for each in data.decisions if is_position_reset(each) and not _has_diverged(each)]
     for title, found in (("The filter was restarted", restarts), ("The position was reset", resets)):
         if found:
             first = found[0]
