@@ -132,13 +132,13 @@ def format_row(name: str, drives: list[dict[str, Any]]) -> str:
         low, high = compute_ratio_interval(values, seconds)
         if values.any():
             middle = factor * float(values.sum() / seconds.sum())
-            return f"{middle:.{digits}f} ({factor * low:.{digits}f} to {factor * high:.{digits}f})"
+            return f"{middle:.{digits}f} ({factor * low:.{digits}f}-{factor * high:.{digits}f})"
         return "0"
 
-    hmi = interval(wrong, 3600.0, 1) if wrong.any() else f"0 (below {3.0 / hours:.2f} events/h)"
+    hmi = interval(wrong, 3600.0, 1) if wrong.any() else f"0 (<{3.0 / hours:.1f}/h)"
     detected = [each for drive in drives for each in drive["detected"]]
     events = sum(drive["events"] for drive in drives)
-    found = f"{np.median(detected):.0f}, {len(detected)} of {events}" if detected else f"none of {events}"
+    found = f"{np.median(detected):.0f} ({len(detected)}/{events})" if detected else f"(0/{events})"
     return (
         f"| {name} | {hours:.1f} | {interval(valid, 100.0, 1)} | {hmi} | "
         f"{max(drive['longest'] for drive in drives):.0f} | {interval(beyond, 100.0, 2)} | "

@@ -22,6 +22,9 @@ from modelserver.wire.fields import MAX_UTIME
 MAX_DATA = 256 << 20
 """Longer messages are treated as damage."""
 
+RELEASED_BYTES = 32 << 20
+"""Bytes of a log after which its pages are released: the most that a long one occupies."""
+
 _HEAD = struct.Struct(">Iqqii")  # sync word, event number, utime, lengths of channel and data
 _SYNC_WORD = 0xEDA1DA01
 _SYNC = struct.pack(">I", _SYNC_WORD)
@@ -145,9 +148,14 @@ class LogFile:
 
     def read_from(self, offset: int = 0) -> Iterator[LogEvent]:
         self.damage.clear()
+        released = offset
         for each in scan(self._data, offset):
             if isinstance(each, LogEvent):
                 yield each
+                if each.end > released + RELEASED_BYTES and isinstance(self._data, mmap.mmap):
+                    released = each.end
+                    # what is read need not stay in this process; the kernel has it
+                    self._data.madvise(mmap.MADV_DONTNEED, 0, released - released % mmap.PAGESIZE)
             else:
                 self.damage.append(each)
 

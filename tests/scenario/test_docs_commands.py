@@ -42,9 +42,10 @@ REASONS = (
     "needs a signed vehicle; tests/scenario/test_pose_set.py runs it",
     "needs a Raptor vehicle file with that change; tests/scenario/test_demo.py runs it",
     "needs that copy; tests/scenario/test_demo.py runs it",
+    "needs other machines; tests/scenario/test_archive.py runs it",
     "takes minutes",
 )
-MOST_NOT_RUN = 16
+MOST_NOT_RUN = 17
 
 TUTORIAL = DOCS / "tutorial.md"
 IN_SOURCE = [ROOT / "README.md", DOCS / "quick-start.md", DOCS / "own-device.md", DOCS / "dynamics.md"]
@@ -61,6 +62,7 @@ AFTER_THE_ROVER = [
         "publish-samples.md",
         "moving-geometry.md",
         "recordings.md",
+        "archives.md",
         "calibration.md",
         "tuning.md",
         "deployment.md",

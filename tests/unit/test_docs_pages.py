@@ -32,11 +32,11 @@ LINKING = [
     *PAGES,
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "examples/README.md", "tests/realdata/README.md")),
 ]
-WORDS_AT_MOST = 32_500
+WORDS_AT_MOST = 33_700
 """Over README and what is written by hand in docs/, as `wc -w` counts: what `make docs` writes does not count, neither
 in the reference nor below the marks of other pages. They were 52,000, 29,300 without dynamics, and 30,800 without
 operation (metrics, backup, upgrade, exit codes)
-and frames added at run time."""
+and frames added at run time, and 32,500 without archives and the campaign's table."""
 
 
 @pytest.fixture(scope="module")

@@ -91,8 +91,11 @@ def open_cluster(scheduler: str = "", workers: int = 0) -> Iterator[Cluster]:
     the scheduler does not answer, or a worker of it has another version of the source.
     """
     require_extra("archive", "work on a cluster needs Dask")
+    import dask
     from distributed import Client, LocalCluster
 
+    # it keeps an hour of call trees, a third of a megabyte for each second
+    dask.config.set({"distributed.worker.profile.enabled": False})
     with block_interrupt():
         if scheduler:
             try:

@@ -35,7 +35,7 @@ MAX_LISTED: Final = 100
 
 
 @dataclass
-class Drive:
+class ArchivedDrive:
     """A drive of an archive with its figures. `invalid`: seconds by reason; `nis`: mean per degree of freedom by kind.
 
     `findings`: titles of the findings; `rejected` samples and measurements by source and reason; `level`: median of the
@@ -66,7 +66,7 @@ class Drive:
         return self.seconds * (1.0 - self.valid_share)
 
 
-def read_drives(url: str) -> list[Drive]:
+def read_drives(url: str) -> list[ArchivedDrive]:
     """Return the drives of an archive, worst first: those with an error, then by invalid time.
 
     Raises ModelServerError for what is no archive.
@@ -75,7 +75,7 @@ def read_drives(url: str) -> list[Drive]:
     if not rows:
         raise ModelServerError(f"{url}: no archive there: modelserver archive run LOGS -c vehicle.yaml --out {url}")
     drives = {
-        row["log"]: Drive(
+        row["log"]: ArchivedDrive(
             row["log"],
             row["content"],
             row["time"] if row["seconds"] else None,
@@ -95,7 +95,7 @@ def read_drives(url: str) -> list[Drive]:
     return sorted(drives.values(), key=lambda each: (not each.error, -each.invalid_seconds, each.log))
 
 
-def _add_metrics(drives: Mapping[str, Drive], rows: Iterable[Mapping[str, Any]]) -> None:
+def _add_metrics(drives: Mapping[str, ArchivedDrive], rows: Iterable[Mapping[str, Any]]) -> None:
     sums: defaultdict[str, defaultdict[tuple[str, str], float]] = defaultdict(lambda: defaultdict(float))
     levels: defaultdict[str, list[float]] = defaultdict(list)
     for row in rows:
@@ -125,7 +125,7 @@ def _read(url: str, table: str, condition: Any = None) -> list[dict[str, Any]]:
 # --- page ---------------------------------------------------------------------------------------------------
 
 
-def render_page(url: str, drives: Sequence[Drive], find_report: Callable[[Drive], str]) -> str:
+def render_page(url: str, drives: Sequence[ArchivedDrive], find_report: Callable[[ArchivedDrive], str]) -> str:
     """Return the page of an archive; `find_report` gives the link to a drive's own report, empty without one."""
     hours = sum(each.seconds for each in drives) / 3600.0
     poses, failed = sum(each.poses for each in drives), [each for each in drives if each.error]
@@ -153,7 +153,7 @@ def render_page(url: str, drives: Sequence[Drive], find_report: Callable[[Drive]
     return charts.render_page(f"Archive {escape(url)}", head + body + foot)
 
 
-def _render_worst(url: str, drives: Sequence[Drive], find_report: Callable[[Drive], str]) -> str:
+def _render_worst(url: str, drives: Sequence[ArchivedDrive], find_report: Callable[[ArchivedDrive], str]) -> str:
     prefix = os.path.commonpath([each.log for each in drives]) if len(drives) > 1 else ""
     lines = []
     for each in drives[:MAX_LISTED]:
@@ -201,7 +201,7 @@ def _render_worst(url: str, drives: Sequence[Drive], find_report: Callable[[Driv
     )
 
 
-def _render_reasons(drives: Sequence[Drive]) -> str:
+def _render_reasons(drives: Sequence[ArchivedDrive]) -> str:
     total = sum(each.seconds for each in drives)
     reasons: defaultdict[str, float] = defaultdict(float)
     affected: Counter[str] = Counter()
@@ -216,7 +216,7 @@ def _render_reasons(drives: Sequence[Drive]) -> str:
     return render_table(("reason", "s", "share of the time", "drives"), rows, (1, 2, 3)) if rows else "<p>None.</p>"
 
 
-def _render_findings(drives: Sequence[Drive]) -> str:
+def _render_findings(drives: Sequence[ArchivedDrive]) -> str:
     counts = Counter(title for each in drives for title in each.findings)
     rejected: Counter[str] = Counter()
     for each in drives:
@@ -227,7 +227,7 @@ def _render_findings(drives: Sequence[Drive]) -> str:
     return found + (render_table(("rejected: source and reason", "samples"), rows, (1,)) if rows else "")
 
 
-def _render_distributions(drives: Sequence[Drive]) -> str:
+def _render_distributions(drives: Sequence[ArchivedDrive]) -> str:
     whole = [each for each in drives if each.poses]
     if not whole:
         return "<p>No drive has a pose.</p>"
@@ -252,7 +252,7 @@ def _draw_distribution(title: str, values: Iterable[float]) -> Panel:
     )
 
 
-def _render_errors(failed: Sequence[Drive]) -> str:
+def _render_errors(failed: Sequence[ArchivedDrive]) -> str:
     if not failed:
         return "<p>None.</p>"
     return render_table(
@@ -269,10 +269,10 @@ class Figure(NamedTuple):
     name: str
     unit: str
     factor: float
-    compute: Callable[[Drive], tuple[float, float]]
+    compute: Callable[[ArchivedDrive], tuple[float, float]]
 
 
-def _deviate(drive: Drive) -> tuple[float, float]:
+def _deviate(drive: ArchivedDrive) -> tuple[float, float]:
     return sum(abs(math.log(max(nis, 1e-3))) for nis in drive.nis.values()), float(len(drive.nis))
 
 
@@ -304,7 +304,7 @@ class PairedFigure:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ArchiveComparison:
     """The drives of two archives compared; `only`: those of one archive alone."""
 
     pairs: int
@@ -316,7 +316,7 @@ class Comparison:
         return any(each.verdict == "worse" for each in self.figures)
 
 
-def compare(before: Sequence[Drive], after: Sequence[Drive]) -> Comparison:
+def compare(before: Sequence[ArchivedDrive], after: Sequence[ArchivedDrive]) -> ArchiveComparison:
     """Compare the drives of two archives log by log. Raises ModelServerError without a common log."""
     first, second = ({each.content: each for each in drives if each.content} for drives in (before, after))
     both = sorted(first.keys() & second.keys())
@@ -343,10 +343,10 @@ def compare(before: Sequence[Drive], after: Sequence[Drive]) -> Comparison:
                 *(int((difference < 0.0).sum()), int((difference > 0.0).sum())),
             )
         )
-    return Comparison(len(both), (len(first) - len(both), len(second) - len(both)), tuple(found))
+    return ArchiveComparison(len(both), (len(first) - len(both), len(second) - len(both)), tuple(found))
 
 
-def name_report(drive: Drive) -> str:
+def name_report(drive: ArchivedDrive) -> str:
     """Return the file name of a drive's own report."""
     stem = re.sub(r"[^A-Za-z0-9._-]", "_", Path(drive.log).stem)[:60]
     return f"{stem}-{digest(drive.log)[:8]}.html"

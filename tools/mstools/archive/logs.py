@@ -147,9 +147,15 @@ def _is_bag(path: Path) -> bool:
         return path.suffix in SUFFIXES[1:] or file.read(16).startswith(BAG_MAGICS)
 
 
-def compute_content(path: Path) -> str:
-    """Return a digest of a log's bytes, of a folder that of its files. Raises OSError."""
-    found = blake2b(digest_size=16)
+def identify(log: str) -> str:
+    """Return what identifies the content of a log: of one on this machine a digest of its bytes, of a folder's files.
+
+    Of a URL it is what the storage states of it without sending it, such as its ETag. Raises OSError.
+    """
+    if "://" in log:
+        fs, remote = _open_url(log)
+        return str(fs.ukey(remote))
+    path, found = Path(log), blake2b(digest_size=16)
     for each in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if each.is_file():
             found.update(f"{each.relative_to(path)}\0{os.path.getsize(each)}\0".encode())

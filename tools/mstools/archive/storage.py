@@ -121,7 +121,9 @@ class Storage:
 
     def _list(self, table: str) -> list[str]:
         self._fs.invalidate_cache()
-        return sorted(self._fs.ls(f"{self._root}/{table}", detail=False))
+        with suppress(FileNotFoundError):  # object storage has no empty folders
+            return sorted(self._fs.ls(f"{self._root}/{table}", detail=False))
+        return []
 
 
 def _name_of(path: str) -> str:

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from modelserver.errors import ModelServerError
+from modelserver.server.recordings import CSV_HEADER
 
 SCHEMA_VERSION: Final = 1
 
@@ -44,13 +45,9 @@ _COLUMNS: Final[Mapping[str, Mapping[str, pa.DataType]]] = {
     "poses": {
         "log": _TEXT,
         "time": _TIME,
-        **dict.fromkeys(("easting", "northing", "up", "qw", "qx", "qy", "qz"), _REAL),
-        "valid": pa.bool_(),
+        **dict.fromkeys(CSV_HEADER.split(",")[1:], _REAL),
+        "pose_valid": pa.bool_(),
         "invalid_reasons": pa.int32(),
-        **dict.fromkeys(("horizontal_protection_level", "heading_protection_level"), _REAL),
-        **dict.fromkeys(("sigma_east", "sigma_north", "sigma_up", "sigma_yaw"), _REAL),
-        **dict.fromkeys(("latitude_deg", "longitude_deg", "heading_deg"), _REAL),
-        **dict.fromkeys(("horizontal_level", "heading_level", "limit_risk"), _REAL),
     },
     "decisions": {
         "log": _TEXT,

@@ -25,7 +25,7 @@ from modelserver.messages import Decision, Event, Invalid, Verdict
 from modelserver.server.recordings import OfflineRun, TrackRow, relax_garbage_collector
 from modelserver.server.vehicle import Vehicle
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.archive.logs import compute_content, fetch, open_lcm_log
+from mstools.archive.logs import fetch, identify, open_lcm_log
 from mstools.archive.storage import UNREAD, Storage, digest
 from mstools.archive.tables import SCHEMA_VERSION, ArchiveError, TableWriter
 from mstools.report.findings import collect_findings, has_nis, is_position_reset
@@ -82,14 +82,13 @@ def run_task(task: Task) -> LogOutcome:
     started = time.process_time()
     storage = Storage(task.out)
     try:
-        with fetch(task.log) as path:
-            content = compute_content(path)
-            name = name_result(task.log, digest(content, task.settings))
-            if storage.has(name):
-                return LogOutcome(task.log, "unchanged")
-            relax_garbage_collector()
-            with storage.draft(name) as folder:
-                found = _write(task, folder, path, content)
+        content = identify(task.log)
+        name = name_result(task.log, digest(content, task.settings))
+        if storage.has(name):
+            return LogOutcome(task.log, "unchanged")
+        relax_garbage_collector()
+        with fetch(task.log) as path, storage.draft(name) as folder:
+            found = _write(task, folder, path, content)
     except OSError as error:
         return write_error(task, f"cannot be read: {error.strerror or error}")
     return found._replace(cpu=time.process_time() - started)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from mstools.terminal.output import (
 )
 
 if TYPE_CHECKING:
-    from mstools.archive.fleet import Drive
+    from mstools.archive.fleet import ArchivedDrive
     from mstools.archive.task import LogOutcome
 
 NEEDS_ARCHIVE = "archives need Dask and Arrow"
@@ -37,6 +38,9 @@ RATE_HZ = 10.0
 
 WORSE = 3
 """Exit code of a comparison whose second archive is worse."""
+
+LINE_PERIOD_S = 60.0
+"""Seconds between two lines of progress where there is no terminal for a bar."""
 
 MAX_PRINTED = 10
 """Drives that a report prints: the worst ones."""
@@ -102,7 +106,7 @@ def run(
     settings = digest_settings(vehicle, rate, hash_code())
     place = out if "://" in out else str(Path(out).absolute())
     tasks = [Task(log, vehicle, rate, settings, place) for log in find_logs(logs)]
-    started = time.monotonic()
+    started = printed = time.monotonic()
     outcomes: list[LogOutcome] = []
     with closing(Storage(place)) as storage:
         storage.prepare()
@@ -115,7 +119,11 @@ def run(
                 outcome = write_error(task, str(found)) if isinstance(found, ModelServerError) else found
                 outcomes.append(outcome)
                 rate_now = sum(each.seconds for each in outcomes) / (time.monotonic() - started)
-                show(len(outcomes), f"archiving, {rate_now:.0f} times real time")
+                label = f"archiving, {rate_now:.0f} times real time"
+                show(len(outcomes), label)
+                if not sys.stderr.isatty() and time.monotonic() > printed + LINE_PERIOD_S:
+                    printed = time.monotonic()
+                    typer.echo(f"{label}: {len(outcomes)} of {len(tasks)}", err=True)
                 if outcome.error:
                     typer.echo(escape(f"modelserver: {outcome.log}: {outcome.error}"), err=True)
     report_outcomes(outcomes, time.monotonic() - started, place, as_json)
@@ -173,7 +181,7 @@ def report(
         assert config is not None
         write_report(each, config, folder / name_report(each))
 
-    def find_report(each: Drive) -> str:
+    def find_report(each: ArchivedDrive) -> str:
         path = folder / name_report(each)
         return f"{folder.name}/{path.name}" if path.exists() else ""
 
@@ -189,7 +197,7 @@ def report(
     typer.echo(format_table(("drive", "valid", "invalid, s", "error"), rows, (1, 2)))
 
 
-def find_drive(drives: Sequence[Drive], name: str) -> Drive:
+def find_drive(drives: Sequence[ArchivedDrive], name: str) -> ArchivedDrive:
     """Return the drive of a log, by its path or its name. Raises RecordingError."""
     from modelserver.errors import find_nearest_names
 
@@ -203,7 +211,7 @@ def find_drive(drives: Sequence[Drive], name: str) -> Drive:
     raise RecordingError(f"{name}: no drive of the archive" + (f"; did you mean {near[0]}?" if near else ""))
 
 
-def write_report(drive: Drive, config: Path, page: Path) -> None:
+def write_report(drive: ArchivedDrive, config: Path, page: Path) -> None:
     """Write the replay report of a drive; one that cannot be read gets none, with a note."""
     from mstools.archive.logs import fetch, open_lcm_log
     from mstools.commands.replay import replay_offline
