@@ -32,7 +32,7 @@ LINKING = [
     *PAGES,
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "examples/README.md", "tests/realdata/README.md")),
 ]
-WORDS_AT_MOST = 33_700
+WORDS_AT_MOST = 33_800
 """Over README and what is written by hand in docs/, as `wc -w` counts: what `make docs` writes does not count, neither
 in the reference nor below the marks of other pages. They were 52,000, 29,300 without dynamics, and 30,800 without
 operation (metrics, backup, upgrade, exit codes)
