@@ -267,7 +267,7 @@ def read_pipe(job: tune.EvaluationJob) -> None:
     job.config.read_bytes()
 
 def command(log: Path, config: Path) -> None:
-    with tune._open_pool() as runs:
+    with tune.open_pool("") as runs:
         runs([tune.EvaluationJob(log, config, "half", ())] * 2)
 
 # in the workers too: each imports this file
