@@ -36,6 +36,7 @@ from benchmarks.integrity_drives import VEHICLES
 from modelserver.errors import ModelServerError
 from mstools.archive.cluster import hash_code, open_cluster
 from mstools.archive.statistics import compute_ratio_interval
+from mstools.archive.storage import digest
 from mstools.terminal.output import show_progress
 
 ROUND_HOURS: Final = sum(fault.quick[1] for fault in FAULTS) * len(VEHICLES) / 60.0
@@ -47,8 +48,8 @@ def plan_tasks(hours: float) -> Iterator[Task]:
     for number in range(math.ceil(hours / ROUND_HOURS)):
         for fault in FAULTS:
             for vehicle in VEHICLES:
-                digest = blake2b(f"{fault.name} {vehicle} {number}".encode(), digest_size=4).digest()
-                yield Task(fault.name, vehicle, int.from_bytes(digest, "big"), fault.quick[1] * 60.0)
+                seed = blake2b(f"{fault.name} {vehicle} {number}".encode(), digest_size=4).digest()
+                yield Task(fault.name, vehicle, int.from_bytes(seed, "big"), fault.quick[1] * 60.0)
 
 
 def run_drive(task: Task) -> dict[str, Any]:
@@ -156,7 +157,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=0, help="processes on this machine; default: one per core")
     parser.add_argument("--table", action="store_true", help="only print the table of what is there")
     options = parser.parse_args(arguments or [])
-    path = options.out / f"{blake2b(hash_code().encode(), digest_size=8).hexdigest()}.jsonl"
+    path = options.out / f"{digest(hash_code())}.jsonl"
     try:
         if not options.table:
             run(plan_tasks(options.hours), path, options.scheduler, options.workers)

@@ -20,7 +20,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from support_lcm import end_process
+from support_lcm import end_process, invoke
 from support_recordings import REPOSITORY
 from support_tuning import write_simulated_log
 
@@ -83,12 +83,10 @@ def read_table(archive: Path, table: str) -> list[dict[str, Any]]:
     return rows
 
 
-def call(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, str, str]:
+def call(*words: Any) -> tuple[int, str, str]:
     """Run a command here; return exit code and output."""
-    with pytest.raises(SystemExit) as end:
-        cli.main(["archive", *map(str, words)])
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
+    done = invoke("", "archive", *words)
+    return done.returncode, done.stdout, done.stderr
 
 
 def wait_for(condition: Callable[[], Any]) -> Any:
@@ -268,12 +266,7 @@ def _count_workers(address: str) -> int:
 
 
 def test_given_a_cluster_of_its_own_then_the_bytes_are_the_same_and_tune_scores_the_same(
-    logs: Path,
-    vehicle: Path,
-    reference: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    logs: Path, vehicle: Path, reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "archive"
     with dask_cluster() as address:
@@ -290,7 +283,7 @@ def test_given_a_cluster_of_its_own_then_the_bytes_are_the_same_and_tune_scores_
             found = runs(jobs)
         assert found == [evaluate(jobs[0]), None, evaluate(jobs[2]), None]
     monkeypatch.setattr("mstools.archive.cluster.CONNECT_S", 0.5)
-    code, _, err = call(capsys, "run", logs, "-c", vehicle, "--out", out, "--scheduler", address)
+    code, _, err = call("run", logs, "-c", vehicle, "--out", out, "--scheduler", address)
     assert code == 1
     assert "no scheduler answers" in err
 
@@ -314,7 +307,7 @@ def test_given_a_journal_a_bag_a_list_and_a_pattern_then_each_is_one_log(
 
 
 def test_given_a_worse_configuration_when_compared_then_the_exit_code_is_that_of_worse(
-    logs: Path, vehicle: Path, reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    logs: Path, vehicle: Path, reference: Path, tmp_path: Path
 ) -> None:
     worse = tmp_path / "vehicle.yaml"
     content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
@@ -323,32 +316,32 @@ def test_given_a_worse_configuration_when_compared_then_the_exit_code_is_that_of
     content["localization"]["filter"]["maximum_sigma"] = 0.001
     worse.write_text(yaml.safe_dump(content), encoding="utf-8")
     assert run(logs, worse, tmp_path / "worse")[0] == 0
-    code, out, _ = call(capsys, "compare", reference, tmp_path / "worse")
+    code, out, _ = call("compare", reference, tmp_path / "worse")
     assert code == 3, out
     assert re.search(r"invalid +% of the time.* worse$", out, re.MULTILINE)
-    code, out, _ = call(capsys, "compare", tmp_path / "worse", reference)
+    code, out, _ = call("compare", tmp_path / "worse", reference)
     assert code == 0, out
-    code, out, _ = call(capsys, "compare", reference, reference, "--json")
+    code, out, _ = call("compare", reference, reference, "--json")
     found = json.loads(out)
     assert (code, found["worse"], found["pairs"]) == (0, False, len(SECONDS))
     assert {each["low"] for each in found["figures"]} == {each["high"] for each in found["figures"]} == {0.0}
 
 
 def test_given_an_archive_then_the_page_has_its_drives_and_links_to_reports_on_demand(
-    logs: Path, vehicle: Path, reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    logs: Path, vehicle: Path, reference: Path, tmp_path: Path
 ) -> None:
     page = tmp_path / "page.html"
-    code, out, _ = call(capsys, "report", reference, "-o", page)
+    code, out, _ = call("report", reference, "-o", page)
     assert code == 0
     text = page.read_text()
     assert all(f">drive{number}.lcm<" in text for number in range(len(SECONDS)))
     assert 'href="page-drives' not in text
-    code, out, _ = call(capsys, "report", reference, "-o", page, "-c", vehicle, "--drive", "drive2.lcm", "--worst", 1)
+    code, out, _ = call("report", reference, "-o", page, "-c", vehicle, "--drive", "drive2.lcm", "--worst", 1)
     assert code == 0, out
     links = re.findall(r'href="(page-drives/[^"]+)"', page.read_text())
     assert len(links) == 2
     assert all("Replay report" in (tmp_path / link).read_text() for link in links)
-    code, _, err = call(capsys, "report", reference, "-o", page, "-c", vehicle, "--drive", "drive9.lcm")
+    code, _, err = call("report", reference, "-o", page, "-c", vehicle, "--drive", "drive9.lcm")
     assert (code, err) == (1, "modelserver: drive9.lcm: no drive of the archive; did you mean drive3.lcm?\n")
 
 
@@ -363,16 +356,11 @@ def test_given_an_archive_then_the_page_has_its_drives_and_links_to_reports_on_d
     ],
 )
 def test_given_no_input_then_the_error_names_it(
-    words: tuple[str, ...],
-    expected: str,
-    vehicle: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...], expected: str, vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
-    code, _, err = call(capsys, *(str(vehicle) if each == "VEHICLE" else each for each in words))
+    code, _, err = call(*(str(vehicle) if each == "VEHICLE" else each for each in words))
     assert code == 1
     assert err.startswith("modelserver: ")
     assert expected in err
@@ -380,13 +368,13 @@ def test_given_no_input_then_the_error_names_it(
 
 
 def test_given_an_archive_that_another_run_writes_then_the_second_one_is_refused(
-    logs: Path, vehicle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    logs: Path, vehicle: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "archive"
     process = start("run", logs, "-c", vehicle, "--out", out, "--workers", 1)
     try:
         wait_for_draft(out)
-        code, _, err = call(capsys, "run", logs, "-c", vehicle, "--out", out)
+        code, _, err = call("run", logs, "-c", vehicle, "--out", out)
         assert (code, "another run writes to it" in err) == (1, True)
     finally:
         end_process(process)

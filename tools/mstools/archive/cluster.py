@@ -91,11 +91,8 @@ def open_cluster(scheduler: str = "", workers: int = 0) -> Iterator[Cluster]:
     the scheduler does not answer, or a worker of it has another version of the source.
     """
     require_extra("archive", "work on a cluster needs Dask")
-    import dask
     from distributed import Client, LocalCluster
 
-    # it keeps an hour of call trees, a third of a megabyte for each second
-    dask.config.set({"distributed.worker.profile.enabled": False})
     with block_interrupt():
         if scheduler:
             try:
@@ -144,7 +141,10 @@ def hash_code() -> str:
 
 @contextmanager
 def block_interrupt() -> Iterator[None]:
-    """Block SIGINT: processes that start within inherit that, so that Ctrl-C in a terminal ends only this one."""
+    """Block SIGINT, which is delivered afterwards: processes that start within inherit that, and keep it.
+
+    Ctrl-C reaches all processes of a terminal: so it ends only this one, which ends them.
+    """
     # it unblocks the signal in the thread that starts it
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

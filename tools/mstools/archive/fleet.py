@@ -23,12 +23,10 @@ import numpy as np
 import pyarrow.dataset as ds
 
 from modelserver.errors import ModelServerError
-from modelserver.version import __version__
 from mstools.archive.statistics import compute_ratio_interval
 from mstools.archive.storage import Storage, digest
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, escape_text, render_figure, render_key_figures, render_table
-from mstools.terminal.output import escape
 
 MAX_LISTED: Final = 100
 """Drives in the table of the page: the worst ones."""
@@ -143,14 +141,8 @@ def render_page(url: str, drives: Sequence[ArchivedDrive], find_report: Callable
         ("distributions", "Distributions", _render_distributions(drives)),
         ("errors", "Errors of logs", _render_errors(failed)),
     ]
-    links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
-    body = "\n".join(f'<section id="{name}"><h2>{title}</h2>\n{text}\n</section>' for name, title, text in sections)
-    head = (
-        f'<header>\n<p class="kicker">Archive report</p>\n<h1>{escape_text(url)}</h1>\n'
-        f"{render_key_figures(figures)}\n<nav>{links}</nav>\n</header>\n"
-    )
-    foot = f"\n<footer>modelserver {__version__}; docs/archives.md explains each table</footer>"
-    return charts.render_page(f"Archive {escape(url)}", head + body + foot)
+    about = "docs/archives.md explains each table"
+    return charts.render_report(f"Archive {url}", ("Archive report", url), render_key_figures(figures), sections, about)
 
 
 def _render_worst(url: str, drives: Sequence[ArchivedDrive], find_report: Callable[[ArchivedDrive], str]) -> str:

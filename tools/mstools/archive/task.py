@@ -29,7 +29,7 @@ from mstools.archive.logs import fetch, identify, open_lcm_log
 from mstools.archive.storage import UNREAD, Storage, digest
 from mstools.archive.tables import SCHEMA_VERSION, ArchiveError, TableWriter
 from mstools.report.findings import collect_findings, has_nis, is_position_reset
-from mstools.report.replay_data import ReplayCollector, integrate_distance
+from mstools.report.replay_data import ReplayCollector, count_reasons, integrate_distance
 
 WINDOW_S: Final = 600.0
 """Length of the windows of findings and metrics, seconds: ten minutes have turns and stops enough for the findings, and
@@ -190,13 +190,8 @@ class DriveReplay:
             decision.utime,
             *(decision.source, decision.kind, verdict, decision.reason, decision.statistic, decision.dof),
         )
-        self._resets += is_position_reset(decision)
         if decision.verdict is Verdict.RESET:
             self._add_event(decision.utime, 0.0, "reset", "", f"{decision.kind}: {decision.reason}")
-        elif has_nis(decision):
-            self._nis[decision.kind] += decision.statistic
-            self._dof[decision.kind] += decision.dof
-        self._verdicts[f"{decision.kind} {verdict}"] += 1
 
     def _add_pose(self, row: TrackRow) -> None:
         self._poses += 1
@@ -233,10 +228,6 @@ class DriveReplay:
         self._collector = ReplayCollector(self._vehicle)
         self._flags: Counter[int] = Counter()
         self._levels: list[float] = []
-        self._nis: defaultdict[str, float] = defaultdict(float)
-        self._dof: Counter[str] = Counter()
-        self._verdicts: Counter[str] = Counter()
-        self._resets = 0
 
     def _close_window(self, end: int) -> None:
         """Write the metrics, rejections and findings of the window."""
@@ -250,24 +241,29 @@ class DriveReplay:
         distance = integrate_distance(data.snapshots)
         self._distance += distance
         period = 1.0 / self._rate
-        reasons: Counter[str] = Counter()
-        for bits, count in self._flags.items():
-            reasons.update({str(flag.name): count for flag in Invalid if bits & flag})
+        reasons = {str(flag.name): count for flag, count in count_reasons(self._flags).items()}
+        verdicts = Counter(f"{each.kind} {each.verdict.name.lower()}" for each in data.decisions)
+        nis: defaultdict[str, float] = defaultdict(float)
+        dof: Counter[str] = Counter()
+        for each in data.decisions:
+            if each.verdict is not Verdict.RESET and has_nis(each):
+                nis[each.kind] += each.statistic
+                dof[each.kind] += each.dof
         metrics: list[tuple[str, str, float]] = [
             ("distance", "", distance),
-            ("resets", "", float(self._resets)),
+            ("resets", "", float(sum(map(is_position_reset, data.decisions)))),
             ("valid_seconds", "", self._flags[0] * period),
             *(("invalid_seconds", name, count * period) for name, count in sorted(reasons.items())),
             *([("horizontal_level", "median", median(self._levels))] if self._levels else []),
             *(("samples", each.name, float(len(each.times))) for each in data.sensors),
-            *(("verdicts", name, float(count)) for name, count in sorted(self._verdicts.items())),
-            *(("nis_sum", kind, value) for kind, value in sorted(self._nis.items())),
-            *(("nis_dof", kind, float(count)) for kind, count in sorted(self._dof.items())),
+            *(("verdicts", name, float(count)) for name, count in sorted(verdicts.items())),
+            *(("nis_sum", kind, value) for kind, value in sorted(nis.items())),
+            *(("nis_dof", kind, float(count)) for kind, count in sorted(dof.items())),
         ]
         seconds = max(end - begin, 0) * 1e-6
         for metric in metrics:
             self._tables.add("metrics", begin, seconds, *metric)
         for (source, reason), count in rejected.items():
             self._tables.add("rejections", begin, source, reason, count)
-        for each in collect_findings(data):
-            self._add_event(begin, seconds, "finding", each.level, f"{each.title}: {each.observation}")
+        for found in collect_findings(data):
+            self._add_event(begin, seconds, "finding", found.level, f"{found.title}: {found.observation}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ModelServerError, RecordingError
+from modelserver.errors import ModelServerError, RecordingError, find_nearest_names
 from mstools.terminal.options import JsonOption, SchedulerOption, argument, option
 from mstools.terminal.output import (
     check_writable,
@@ -199,8 +199,6 @@ def report(
 
 def find_drive(drives: Sequence[ArchivedDrive], name: str) -> ArchivedDrive:
     """Return the drive of a log, by its path or its name. Raises RecordingError."""
-    from modelserver.errors import find_nearest_names
-
     names = {name, str(Path(name).absolute())}
     found = [each for each in drives if not names.isdisjoint((each.log, Path(each.log).name))]
     if len(found) == 1:

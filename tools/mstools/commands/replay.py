@@ -370,10 +370,9 @@ class ReplayCounts:
 
     def count_reasons(self) -> list[tuple[Invalid, int]]:
         """Return the number of poses with each invalid reason, the most frequent one first."""
-        reasons: Counter[Invalid] = Counter()
-        for bits, n in self.invalid.items():
-            reasons.update({flag: n for flag in Invalid if bits & flag})
-        return reasons.most_common()
+        from mstools.report.replay_data import count_reasons
+
+        return count_reasons(self.invalid).most_common()
 
     def as_data(self, run: OfflineRun, wall: float) -> dict[str, Any]:
         """Return the counts as JSON data; `wall`: duration of the run, seconds."""

@@ -26,7 +26,6 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
@@ -35,7 +34,7 @@ from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from statistics import fmean, median, median_high
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import typer
@@ -56,11 +55,9 @@ from modelserver.server.recordings import OfflineRun, TrackRow
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.transforms.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile
+from mstools.archive.cluster import Cluster, block_interrupt, open_cluster
 from mstools.terminal.options import SchedulerOption, argument, option
 from mstools.terminal.output import check_outputs, escape, format_count, show_progress, write_file
-
-if TYPE_CHECKING:
-    from mstools.archive.cluster import Cluster
 
 Settings: TypeAlias = Mapping[str, float]
 
@@ -272,8 +269,6 @@ def format_proposal(log: str, found: SearchResult) -> str:
 def open_pool(scheduler: str) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
     """Yield a function that runs jobs in parallel processes, or on a cluster, and returns their results in order."""
     if scheduler:
-        from mstools.archive.cluster import open_cluster
-
         with open_cluster(scheduler) as cluster:
             yield lambda jobs: _run_on(cluster, jobs)
         return
@@ -293,17 +288,13 @@ def open_pool(scheduler: str) -> Iterator[Callable[[Sequence[EvaluationJob]], li
 
 
 def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Future[EvaluationResult | None]]:
-    """Submit jobs and return their futures. SIGINT is blocked meanwhile, and delivered afterwards.
+    """Submit jobs and return their futures, without an interrupt.
 
     Submitting starts workers. One whose start is interrupted would run unknown to the pool, and one that is still
-    importing would print a traceback: Ctrl-C reaches all processes of a terminal. Workers inherit the mask and keep
-    it, so only the process that started them ends by Ctrl-C, and ends them.
+    importing would print a traceback.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
+    with block_interrupt():
         return [pool.submit(_run, job) for job in jobs]
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run_on(cluster: Cluster, jobs: Sequence[EvaluationJob]) -> list[EvaluationResult | None]:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.transforms.so3 import Array
+from modelserver.version import __version__
 from mstools.terminal.output import escape, require_extra
 
 NEEDS_PLOTLY = "reports need plotly"
@@ -351,6 +352,23 @@ def render_key_figures(figures: Iterable[tuple[str, str]]) -> str:
     """Return values with what they are, in large type."""
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
     return f'<div class="figures">{cells}</div>'
+
+
+def render_report(
+    title: str, heads: Sequence[str], figures: str, sections: Sequence[tuple[str, str, str]], about: str
+) -> str:
+    """Return a page of sections (name, title, HTML) below key figures, with links to them. Raises as `render_page`.
+
+    heads: kind of the report, its subject, and lines below, as text; about: what explains it.
+    """
+    kicker, subject, *lines = map(escape_text, heads)
+    links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
+    body = "\n".join(f'<section id="{name}"><h2>{title}</h2>\n{text}\n</section>' for name, title, text in sections)
+    below = "".join(f"<p>{line}</p>\n" for line in lines)
+    top = f'<p class="kicker">{kicker}</p>\n<h1>{subject}</h1>\n{below}{figures}\n<nav>{links}</nav>'
+    head = f"<header>\n{top}\n</header>\n"
+    foot = f"\n<footer>modelserver {__version__}; {about}</footer>"
+    return render_page(escape(title), head + body + foot)
 
 
 def render_page(title: str, body: str) -> str:

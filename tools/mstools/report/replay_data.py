@@ -11,7 +11,7 @@ without turns or straight driving there is nothing to compare, and the compariso
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -663,6 +663,14 @@ def integrate_distance(snapshots: Sequence[StateSample]) -> float:
     return sum(
         abs(b.speed) * (b.t - a.t) for a, b in pairwise(snapshots) if math.isfinite(b.speed) and b.t - a.t < HOLD_S
     )
+
+
+def count_reasons(counts: Mapping[int, int]) -> Counter[Invalid]:
+    """Return the number of poses with each invalid reason, from the numbers by the bits of all their reasons."""
+    reasons: Counter[Invalid] = Counter()
+    for bits, count in counts.items():
+        reasons.update({flag: count for flag in Invalid if bits & flag})
+    return reasons
 
 
 def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> StateSample | None:

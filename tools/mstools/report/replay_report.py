@@ -9,7 +9,6 @@ from datetime import UTC, datetime
 from itertools import cycle, pairwise
 
 from modelserver.messages import Decision, Invalid, Mode, Verdict
-from modelserver.version import __version__
 from mstools.report import charts
 from mstools.report.charts import (
     Axis,
@@ -64,19 +63,10 @@ def render_page(data: ReplayData) -> str:
         ("states", "Biases, wheels and other states", _render_states(data)),
         ("verdicts", "Verdicts", _render_verdicts(data)),
     ]
-    links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
-    body = "\n".join(f'<section id="{name}"><h2>{title}</h2>\n{text}\n</section>' for name, title, text in sections)
     began = datetime.fromtimestamp(data.first_utime * 1e-6, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    head = f"""<header>
-<p class="kicker">Replay report</p>
-<h1>{escape_text(data.vehicle)}</h1>
-<p>{escape_text(data.log)}, start {began}, {data.duration:.0f} s</p>
-{_list_key_figures(data)}
-<nav>{links}</nav>
-</header>
-"""
-    foot = f"\n<footer>modelserver {__version__}; docs/tuning.md explains each chart</footer>"
-    return charts.render_page(f"{escape(data.vehicle)}: replay of {escape(data.log)}", head + body + foot)
+    heads = ("Replay report", data.vehicle, f"{data.log}, start {began}, {data.duration:.0f} s")
+    title = f"{data.vehicle}: replay of {data.log}"
+    return charts.render_report(title, heads, _render_key_figures(data), sections, "docs/tuning.md explains each chart")
 
 
 def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
@@ -95,7 +85,7 @@ def _time_axis(data: ReplayData) -> Axis:
 # --- key figures and findings -------------------------------------------------------------------------------
 
 
-def _list_key_figures(data: ReplayData) -> str:
+def _render_key_figures(data: ReplayData) -> str:
     states = data.snapshots
     distance = integrate_distance(states)
     sigmas = sorted(each.sigma for each in states if math.isfinite(each.sigma))
