@@ -27,9 +27,15 @@ from mstools.archive.statistics import compute_ratio_interval
 from mstools.archive.storage import Storage, digest
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, escape_text, render_figure, render_key_figures, render_table
+from mstools.terminal.output import format_count
 
 MAX_LISTED: Final = 100
 """Drives in the table of the page: the worst ones."""
+
+
+MIN_PAIRS: Final = 8
+"""Fewest drives of a comparison. The interval of n drives excludes zero where all changed alike, which chance does with
+2^-n on each side: 0.4 %, for each of five figures."""
 
 
 @dataclass
@@ -312,8 +318,11 @@ def compare(before: Sequence[ArchivedDrive], after: Sequence[ArchivedDrive]) -> 
     """Compare the drives of two archives log by log. Raises ModelServerError without a common log."""
     first, second = ({each.content: each for each in drives if each.content} for drives in (before, after))
     both = sorted(first.keys() & second.keys())
-    if not both:
-        raise ModelServerError("the two archives have no log in common: run both over the same logs")
+    if len(both) < MIN_PAIRS:
+        raise ModelServerError(
+            f"the two archives have {format_count(len(both), 'log')} in common; a change differs from chance in "
+            f"{MIN_PAIRS} or more: run both over the same logs"
+        )
     level = 1.0 - 0.05 / len(FIGURES)
     found = []
     for figure in FIGURES:
