@@ -320,7 +320,8 @@ class OfflineRun:
 def relax_garbage_collector() -> None:
     """Search for cycles seldom: searching long-lived tuples for them costs a sixth of a replay's time."""
     gc.collect()
-    gc.freeze()
+    if not gc.get_freeze_count():  # what a process of many replays has at the time of a later one would never be freed
+        gc.freeze()
     gc.set_threshold(50_000, 20, 100)
 
 

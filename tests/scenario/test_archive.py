@@ -12,21 +12,30 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import fsspec
 import psutil
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from fsspec.implementations.memory import MemoryFileSystem
 from support_lcm import end_process, invoke
 from support_recordings import REPOSITORY
 from support_tuning import write_simulated_log
 
+from modelserver.config.vehicle_file import load_config
 from modelserver.server.recordings import CSV_HEADER
+from modelserver.server.vehicle import load_vehicle
 from mstools import cli
+from mstools.archive.fleet import read_drives
+from mstools.archive.logs import find_logs
+from mstools.archive.storage import Storage, digest
 from mstools.archive.tables import SCHEMA_VERSION, TABLES
+from mstools.archive.task import Task, run_task
 from mstools.commands.tune import PARTS, EvaluationJob, evaluate, open_pool
 
 pytestmark = pytest.mark.slow
@@ -304,6 +313,55 @@ def test_given_a_journal_a_bag_a_list_and_a_pattern_then_each_is_one_log(
     assert rows.keys() == {"drive0.lcm", "drive1.lcm", "journal-Raptor", "drive2.mcap"}
     assert rows["journal-Raptor"]["messages"] == rows["drive0.lcm"]["messages"] + rows["drive1.lcm"]["messages"]
     assert rows["drive2.mcap"]["valid"] > 0
+
+
+class ObjectStore(MemoryFileSystem):
+    """As S3 by s3fs: its order of arguments, refused ranges, errors of its own."""
+
+    protocol = "objects"
+    store: ClassVar[dict[str, Any]] = {}
+    pseudo_dirs: ClassVar[list[str]] = [""]
+    offline: ClassVar[set[str]] = set()
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return str(super()._strip_protocol(path.replace("objects://", "memory://")))
+
+    def cat_file(self, path: str, version_id: str | None = None, start: int = 0, end: int | None = None) -> Any:
+        size = self.info(path)["size"]
+        if version_id is not None or start >= size:
+            raise OSError(22, "The requested range is not satisfiable")
+        return super().cat_file(path, start, end)
+
+    def get_file(self, rpath: str, lpath: str, **_: Any) -> None:
+        if rpath in self.offline:
+            raise RuntimeError("could not connect to the endpoint")
+        super().get_file(rpath, lpath)
+
+
+def test_given_object_storage_then_its_logs_are_found_fetched_and_written_there(logs: Path, vehicle: Path) -> None:
+    fsspec.register_implementation("objects", ObjectStore, clobber=True)
+    fs = fsspec.filesystem("objects")
+    for name, source in (("a/0.lcm", 4), ("a/lcmlog.01", 5), ("b.lcm", 6)):
+        fs.put_file(str(logs / f"drive{source}.lcm"), f"/fleet/{name}")
+    fs.pipe({"/fleet/notes.md": b"short", "/fleet/empty.dat": b""})
+    ObjectStore.offline.add("/fleet/b.lcm")
+    found = find_logs(["objects://fleet"])
+    assert found == ["objects:///fleet/a/0.lcm", "objects:///fleet/a/lcmlog.01", "objects:///fleet/b.lcm"]
+    task = Task("", load_vehicle(load_config(vehicle), str(vehicle)), 10.0, "", "objects://archive")
+
+    def archive() -> list[str]:
+        with closing(Storage(task.out)) as storage:
+            present = storage.prepare()
+        return [run_task(replace(task, log=each, present=present.get(digest(each), ()))).state for each in found]
+
+    assert archive() == ["written", "written", "failed"]
+    drives = {each.log: each for each in read_drives(task.out)}
+    assert "RuntimeError: could not connect to the endpoint" in drives[found[2]].error
+    assert drives[found[0]].seconds == pytest.approx(SECONDS[4], abs=0.5)
+    ObjectStore.offline.clear()
+    assert archive() == ["unchanged", "unchanged", "written"]
+    assert len(fs.find("/archive")) == len(TABLES) * len(found)
 
 
 def test_given_a_worse_configuration_when_compared_then_the_exit_code_is_that_of_worse(

@@ -91,6 +91,7 @@ def open_cluster(scheduler: str = "", workers: int = 0) -> Iterator[Cluster]:
     the scheduler does not answer, or a worker of it has another version of the source.
     """
     require_extra("archive", "work on a cluster needs Dask")
+    import dask
     from distributed import Client, LocalCluster
 
     with block_interrupt():
@@ -104,14 +105,16 @@ def open_cluster(scheduler: str = "", workers: int = 0) -> Iterator[Cluster]:
                 ) from None
             cluster = None
         else:
-            cluster = LocalCluster(
-                n_workers=workers or os.cpu_count() or 1,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                memory_limit=0,  # a task's memory is bounded, and pages of a mapped log would count
-                silence_logs=logging.CRITICAL,  # a worker that ends is seen by its task
-            )
+            # a worker holds the profiles of an hour's seconds: 1 GB
+            with dask.config.set({"distributed.worker.profile.enabled": False}):
+                cluster = LocalCluster(
+                    n_workers=workers or os.cpu_count() or 1,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,  # a task's memory is bounded, and pages of a mapped log would count
+                    silence_logs=logging.CRITICAL,  # a worker that ends is seen by its task
+                )
             client = Client(cluster, set_as_default=False)
     try:
         if scheduler:

@@ -24,7 +24,7 @@ import pyarrow.dataset as ds
 
 from modelserver.errors import ModelServerError
 from mstools.archive.statistics import compute_ratio_interval
-from mstools.archive.storage import Storage, digest
+from mstools.archive.storage import Storage, digest, unify_errors
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, escape_text, render_figure, render_key_figures, render_table
 from mstools.terminal.output import format_count
@@ -121,8 +121,9 @@ def _read(url: str, table: str, condition: Any = None) -> list[dict[str, Any]]:
     storage = Storage(url)
     if not storage.exists(table):
         return []
-    found = ds.dataset(storage.path(table), format="parquet", filesystem=storage.filesystem)
-    rows: list[dict[str, Any]] = found.to_table(filter=condition).to_pylist()
+    with unify_errors(url):
+        found = ds.dataset(storage.path(table), format="parquet", filesystem=storage.filesystem)
+        rows: list[dict[str, Any]] = found.to_table(filter=condition).to_pylist()
     return rows
 
 

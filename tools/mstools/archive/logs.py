@@ -19,10 +19,14 @@ from typing import Any, Final
 
 from modelserver.errors import ModelServerError
 from modelserver.server.journal.writer import list_segments
+from mstools.archive.storage import open_filesystem, unify_errors
 from mstools.recordings.bag_log import import_bag
 
 LCM_MAGIC: Final = b"\xed\xa1\xda\x01"
 BAG_MAGICS: Final = (b"#ROSBAG V", b"\x89MCAP0\r\n")
+BEGINNING: Final = 16
+"""Bytes read of a file to recognize it: more than each of these."""
+
 SUFFIXES: Final = (".lcm", ".bag", ".mcap")
 """Names of recordings: one of these is a log also if its beginning is damaged."""
 
@@ -82,30 +86,28 @@ def _is_one(folder: Path) -> bool:
 
 def _begins_as_recording(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(16).startswith((LCM_MAGIC, *BAG_MAGICS))
+        return file.read(BEGINNING).startswith((LCM_MAGIC, *BAG_MAGICS))
 
 
 def _expand_url(given: str) -> Iterator[str]:
-    fs, path = _open_url(given)
-    if glob.has_magic(path):
-        matches = fs.glob(path)
-    elif fs.isdir(path):
-        matches = fs.find(path)
-    else:
-        matches = [path]
-    for each in sorted(matches):
-        if each == path or each.endswith(SUFFIXES) or fs.cat_file(each, 0, 16).startswith((LCM_MAGIC, *BAG_MAGICS)):
-            yield fs.unstrip_protocol(each)
+    fs, path = open_filesystem(given)
+    with unify_errors(given):
+        if glob.has_magic(path):
+            matches = fs.glob(path, detail=True)
+        elif fs.isdir(path):
+            matches = fs.find(path, detail=True)
+        else:
+            matches = {path: fs.info(path)}
+        for each, info in sorted(matches.items()):
+            if info["type"] == "file" and (
+                each == path or each.endswith(SUFFIXES) or _begins_as_recording_at(fs, each, info["size"])
+            ):
+                yield fs.unstrip_protocol(each)
 
 
-def _open_url(url: str) -> tuple[Any, str]:
-    import fsspec
-
-    try:
-        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
-    except (ValueError, ImportError) as error:
-        raise ModelServerError(f"{url}: {error}; install the package of this file system on all workers") from None
-    return found
+def _begins_as_recording_at(fs: Any, path: str, size: int) -> bool:
+    # storage refuses a range of an empty file; the order of the arguments differs between file systems
+    return size >= BEGINNING and bool(fs.cat_file(path, start=0, end=BEGINNING).startswith((LCM_MAGIC, *BAG_MAGICS)))
 
 
 @contextmanager
@@ -114,10 +116,11 @@ def fetch(log: str) -> Iterator[Path]:
     if "://" not in log:
         yield Path(log)
         return
-    fs, remote = _open_url(log)
+    fs, remote = open_filesystem(log)
     with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
         path = Path(folder) / Path(remote).name
-        fs.get_file(remote, str(path))
+        with unify_errors(log):
+            fs.get_file(remote, str(path))
         yield path
 
 
@@ -144,7 +147,7 @@ def open_lcm_log(path: Path) -> Iterator[Path]:
 
 def _is_bag(path: Path) -> bool:
     with path.open("rb") as file:
-        return path.suffix in SUFFIXES[1:] or file.read(16).startswith(BAG_MAGICS)
+        return path.suffix in SUFFIXES[1:] or file.read(BEGINNING).startswith(BAG_MAGICS)
 
 
 def identify(log: str) -> str:
@@ -153,8 +156,9 @@ def identify(log: str) -> str:
     Of a URL it is what the storage states of it without sending it, such as its ETag. Raises OSError.
     """
     if "://" in log:
-        fs, remote = _open_url(log)
-        return str(fs.ukey(remote))
+        fs, remote = open_filesystem(log)
+        with unify_errors(log):
+            return str(fs.ukey(remote))
     path, found = Path(log), blake2b(digest_size=16)
     for each in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if each.is_file():

@@ -12,12 +12,14 @@ from __future__ import annotations
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, Any, Final
 
+from modelserver.errors import ModelServerError
 from mstools.archive.tables import TABLES, ArchiveError, explain_errors
 
 DRAFTS: Final = ".drafts"
@@ -32,22 +34,45 @@ def digest(*parts: str) -> str:
     return blake2b("\0".join(parts).encode(), digest_size=8).hexdigest()
 
 
+def open_filesystem(url: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a URL, and the path in it. Raises ModelServerError for an unknown kind."""
+    import fsspec
+
+    try:
+        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
+    except (ValueError, ImportError) as error:
+        raise ModelServerError(f"{url}: {error}; install the package of this file system on all workers") from None
+    return found
+
+
+@contextmanager
+def unify_errors(url: str) -> Iterator[None]:
+    """Raise what reading from a file system raises as an OSError: those in object storage have errors of their own."""
+    try:
+        yield
+    except (OSError, ModelServerError):
+        raise
+    except Exception as error:
+        raise OSError(0, f"{type(error).__name__}: {error}", url) from None
+
+
 class Storage:
     """An archive by its path or URL. Raises ArchiveError where it cannot be written."""
 
     def __init__(self, url: str):
-        import fsspec
-
         self.url = url
-        self._fs, self._root = fsspec.core.url_to_fs(url)
+        self._fs, self._root = open_filesystem(url)
         self.is_local = "file" in _protocols(self._fs)
         self._lock: IO[Any] | None = None
 
     def path(self, table: str, name: str = "") -> str:
         return f"{self._root}/{table}{f'/{name}.parquet' if name else ''}"
 
-    def prepare(self) -> None:
-        """Make the folders, remove what an interrupted run left, and lock a local archive until `close`."""
+    def prepare(self) -> dict[str, tuple[str, ...]]:
+        """Make the folders, remove what an interrupted run left, and lock a local archive until `close`.
+
+        Returns the names of the results by digest of the log: the archive is listed once, and by no task.
+        """
         with explain_errors(self.url):
             for table in (*TABLES, DRAFTS):
                 self._fs.makedirs(f"{self._root}/{table}", exist_ok=True)
@@ -65,6 +90,10 @@ class Storage:
                 for path in self._list(table):
                     if _name_of(path) not in whole:
                         self._fs.rm(path)
+        found: defaultdict[str, list[str]] = defaultdict(list)
+        for name in sorted(whole):
+            found[name.partition("-")[0]].append(name)
+        return {log: tuple(names) for log, names in found.items()}
 
     def close(self) -> None:
         """Remove what killed workers left, and unlock."""
@@ -83,14 +112,12 @@ class Storage:
         return self._fs
 
     def exists(self, table: str) -> bool:
-        return bool(self._fs.exists(self.path(table)))
-
-    def has(self, name: str) -> bool:
-        return bool(self._fs.exists(self.path(LAST, name)))
+        with unify_errors(self.url):
+            return bool(self._fs.exists(self.path(table)))
 
     @contextmanager
-    def draft(self, name: str) -> Iterator[Path]:
-        """Give a folder for the files of a log; at the end of the block they replace those of its other results."""
+    def draft(self, name: str, others: Iterable[str]) -> Iterator[Path]:
+        """Give a folder for the files of a log; at the end of the block they replace those of its `others`."""
         parent = f"{self._root}/{DRAFTS}" if self.is_local else None
         with explain_errors(self.url):
             folder = tempfile.TemporaryDirectory(prefix=f"{name}.", dir=parent)
@@ -99,10 +126,9 @@ class Storage:
             with explain_errors(self.url):
                 for table in (*OTHERS, LAST):
                     self._move(Path(place) / f"{table}.parquet", table, name)
-                log = name.partition("-")[0]
-                for path in self._fs.glob(f"{self._root}/{LAST}/{log}-*.parquet"):
-                    if _name_of(path) != name:
-                        self._remove(_name_of(path))
+                for other in others:
+                    if other != name:
+                        self._remove(other)
 
     def _move(self, path: Path, table: str, name: str) -> None:
         if self.is_local:

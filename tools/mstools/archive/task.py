@@ -41,13 +41,17 @@ MAX_ERRORS: Final = 10
 
 @dataclass(frozen=True)
 class Task:
-    """A log to archive in `out`. `settings`: digest of vehicle file, geometry, rate and code."""
+    """A log to archive in `out`. `settings`: digest of vehicle file, geometry, rate and code.
+
+    `present`: names of its results there.
+    """
 
     log: str
     vehicle: Vehicle
     rate: float
     settings: str
     out: str
+    present: tuple[str, ...] = ()
 
 
 class LogOutcome(NamedTuple):
@@ -80,14 +84,13 @@ def run_task(task: Task) -> LogOutcome:
     Raises ArchiveError where the archive cannot be written.
     """
     started = time.process_time()
-    storage = Storage(task.out)
     try:
         content = identify(task.log)
         name = name_result(task.log, digest(content, task.settings))
-        if storage.has(name):
+        if name in task.present:
             return LogOutcome(task.log, "unchanged")
         relax_garbage_collector()
-        with fetch(task.log) as path, storage.draft(name) as folder:
+        with fetch(task.log) as path, Storage(task.out).draft(name, task.present) as folder:
             found = _write(task, folder, path, content)
     except OSError as error:
         return write_error(task, f"cannot be read: {error.strerror or error}")
@@ -96,7 +99,8 @@ def run_task(task: Task) -> LogOutcome:
 
 def write_error(task: Task, error: str) -> LogOutcome:
     """Write the row of a log that could not be read, or whose workers ended. Raises ArchiveError."""
-    with Storage(task.out).draft(name_result(task.log, UNREAD)) as folder, TableWriter(folder, task.log) as tables:
+    name = name_result(task.log, UNREAD)
+    with Storage(task.out).draft(name, task.present) as folder, TableWriter(folder, task.log) as tables:
         tables.add_drive("", task.vehicle.config.vehicle, 0, 0.0, 0.0, 0, 0, 0, 0, 0, error)
     return LogOutcome(task.log, "failed", error=error)
 

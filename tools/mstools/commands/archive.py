@@ -97,7 +97,7 @@ def run(
     from modelserver.server.vehicle import load_vehicle
     from mstools.archive.cluster import hash_code, open_cluster
     from mstools.archive.logs import find_logs
-    from mstools.archive.storage import Storage
+    from mstools.archive.storage import Storage, digest
     from mstools.archive.task import Task, digest_settings, run_task, write_error
 
     vehicle = load_vehicle(load_config(config), str(config))
@@ -105,11 +105,12 @@ def run(
         raise RecordingError(f"{config}: no localization sensor is configured (section 'sensors' is empty)")
     settings = digest_settings(vehicle, rate, hash_code())
     place = out if "://" in out else str(Path(out).absolute())
-    tasks = [Task(log, vehicle, rate, settings, place) for log in find_logs(logs)]
+    names = find_logs(logs)
     started = printed = time.monotonic()
     outcomes: list[LogOutcome] = []
     with closing(Storage(place)) as storage:
-        storage.prepare()
+        present = storage.prepare()
+        tasks = [Task(log, vehicle, rate, settings, place, present.get(digest(log), ())) for log in names]
         with (
             open_cluster(scheduler, workers) as cluster,
             show_progress("archiving", len(tasks)) as show,
