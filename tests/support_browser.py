@@ -95,8 +95,13 @@ def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[P
 
 
 @contextmanager
-def show(browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5) -> Iterator[Page]:
-    """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_link`."""
+def show(
+    browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5, path: str = "scene"
+) -> Iterator[Page]:
+    """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_link`.
+
+    `path`: `scene` shows the scene with its tabs alone, an empty one the whole page.
+    """
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
@@ -106,8 +111,8 @@ def show(browser: Browser, source: Source, editing: Editing | None = None, sharp
     thread = threading.Thread(target=viewer.run, args=(stop.is_set,))
     thread.start()
     try:
-        with open_link(browser, served.link, sharpness) as page:
-            page.get_by_role("tab", name="Query").wait_for()
+        with open_link(browser, f"{served.link}{path}", sharpness) as page:
+            (page if path else page.frame_locator("#scene")).get_by_role("tab", name="Query").wait_for()
             yield page
     finally:
         stop.set()

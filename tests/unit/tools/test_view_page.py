@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import http.client
+import json
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from urllib.parse import urlsplit
 
 import pytest
@@ -20,7 +21,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.http11 import Request
 from websockets.typing import Subprotocol
 
-from mstools.view.page import COOKIE, Guard, Page, ViewError, open_page
+from mstools.view.page import COOKIE, Guard, Page, Reply, ViewError, open_page
 
 GUARD = Guard(frozenset({"127.0.0.1:8080", "localhost:8080"}))
 
@@ -55,6 +56,11 @@ def fetch(page: Page, path: str = "/", **headers: str) -> http.client.HTTPRespon
         ({"Host": "attacker.example:8080"}, False),
         ({"Origin": "http://attacker.example"}, False),
         ({"Origin": "null"}, False),
+        ({"Sec-Fetch-Site": "same-origin"}, True),
+        # an image in another page
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}, False),
+        # a link in another page
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}, True),
         ({"Origin": "http://127.0.0.1:8080.attacker.example"}, False),
     ],
 )
@@ -91,11 +97,22 @@ def test_given_a_token_then_the_name_of_the_machine_does_not_matter_but_other_pa
     assert guard.find_problem(make_request(path, Host=host, Origin="http://attacker.example")) != ""
 
 
-def test_given_a_browser_on_this_machine_then_it_gets_the_page_and_nobody_may_frame_it(page: Page) -> None:
-    response = fetch(page)
+def test_given_a_browser_on_this_machine_then_it_gets_the_page_and_no_other_page_may_frame_it(page: Page) -> None:
+    response = fetch(page, "/scene")
     assert response.status == 200
-    assert response.getheader("X-Frame-Options") == "DENY"
+    assert response.getheader("X-Frame-Options") == "SAMEORIGIN"
     assert fetch(page, Host="attacker.example").status == 403
+
+
+def test_given_answers_of_the_page_then_they_are_sent_and_errors_have_their_status(page: Page) -> None:
+    def respond(path: str, query: Mapping[str, str]) -> Reply | None:
+        if path == "/bad":
+            raise ValueError("at must be a number")
+        return Reply(json.dumps(dict(query)).encode()) if path == "/state" else None
+
+    page.respond = respond
+    assert fetch(page, "/state?at=1&at=2").getheader("Cache-Control") == "no-store"
+    assert [fetch(page, path).status for path in ("/state", "/bad", "/other", "/../etc/passwd")] == [200, 400, 404, 404]
 
 
 def test_given_another_web_page_then_its_websocket_is_denied(page: Page) -> None:
@@ -115,16 +132,16 @@ def test_given_another_web_page_then_its_websocket_is_denied(page: Page) -> None
 def test_given_a_page_beyond_loopback_then_its_link_has_the_token_that_it_needs() -> None:
     page = open_page("0.0.0.0", 0)
     try:
-        path, query = urlsplit(page.link).path, urlsplit(page.link).query
+        query = urlsplit(page.link).query
         host = urlsplit(page.link).netloc
         assert fetch(page, Host=host).status == 403
-        response = fetch(page, f"{path}?{query}", Host=host)
+        response = fetch(page, f"/scene?{query}", Host=host)
         assert response.status == 200
         cookie = response.getheader("Set-Cookie") or ""
         assert "HttpOnly" in cookie
         # browsers send a cookie to all ports of a machine
         assert cookie.startswith(f"{COOKIE}_{urlsplit(page.link).port}=")
-        assert fetch(page, Host=host, Cookie=cookie.partition(";")[0]).status == 200
+        assert fetch(page, "/scene", Host=host, Cookie=cookie.partition(";")[0]).status == 200
     finally:
         page.close()
 

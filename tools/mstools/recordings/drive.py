@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.earth import Origin
-from modelserver.earth.geodesy import GeodesyError, geodesy_of
+from modelserver.earth.geodesy import GeodesyError, geodesy_of, origin_at
 from modelserver.errors import QueryError, WireError
 from modelserver.formats.yaml_geometry import decode_snapshot
 from modelserver.geometry.joint import Coordinates, coordinate_names
@@ -80,7 +80,7 @@ REPEATED_EVENT_US: Final = 1_000_000
 SOURCE_OFFSET: Final = 48
 """Offset of the source in the bytes of a sample, behind fingerprint and the numbers of sensor_header_t."""
 
-POSITION: Final = "gps_position"
+POSITION_KIND: Final = "gps_position"
 """The kind of decisions that are about the position of a fix."""
 
 
@@ -176,23 +176,31 @@ class Table:
 
 @dataclass(slots=True)
 class ChannelCount:
-    """Messages of a channel: their number, receive time of the last, and rate in Hz over the last seconds."""
+    """Messages of a channel: their number, receive time of the last, and rate in Hz over the last seconds.
+
+    `course` has the rate of each second, and the longest time from a stamp to the reception in it, seconds.
+    """
 
     count: int = 0
     last: int = 0
     rate: float = math.nan
+    course: Table = field(default_factory=lambda: Table(2))
     _first: int = 0
     _since: int = 0
     _counted: int = 1
+    _latency: float = math.nan
 
-    def add(self, now: int) -> None:
+    def add(self, now: int, stamp: int = 0) -> None:
         if not self.count:
             self._first = self._since = now
         self.count += 1
         self.last = now
+        if stamp:
+            self._latency = max((now - stamp) * 1e-6, self._latency if math.isfinite(self._latency) else -math.inf)
         if now - self._since >= 1_000_000:
             self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
-            self._since, self._counted = now, self.count
+            self.course.append(now, self.rate, self._latency)
+            self._since, self._counted, self._latency = now, self.count, math.nan
 
     @property
     def mean_rate(self) -> float:
@@ -217,10 +225,12 @@ class Picture(NamedTuple):
 
 
 # columns of the table of poses
-_POSITION, _QUATERNION, _COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 13)
-_HORIZONTAL, _HEADING, _INVALID, _EPOCH = range(13, 17)
+POSITION, QUATERNION, COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 13)
+HORIZONTAL, HEADING, INVALID, EPOCH = range(13, 17)
 _POSE_COLUMNS: Final = 17
 _UPPER: Final = np.triu_indices(3)
+FIX_POSITION, FIX_COLOR, FIX_COLUMNS = slice(3, 6), 6, 10
+
 MAX_INTERPOLATION_US: Final = 1_000_000
 """Longest time between two poses that is interpolated."""
 
@@ -229,8 +239,9 @@ MAX_INTERPOLATION_US: Final = 1_000_000
 class Drive:
     """What is known of a drive. Channels have the prefix `prefix`; `model` is the geometry, from a snapshot or given.
 
-    `poses` is a table, `origin` that of the newest pose; `channels` counts all messages by channel. `on_event` is
-    called with each new event.
+    `poses` is a table, `origin` that of the newest pose, without any the place of the first fix; `channels` counts all
+    messages by channel; `nis` has a measurement's normalized innovation squared per degree of freedom, by source and
+    kind. `on_event` is called with each new event.
     """
 
     prefix: str = ""
@@ -243,14 +254,13 @@ class Drive:
     events: list[DriveEvent] = field(default_factory=list)
     channels: dict[str, ChannelCount] = field(default_factory=dict)
     drivers: dict[str, DriverHealth] = field(default_factory=dict)
+    nis: dict[str, Table] = field(default_factory=dict)
     damaged: int = 0
     on_event: Callable[[DriveEvent], None] | None = None
 
     def __post_init__(self) -> None:
         self._coordinates = _list_coordinates(self.model)
         self._fixes: dict[str, Table] = {}
-        # until the origin is known: source, time, latitude, longitude, height
-        self._unplaced: list[tuple[str, int, Vector3]] = []
         self._assembler = SnapshotAssembler()
         self._geometries: list[tuple[int, Model, str]] = []
         self.joints_channel = f"{self.prefix}JOINTS"
@@ -280,9 +290,9 @@ class Drive:
             if len(self.channels) >= MAX_CHANNELS or not channel.startswith(self.prefix):
                 return
             counted = self.channels[channel] = ChannelCount()
-        counted.add(now)
-        name = channel[len(self.prefix) :]
-        if not 0 < (stamp := read_stamp(data)) < MAX_STAMP:
+        name, stamp = channel[len(self.prefix) :], read_stamp(data)
+        counted.add(now, stamp if 0 < stamp < MAX_STAMP else 0)
+        if not 0 < stamp < MAX_STAMP:
             # every message of this project begins with its stamp; what does not is of no use here
             self.damaged += name in self._handlers
             return
@@ -327,11 +337,7 @@ class Drive:
         self._last_pose = stamp
         if answer.origin is not None and answer.origin != self.origin:
             self.origin = answer.origin
-            # fixes of an earlier origin would be at wrong places
-            self._fixes.clear()
-            for each in self._unplaced:
-                self._place_fix(*each)
-            self._unplaced.clear()
+            self._place_fixes()
         covariance = found.covariance
         upper = np.full(6, math.nan) if covariance is None else covariance[:3, :3][_UPPER]
         self.poses.append(
@@ -371,20 +377,28 @@ class Drive:
         place = (sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal)
         if sample.fix_type is FixType.NONE or not all(map(math.isfinite, place[:2])):
             return
-        height = place[2] if math.isfinite(place[2]) else sample.height_msl
+        source, height = sample.header.source, place[2] if math.isfinite(place[2]) else sample.height_msl
         known = (place[0], place[1], height if math.isfinite(height) else 0.0)
-        self._place_fix(sample.header.source, sample.header.utime, known)
-
-    def _place_fix(self, source: str, utime: int, place: Vector3) -> None:
-        """Store a fix at a geodetic place; without an origin it waits for one."""
-        if self.origin is None:
-            self._unplaced = [*self._unplaced[-MAX_EVENTS:], (source, utime, place)]
-            return
         if source not in self._fixes and len(self._fixes) >= MAX_CHANNELS:
             return
+        if self.origin is None:
+            # until the service publishes its own
+            self.origin = origin_at(*known)
+        covariance = sample.position_covariance
+        east, north, east_north = (covariance[0], covariance[4], covariance[1]) if covariance else (math.nan,) * 3
+        table = self._fixes.setdefault(source, Table(FIX_COLUMNS))
+        table.append(sample.header.utime, *known, *self._place(known), FixColor.NO_DECISION, east, north, east_north)
+
+    def _place(self, place: Vector3) -> Vector3:
+        assert self.origin is not None
         geodesy = geodesy_of(self.origin)
-        position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
-        self._fixes.setdefault(source, Table(4)).append(utime, *position, FixColor.NO_DECISION)
+        return geodesy.to_relative_utm(geodesy.utm_from_geodetic(*place))
+
+    def _place_fixes(self) -> None:
+        """Place the fixes in World:UTM of another origin."""
+        for table in self._fixes.values():
+            for row in table.rows:
+                row[FIX_POSITION] = self._place((row[0], row[1], row[2]))
 
     def _process_decisions(self, name: str, stamp: int, data: bytes) -> None:
         for decision in decode("decisions_t", data).decisions:
@@ -394,10 +408,14 @@ class Drive:
         if not 0 < decision.utime < MAX_STAMP:
             raise WireError("malformed", f"{decision.utime} is no stamp")
         table, is_reset = self._fixes.get(decision.source), decision.verdict is Verdict.RESET
-        if decision.kind == POSITION and table is not None:
+        if decision.kind == POSITION_KIND and table is not None:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
-                table.rows[row, 3] = FixColor.USED if is_reset else FixColor[decision.verdict.name]
+                table.rows[row, FIX_COLOR] = FixColor.USED if is_reset else FixColor[decision.verdict.name]
+        if not is_reset and decision.dof > 0 and math.isfinite(decision.statistic):
+            name = f"{decision.source} {decision.kind}"
+            if name in self.nis or len(self.nis) < MAX_CHANNELS:
+                self.nis.setdefault(name, Table(1)).append(decision.utime, decision.statistic / decision.dof)
         if is_reset or decision.verdict is Verdict.REJECTED:
             verb = "reset by" if is_reset else "rejected"
             reason = f": {decision.reason}" if decision.reason else ""
@@ -443,14 +461,17 @@ class Drive:
 
     @property
     def begin(self) -> int:
-        """The time of the first stored pose or joint reading, 0 without any."""
-        tables = [each for each in (self.poses, *self.joints.values()) if each.count]
+        """The time of the first stored pose or joint reading, without a pose of the first fix; 0 without any."""
+        tables = [each for each in self._list_timed() if each.count]
         return min((int(each.utimes[0]) for each in tables), default=0)
 
     @property
     def end(self) -> int:
-        """The time of the last stored pose or joint reading, 0 without any."""
-        return max((each.last for each in (self.poses, *self.joints.values())), default=0)
+        """The time of the last stored pose or joint reading, without a pose of the last fix; 0 without any."""
+        return max((each.last for each in self._list_timed()), default=0)
+
+    def _list_timed(self) -> list[Table]:
+        return [self.poses, *self.joints.values(), *([] if self.poses.count else self._fixes.values())]
 
     def get_geometry(self, utime: int = 0) -> tuple[Model | None, str]:
         """Return the model at a time, and the frame whose pose is published; the latest at 0.
@@ -474,9 +495,14 @@ class Drive:
 
     def get_fixes(self, utime: int) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the positions in World:UTM (n, 3) of the fixes until a time, and their `FixColor` (n,)."""
-        rows = [table.rows[: table.find(utime) + 1] for table in self._fixes.values()]
-        found = np.concatenate([np.zeros((0, 4)), *rows])
-        return found[:, :3], found[:, 3].astype(np.int64)
+        found = np.concatenate([np.zeros((0, FIX_COLUMNS)), *self.get_fix_tables(utime).values()])
+        return found[:, FIX_POSITION], found[:, FIX_COLOR].astype(np.int64)
+
+    def get_fix_tables(self, utime: int) -> dict[str, Array]:
+        """Return the fixes until a time by source (n, 10): latitude and longitude in degrees, height, position in
+        World:UTM, `FixColor`, and the covariance of the position (east, north, east with north), m2.
+        """
+        return {source: table.rows[: table.find(utime) + 1] for source, table in self._fixes.items()}
 
     def get_track(self, utime: int, seconds: float = math.inf) -> tuple[npt.NDArray[np.int64], Array]:
         """Return times (n,) and positions in World:UTM (n, 3) of the last seconds before a time, after a reset."""
@@ -484,10 +510,10 @@ class Drive:
         first = 0
         if math.isfinite(seconds):
             first = int(np.searchsorted(self.poses.utimes, utime - round(seconds * 1e6)))
-        jumps = np.flatnonzero(np.diff(self.poses.rows[first:end, _EPOCH]) != 0)
+        jumps = np.flatnonzero(np.diff(self.poses.rows[first:end, EPOCH]) != 0)
         if len(jumps):
             first += int(jumps[-1]) + 1
-        return self.poses.utimes[first:end], self.poses.rows[first:end, _POSITION]
+        return self.poses.utimes[first:end], self.poses.rows[first:end, POSITION]
 
     def get_picture(self, utime: int = 0) -> Picture:
         """Return the picture at a time, or the latest one at 0; poses in between are interpolated."""
@@ -498,17 +524,17 @@ class Drive:
             return Picture(utime, joints=joints)
         row = self.poses.rows[at]
         pose = _read_pose(row)
-        if at + 1 < self.poses.count and self.poses.rows[at + 1, _EPOCH] == row[_EPOCH]:
+        if at + 1 < self.poses.count and self.poses.rows[at + 1, EPOCH] == row[EPOCH]:
             first, second = (int(each) for each in self.poses.utimes[at : at + 2])
             if second - first <= MAX_INTERPOLATION_US:
                 pose = pose.interpolate(_read_pose(self.poses.rows[at + 1]), (utime - first) / (second - first))
         covariance = None
-        if math.isfinite(row[_COVARIANCE.start]):
+        if math.isfinite(row[COVARIANCE.start]):
             covariance = np.zeros((3, 3))
-            covariance[_UPPER] = row[_COVARIANCE]
+            covariance[_UPPER] = row[COVARIANCE]
             covariance = covariance + np.triu(covariance, 1).T
-        levels = float(row[_HORIZONTAL]), float(row[_HEADING])
-        return Picture(utime, pose, Invalid(int(row[_INVALID])), covariance, *levels, joints)
+        levels = float(row[HORIZONTAL]), float(row[HEADING])
+        return Picture(utime, pose, Invalid(int(row[INVALID])), covariance, *levels, joints)
 
     def get_joints(self, utime: int) -> dict[str, float]:
         found = {name: (table, table.find(utime)) for name, table in self.joints.items()}
@@ -556,7 +582,7 @@ def _list_coordinates(model: Model | None) -> frozenset[str]:
 
 
 def _read_pose(row: Array) -> Pose:
-    return Pose(tuple(row[_POSITION].tolist()), tuple(row[_QUATERNION].tolist()))
+    return Pose(tuple(row[POSITION].tolist()), tuple(row[QUATERNION].tolist()))
 
 
 class BodyPath(NamedTuple):

@@ -69,12 +69,12 @@ class Series:
     """
 
     name: str
-    x: Sequence[float]
-    y: Sequence[float]
+    x: Sequence[float] | Array
+    y: Sequence[float] | Array
     color: str = BLUE
     width: float = 1.4
     shape: Literal["line", "dashes", "dots", "band"] = "line"
-    high: Sequence[float] = ()
+    high: Sequence[float] | Array = ()
     times: Sequence[float] = ()
 
 
@@ -130,7 +130,8 @@ def dots(name: str, points: Iterable[Sequence[float]], color: str, size: float) 
 
 def render_panels(label: str, x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]] = ()) -> str:
     """Return panels above one another as HTML; `events` are vertical lines through all of them."""
-    return _render_chart(label, *_make_panels(x, panels, events), is_over_time=x.label.startswith("seconds"))
+    figure = make_panels_figure(x, panels, events)
+    return _render_chart(label, figure, is_over_time=x.label.startswith("seconds"))
 
 
 def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tuple[float, float] = (420, 900)) -> str:
@@ -143,10 +144,24 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
     traces, layout = _make_panels(axes[0], [Panel("", axes[1], series, height)], ())
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["hovermode"] = "closest"
-    return _render_chart(label, traces, layout)
+    return _render_chart(label, {"data": traces, "layout": layout})
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
+    return _render_chart(label, make_strip_figure(x, rows, events), is_over_time=True)
+
+
+# --- figures of plotly.js
+
+
+def make_panels_figure(x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]] = ()) -> dict[str, Any]:
+    """Return the figure of `render_panels`."""
+    traces, layout = _make_panels(x, panels, events)
+    return {"data": traces, "layout": layout}
+
+
+def make_strip_figure(x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> dict[str, Any]:
+    """Return the figure of `render_strip`."""
     traces: list[dict[str, Any]] = [
         {
             "type": "bar",
@@ -177,7 +192,7 @@ def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence
         },
         "shapes": [_make_event_line(when) for when, _ in events],
     }
-    return _render_chart(label, traces, layout, is_over_time=True)
+    return {"data": traces, "layout": layout}
 
 
 # --- parts of a figure ---
@@ -306,15 +321,18 @@ def decimate(points: Array, columns: Array) -> Array:
     return points[chosen]
 
 
-def _render_chart(
-    label: str, traces: Sequence[dict[str, Any]], layout: dict[str, Any], is_over_time: bool = False
-) -> str:
+def encode_figure(figure: dict[str, Any]) -> str:
+    """Return a figure as JSON."""
+    return json.dumps(figure, allow_nan=False, separators=(",", ":"))
+
+
+def _render_chart(label: str, figure: dict[str, Any], is_over_time: bool = False) -> str:
     """Return a chart as HTML: an element of its height with the figure in JSON."""
-    figure = json.dumps({"data": traces, "layout": layout}, allow_nan=False, separators=(",", ":"))
     time = " data-time" if is_over_time else ""
-    attributes = f'class="chart" role="img" aria-label="{html.escape(label)}"{time} style="height:{layout["height"]}px"'
+    height = f"height:{figure['layout']['height']}px"
+    attributes = f'class="chart" role="img" aria-label="{html.escape(label)}"{time} style="{height}"'
     # within HTML nothing may look like the end of the script
-    inside = figure.replace("<", "\\u003c")
+    inside = encode_figure(figure).replace("<", "\\u003c")
     return f'<div {attributes}><script type="application/json">{inside}</script></div>'
 
 
@@ -371,11 +389,15 @@ def render_report(
     return render_page(escape(title), head + body + foot)
 
 
+def read_plotly() -> bytes:
+    """Return the script of plotly.js. Raises ModelServerError without the extra `report`."""
+    require_extra("report", NEEDS_PLOTLY)
+    return (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
+
+
 def render_page(title: str, body: str) -> str:
     """Return an HTML page; `title` is text, `body` HTML. Raises ModelServerError without the extra `report`."""
-    require_extra("report", NEEDS_PLOTLY)
-    script = (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
-    library = base64.b64encode(gzip.compress(script, 9, mtime=0)).decode()
+    library = base64.b64encode(gzip.compress(read_plotly(), 9, mtime=0)).decode()
     own = files("mstools.report")
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -390,6 +412,8 @@ def render_page(title: str, body: str) -> str:
 <button id="theme" type="button">Dark</button>
 {body}
 <script id="plotly" type="text/plain">{library}</script>
+<script>
+{(own / "charts.js").read_text()}</script>
 <script>
 {(own / "page.js").read_text()}</script>
 </body>

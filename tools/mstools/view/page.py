@@ -1,10 +1,13 @@
-"""The viewer's page: viser's web server, opened only to those who may see it.
+"""The viewer's page: our page with viser's scene in it, on viser's web server, opened only to those who may see it.
+
+`/scene` and the websocket are viser's; the other paths are answered by what `Page.respond` is set to.
 
 viser serves its page and websocket to anyone who reaches the port, and to any web page that a browser has open: a
 websocket is not bound to the origin of its page. The guard here checks each request before viser sees it:
 
 - On loopback Host is a name of loopback: a foreign name that resolves to it (DNS rebinding) is rejected.
-- Origin, which browsers add to websockets, is that of this page.
+- Origin, which browsers add to websockets, and Sec-Fetch-Site, which they add to what a page loads, are those of this
+  page.
 - Beyond loopback, and on a page that edits (each user of a machine reaches its loopback), a token is needed, by
   whatever name the machine is reached: the link has it once, then a cookie that scripts cannot read. It is compared in
   constant time.
@@ -14,6 +17,7 @@ viser's tunnel to a public server is disabled, and a port that is in use is an e
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import http
 import ipaddress
@@ -21,19 +25,20 @@ import queue
 import re
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
 from io import StringIO
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from unittest.mock import patch
 from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from modelserver.errors import ModelServerError
@@ -41,6 +46,17 @@ from modelserver.errors import ModelServerError
 LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 COOKIE: Final = "modelserver_view"
 TOKEN_BYTES: Final = 24
+SCENE: Final = "/scene"
+"""Path of viser's page."""
+
+
+class Reply(NamedTuple):
+    """An answer to the page. `is_packed`: the body is compressed with gzip; `is_fixed`: it can be cached."""
+
+    body: bytes
+    media_type: str = "application/json"
+    is_packed: bool = False
+    is_fixed: bool = False
 
 
 class ViewError(ModelServerError):
@@ -66,6 +82,9 @@ class Guard:
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return "requests of other pages are denied"
+        fetched = request.headers.get("Sec-Fetch-Site", "none")
+        if fetched not in ("none", "same-origin") and request.headers.get("Sec-Fetch-Mode") != "navigate":
+            return "requests of other pages are denied"
         if self.token and not self._has_token(request):
             return "the token is missing or wrong; open the link that modelserver view printed"
         return ""
@@ -79,21 +98,53 @@ class Guard:
         given = (cookie, parse_qs(urlsplit(request.path).query).get("token", [""])[0])
         return any(hmac.compare_digest(each.encode(), self.token.encode()) for each in given)
 
-    def process(
-        self, inner: Callable[..., Response | None] | None, connection: ServerConnection, request: Request
+    async def process(
+        self,
+        inner: Callable[..., Response | None],
+        respond: Callable[[str, Mapping[str, str]], Reply | None],
+        connection: ServerConnection,
+        request: Request,
     ) -> Response | None:
-        """Return viser's response to a request, or a denial."""
-        problem = self.find_problem(request)
-        if problem:
+        """Return the response to a request: a denial, viser's, or that of `respond`; None opens the websocket."""
+        if problem := self.find_problem(request):
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"{problem}\n")
-        response = None if inner is None else inner(connection, request)
+        url = urlsplit(request.path)
+        if request.headers.get("Upgrade") == "websocket":
+            return inner(connection, request)
+        if url.path == SCENE:
+            response = inner(connection, replace(request, path="/"))
+        else:
+            query = {name: values[-1] for name, values in parse_qs(url.query).items()}
+            response = await asyncio.to_thread(_respond, connection, respond, url.path, query)
         if response is not None:
-            response.headers["X-Frame-Options"] = "DENY"
+            response.headers["X-Frame-Options"] = "SAMEORIGIN"
             response.headers["Referrer-Policy"] = "no-referrer"
             if self.token:
                 attributes = "HttpOnly; SameSite=Strict; Path=/"
                 response.headers["Set-Cookie"] = f"{self.cookie}={self.token}; {attributes}"
         return response
+
+
+def _respond(
+    connection: ServerConnection,
+    respond: Callable[[str, Mapping[str, str]], Reply | None],
+    path: str,
+    query: Mapping[str, str],
+) -> Response:
+    try:
+        reply = respond(path, query)
+    except (ValueError, ModelServerError) as error:
+        return connection.respond(http.HTTPStatus.BAD_REQUEST, f"{error}\n")
+    if reply is None:
+        return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")
+    headers = {
+        "Content-Type": reply.media_type,
+        "Content-Length": str(len(reply.body)),
+        "Cache-Control": "max-age=86400" if reply.is_fixed else "no-store",
+    }
+    if reply.is_packed:
+        headers["Content-Encoding"] = "gzip"
+    return Response(http.HTTPStatus.OK, "OK", Headers(headers), reply.body)
 
 
 class Actions(queue.SimpleQueue[Callable[[], object]]):
@@ -131,12 +182,16 @@ class PageServer(viser.ViserServer):
         """Do nothing: what a vehicle does is not published."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Page:
-    """A served page: `server` adds content to it, `link` opens it."""
+    """A served page: `server` adds content to its scene, `link` opens it.
+
+    `respond` answers paths with their queries; None for an unknown path, ValueError for a malformed query.
+    """
 
     server: PageServer
     link: str
+    respond: Callable[[str, Mapping[str, str]], Reply | None] = lambda path, query: None
 
     def close(self) -> None:
         with redirect_stdout(StringIO()):
@@ -158,10 +213,17 @@ def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool 
     host = f"[{address}]" if ":" in address else address
     reached = _find_own_address() if ipaddress.ip_address(address).is_unspecified else host
     guard = Guard(frozenset(f"{name}:{port}" for name in (*LOOPBACK_NAMES, host)), token, f"{COOKIE}_{port}")
+    pages: list[Page] = []
+
+    def respond(path: str, query: Mapping[str, str]) -> Reply | None:
+        return pages[0].respond(path, query) if pages else None
+
     # its own messages on stdout are replaced by the link
-    with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", partial(_serve, guard, bound)):
+    serve = partial(_serve, guard, bound, respond)
+    with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", serve):
         server = PageServer(host=address, port=port, label="ModelServer", verbose=False)
-    return Page(server, f"http://{reached}:{port}/" + (f"?token={token}" if token else ""))
+    pages.append(Page(server, f"http://{reached}:{port}/" + (f"?token={token}" if token else "")))
+    return pages[0]
 
 
 def _bind(address: str, port: int) -> socket.socket:
@@ -190,7 +252,7 @@ def _find_own_address() -> str:
 _SERVE: Final = websockets.asyncio.server.serve
 
 
-def _serve(guard: Guard, bound: socket.socket, handler: Any, host: str, port: int, **options: Any) -> Any:
+def _serve(guard: Guard, bound: socket.socket, respond: Any, handler: Any, host: str, port: int, **options: Any) -> Any:
     """Serve as viser asks for, with the guard before its own handler, on a socket that is bound already."""
     inner = options.pop("process_request")
-    return _SERVE(handler, sock=bound, process_request=partial(guard.process, inner), **options)
+    return _SERVE(handler, sock=bound, process_request=partial(guard.process, inner, respond), **options)

@@ -7,7 +7,7 @@ import math
 import shlex
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -25,6 +25,7 @@ from modelserver.transforms.so3 import Array
 from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.terminal.health import format_body, format_duration
+from mstools.view.dashboard import Dashboard, Shown
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
@@ -41,9 +42,6 @@ POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 TRAILS: Final = {"10 s": 10.0, "60 s": 60.0, "10 min": 600.0, "all": math.inf}
 """Lengths of the trail, seconds."""
 
-NO_STATE: Final = "-"
-VALUE_COLOR: Final = "#228be6"
-SIGMA_COLOR: Final = "#9ab8d4"
 RATE_PERIOD_US: Final = 3_000_000
 """Rates of sensors are means over this time: a report alone may be of a tenth of a second."""
 
@@ -94,6 +92,17 @@ class Viewer:
         with tabs.add_tab("Display"):
             self._display = DisplayPanel(gui)
             self._notes = gui.add_markdown("")
+        self._dashboard = Dashboard(
+            source,
+            seek=lambda at: self._change_time(lambda panel: panel.jump(at)),
+            play=lambda on: self._change_time(lambda panel: panel.play(on)),
+            follow=lambda: self._change_time(lambda panel: panel.follow()),
+        )
+        page.respond = self._dashboard.respond
+
+    def _change_time(self, change: Callable[[TimePanel], object]) -> None:
+        if self._time is not None:
+            self._actions.put(partial(change, self._time))
 
     def _pick(self, frame: str, is_reference: bool) -> None:
         self._actions.put(lambda: self._query.pick(frame, is_reference))
@@ -153,6 +162,11 @@ class Viewer:
             confidence = int(display.confidence.value.split()[0])
             self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
+        is_playing = self._time is not None and self._time.is_playing
+        places = {}
+        if picture.pose is not None and (frame := self._scene.get_frame_pose(self._query.frames[0])) is not None:
+            places[self._query.frames[0]] = (picture.pose @ frame).xyz
+        self._dashboard.shown = Shown(utime, is_playing, TRAILS[display.trail.value], places)
         if now >= self._next_slider and self._time is not None:
             self._next_slider = now + SLIDER_PERIOD_S
             self._time.show()
@@ -413,6 +427,14 @@ class TimePanel:
             self.jump(0.0)
         self._play.label = "Pause" if self.is_playing else "Play"
 
+    def play(self, is_playing: bool) -> None:
+        if is_playing != self.is_playing:
+            self.toggle()
+
+    def follow(self) -> None:
+        """Show the newest picture of a live drive, and those that come."""
+        self._follow.value = self._follow.visible
+
     def _list_events(self) -> list[DriveEvent]:
         wanted = self._kind.value
         events = sorted(self._drive.events if self._drive else [], key=lambda each: each.utime)
@@ -478,33 +500,7 @@ class StatePanel:
         with gui.add_folder("Findings"):
             self._findings = gui.add_markdown("")
         with gui.add_folder("Filter", expand_by_default=False):
-            self._state: Any = gui.add_dropdown(
-                "State", (NO_STATE,), hint="Its last minute, with one sigma to each side"
-            )
-            self._course = gui.add_uplot(
-                (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
-                (
-                    {"label": "s"},
-                    {"label": "value", "stroke": VALUE_COLOR, "width": 2},
-                    {"label": "+ sigma", "stroke": SIGMA_COLOR},
-                    {"label": "- sigma", "stroke": SIGMA_COLOR},
-                ),
-                scales={"x": {"time": False}},
-                legend={"show": False},
-                height=180,
-                visible=False,
-            )
             self._states = gui.add_markdown("")
-
-    def _show_course(self, drive: Drive, utime: int, states: Sequence[str]) -> None:
-        options = (NO_STATE, *states)
-        if self._state.options != options:
-            # a state that is not among them gives way to the first
-            self._state.options = options
-        self._course.visible = self._state.value != NO_STATE
-        if self._course.visible:
-            times, values, sigmas = drive.get_state_course(self._state.value, utime)
-            self._course.data = (times, values, values + sigmas, values - sigmas)
 
     def show(self, drive: Drive, picture: Picture, utime: int, now: int = 0) -> None:
         """Show the state at a time, 0 for the newest. `now` is the time that ages are counted to, 0 in a log."""
@@ -529,7 +525,6 @@ class StatePanel:
         self._findings.content = "\n\n".join(parts)
         navigation = drive.get_report("LOCALIZATION_STATE", utime)
         self._states.content = "no state published" if navigation is None else _format_states(navigation)
-        self._show_course(drive, utime, navigation.names if navigation is not None else ())
 
 
 def _format_sensors(health: Health, earlier: Health | None) -> str:

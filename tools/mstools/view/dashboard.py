@@ -1,0 +1,231 @@
+"""What the page around the scene asks for: the strip above, charts and map, and the files of the page itself.
+
+    /               the page, in which /scene is the 3D scene (viser's)
+    /state          the strip: validity, speed, heading, uncertainty, ages, time
+    /charts         the charts of a span of time; /strip the validity over it
+    /map            what a view of the map shows; /tile an image below it
+    /seek, /play, /pause, /live   change the time that is shown
+    /assets/NAME    scripts and styles
+
+Answers are computed in threads of the server, under the source's lock where they read the drive. A change of time is
+queued, and executed by the viewer between two pictures.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
+from typing import Any, Final
+
+import numpy as np
+
+from modelserver.messages import Health
+from modelserver.transforms.so3 import Vector3
+from mstools.recordings.drive import Drive, Picture
+from mstools.report.charts import encode_figure, read_plotly
+from mstools.view.map import View, describe_map, fit_view
+from mstools.view.page import Reply
+from mstools.view.signals import (
+    Span,
+    compute_headings,
+    compute_sigmas,
+    compute_speeds,
+    list_charts,
+    make_panels,
+    make_strip,
+)
+from mstools.view.sources import Source
+
+ASSETS: Final = {
+    "view.css": ("mstools.view.web", "text/css; charset=utf-8"),
+    "view.js": ("mstools.view.web", "text/javascript; charset=utf-8"),
+    "map.js": ("mstools.view.web", "text/javascript; charset=utf-8"),
+    "charts.js": ("mstools.report", "text/javascript; charset=utf-8"),
+}
+"""Package and media type of the page's files."""
+
+MAX_PIXELS: Final = 8192
+"""Largest width and height of a map that is answered."""
+
+SPEED_WINDOW_US: Final = 1_000_000
+"""Time around a picture from which its speed is taken."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is shown: the time, 0 for the newest; whether it plays; named places in World:UTM for the map."""
+
+    utime: int = 0
+    is_playing: bool = False
+    trail_s: float = math.inf
+    places: Mapping[str, Vector3] = field(default_factory=dict)
+
+
+class Dashboard:
+    """Answers the requests of the page around the scene.
+
+    Parameters
+    ----------
+    seek : called with seconds after the drive's begin
+    play : called with whether it is to play
+    follow : called to show the newest picture
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        seek: Callable[[float], None],
+        play: Callable[[bool], None],
+        follow: Callable[[], None],
+    ):
+        self._source = source
+        self._seek, self._play, self._follow = seek, play, follow
+        self.shown = Shown()
+
+    def respond(self, path: str, query: Mapping[str, str]) -> Reply | None:
+        """Return the answer to a request; None for what is not here. Raises ValueError for a malformed query."""
+        if path == "/":
+            return Reply((files("mstools.view.web") / "index.html").read_bytes(), "text/html; charset=utf-8")
+        if path.startswith("/assets/"):
+            return _read_asset(path.removeprefix("/assets/"))
+        answer = self._answers.get(path)
+        return None if answer is None else Reply(answer(self, query))
+
+    def _describe_state(self, query: Mapping[str, str]) -> bytes:
+        source, shown = self._source, self.shown
+        now = time.time_ns() // 1000 if source.is_live else 0
+        with source.lock:
+            drive = source.drive
+            picture = drive.get_picture(shown.utime)
+            health: Health | None = drive.get_report("MODELSERVER_HEALTH", shown.utime)
+            model, _ = drive.get_geometry(shown.utime)
+            state: dict[str, Any] = {
+                "title": source.title,
+                "has_time": source.has_time,
+                "is_live": source.is_live,
+                "follows": source.is_live and not shown.utime,
+                "is_playing": shown.is_playing,
+                "begin": drive.begin,
+                "seconds": (drive.end - drive.begin) * 1e-6,
+                "at": (picture.utime - drive.begin) * 1e-6 if drive.begin else 0.0,
+                "utime": picture.utime,
+                "silence": drive.find_silence(now) if now else "",
+                "revision": model.revision if model is not None else "",
+                "charts": list_charts(drive),
+                **_describe_pose(drive, picture),
+            }
+        age = max((now - health.utime) * 1e-6, 0.0) if health is not None and now and not shown.utime else 0.0
+        sensors = [each for each in health.channels if each.channel.startswith("sensor:")] if health is not None else []
+        state["sensors"] = [
+            {
+                "name": each.channel.removeprefix("sensor:"),
+                "age": each.age + age if math.isfinite(each.age) else None,
+                "silent": each.silent,
+            }
+            for each in sensors
+        ]
+        return _encode(state)
+
+    def _make_charts(self, query: Mapping[str, str]) -> bytes:
+        names = [each for each in query.get("names", "").split(",") if each]
+        with self._source.lock:
+            drive = self._source.drive
+            return encode_figure(make_panels(drive, self._read_span(drive, query), names)).encode()
+
+    def _make_strip(self, query: Mapping[str, str]) -> bytes:
+        with self._source.lock:
+            drive = self._source.drive
+            return encode_figure(make_strip(drive, self._read_span(drive, query))).encode()
+
+    def _read_span(self, drive: Drive, query: Mapping[str, str]) -> Span:
+        begin, end = (_read_number(query, name, 0.0, 1e9) for name in ("from", "to"))
+        if not begin < end:
+            raise ValueError("the span is empty")
+        return Span(drive.begin + round(begin * 1e6), drive.begin + round(end * 1e6), drive.begin)
+
+    def _describe_map(self, query: Mapping[str, str]) -> bytes:
+        shown = self.shown
+        width, height = (round(_read_number(query, name, 1.0, MAX_PIXELS)) for name in ("width", "height"))
+        with self._source.lock:
+            drive = self._source.drive
+            picture = drive.get_picture(shown.utime)
+            view = fit_view(drive, picture.utime, width, height)
+            if "scale" in query:
+                scale = _read_number(query, "scale", 1e-4, 2e3)
+                east, north = (_read_number(query, name, -1e7, 1e7) for name in ("east", "north"))
+                view = View(east, north, scale, width, height)
+            if query.get("follow") and picture.pose is not None:
+                east, north, _ = picture.pose.xyz
+                view = replace(view, east=east, north=north)
+            return _encode(describe_map(drive, picture, shown.trail_s, view, shown.places))
+
+    def _change_time(self, query: Mapping[str, str]) -> bytes:
+        self._seek(_read_number(query, "at", 0.0, 1e9))
+        return b"{}"
+
+    def _change_play(self, query: Mapping[str, str]) -> bytes:
+        self._play(query.get("on") == "1")
+        return b"{}"
+
+    def _change_live(self, query: Mapping[str, str]) -> bytes:
+        self._follow()
+        return b"{}"
+
+    _answers: Final[Mapping[str, Callable[[Dashboard, Mapping[str, str]], bytes]]] = {
+        "/state": _describe_state,
+        "/charts": _make_charts,
+        "/strip": _make_strip,
+        "/map": _describe_map,
+        "/seek": _change_time,
+        "/play": _change_play,
+        "/live": _change_live,
+    }
+
+
+@cache
+def _read_asset(name: str) -> Reply | None:
+    """Return a file of the page; None for an unknown one."""
+    if name == "plotly.js":
+        return Reply(gzip.compress(read_plotly(), 6, mtime=0), "text/javascript; charset=utf-8", True, True)
+    if name not in ASSETS:
+        return None
+    package, media_type = ASSETS[name]
+    return Reply((files(package) / name).read_bytes(), media_type)
+
+
+def _describe_pose(drive: Drive, picture: Picture) -> dict[str, Any]:
+    """Return the pose of a picture as the strip shows it."""
+    if picture.pose is None:
+        return {"valid": None, "reason": "no pose"}
+    table = drive.poses
+    first, last = np.searchsorted(table.utimes, (picture.utime - SPEED_WINDOW_US, picture.utime + SPEED_WINDOW_US))
+    utimes, rows = table.utimes[first:last], table.rows[first:last]
+    here = int(np.searchsorted(utimes, picture.utime, side="right")) - 1
+    level = picture.horizontal_protection_level
+    found = {"valid": not picture.invalid, "reason": picture.invalid.explain() if picture.invalid else ""}
+    if here < 0:
+        return found
+    values = {
+        "speed": float(compute_speeds(utimes, rows)[here]),
+        "heading": float(compute_headings(rows[here : here + 1])[0]),
+        "sigma": float(compute_sigmas(rows[here : here + 1])[0]),
+        "level": level,
+    }
+    return found | {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _encode(value: object) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _read_number(query: Mapping[str, str], name: str, low: float, high: float) -> float:
+    value = float(query.get(name, "nan"))
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be a number from {low:g} to {high:g}")
+    return value

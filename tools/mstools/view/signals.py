@@ -1,0 +1,259 @@
+"""What a drive has over time, as charts: motion, uncertainty, innovations, rates and latencies, validity, states.
+
+A chart shows a span of a drive, in seconds after its begin. Its lines are decimated by extremes to the span, so that an
+hour of 200 Hz is drawn as fast as a minute, and a zoom shows what is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.messages import Invalid
+from modelserver.transforms.so3 import Array
+from modelserver.wire.channels import BY_NAME
+from mstools.recordings.drive import COVARIANCE, EPOCH, HORIZONTAL, INVALID, QUATERNION, Drive, Table
+from mstools.report import charts
+from mstools.report.charts import Axis, Panel, Series, StripRow
+
+SPEED_SPAN_US: Final = 200_000
+"""Time over which positions are differenced to a speed: noise of a pose of 1 mm is 7 mm/s then."""
+
+MAX_GAP_US: Final = 1_000_000
+"""Longer gaps between poses interrupt lines and strips."""
+
+LEFT: Final = 170
+"""Pixels left of the charts: the names of the reasons, and the same for all, so that times are below one another."""
+
+STATE: Final = "state "
+"""What precedes the names of the filter's states among the charts."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """The span of a chart: `begin` and `end` in microseconds, of a drive that begins at `zero`."""
+
+    begin: int
+    end: int
+    zero: int
+
+    def select(self, table: Table) -> tuple[npt.NDArray[np.int64], Array]:
+        """Return times and rows of a table within the span, and one beyond each of its ends."""
+        first, last = np.searchsorted(table.utimes, (self.begin, self.end))
+        chosen = slice(max(int(first) - 1, 0), int(last) + 1)
+        return table.utimes[chosen], table.rows[chosen]
+
+    def to_seconds(self, utimes: npt.NDArray[np.int64]) -> Array:
+        return np.asarray((utimes - self.zero) * 1e-6, np.float64)
+
+    @property
+    def axis(self) -> Axis:
+        return Axis("seconds", (self.begin - self.zero) * 1e-6, (self.end - self.zero) * 1e-6)
+
+
+def list_charts(drive: Drive) -> list[str]:
+    """Return the names of the charts that a drive has."""
+    navigation = drive.get_report("LOCALIZATION_STATE")
+    states = navigation.names if navigation is not None else ()
+    return [*CHARTS, *(f"{STATE}{each}" for each in states)]
+
+
+def make_panels(drive: Drive, span: Span, names: Sequence[str]) -> dict[str, Any]:
+    """Return charts of a drive as a figure of plotly.js; unknown names are left out."""
+    panels = [
+        _make_state(drive, span, name.removeprefix(STATE)) if name.startswith(STATE) else CHARTS[name](drive, span)
+        for name in names
+        if name in CHARTS or name.startswith(STATE)
+    ]
+    figure = charts.make_panels_figure(span.axis, panels)
+    figure["layout"]["margin"]["l"] = LEFT
+    return figure
+
+
+def make_strip(drive: Drive, span: Span) -> dict[str, Any]:
+    """Return the validity of the pose with its reasons as a figure of plotly.js."""
+    utimes, rows = span.select(drive.poses)
+    flags = rows[:, INVALID].astype(np.int64)
+
+    def row(name: str, chosen: npt.NDArray[np.bool_], color: str, words: str = "") -> StripRow:
+        found = [(begin, end, words) for begin, end in _find_intervals(span, utimes, chosen)]
+        return StripRow(name, found, color)
+
+    reasons = [
+        row(str(flag.name).lower(), (flags & flag.value) != 0, charts.RED, flag.explain())
+        for flag in Invalid
+        if np.any(flags & flag.value)
+    ]
+    figure = charts.make_strip_figure(span.axis, [row("valid", flags == 0, charts.GREEN), *reasons])
+    layout = figure["layout"]
+    # its time axis is that of the charts below
+    layout["height"] -= charts.BELOW
+    layout["margin"] |= {"l": LEFT, "b": 2}
+    layout["xaxis"] |= {"title": None, "showticklabels": False}
+    return figure
+
+
+def _find_intervals(
+    span: Span, utimes: npt.NDArray[np.int64], chosen: npt.NDArray[np.bool_]
+) -> list[tuple[float, float]]:
+    """Return the intervals in which rows are chosen, seconds; a row lasts until the next one, or for a gap at most."""
+    if not len(utimes):
+        return []
+    ends = np.minimum(np.append(utimes[1:], max(span.end, int(utimes[-1]))), utimes + MAX_GAP_US)
+    joined = np.append(False, chosen[1:] & chosen[:-1] & (ends[:-1] == utimes[1:]))
+    firsts = np.flatnonzero(chosen & ~joined)
+    lasts = np.flatnonzero(chosen & ~np.append(joined[1:], False))
+    begins, closes = span.to_seconds(utimes[firsts]), span.to_seconds(ends[lasts])
+    low, high = span.axis.low, span.axis.high
+    return [
+        (max(begin, low), min(end, high)) for begin, end in zip(begins, closes, strict=True) if end > low < high > begin
+    ]
+
+
+# --- values of poses
+
+
+def compute_speeds(utimes: npt.NDArray[np.int64], rows: Array) -> Array:
+    """Return the horizontal speed at each row of poses, m/s: of the positions around it; nan at resets and gaps."""
+    if len(utimes) < 2:
+        return np.full(len(utimes), math.nan)
+    half = SPEED_SPAN_US // 2
+    first = np.searchsorted(utimes, utimes - half)
+    last = np.searchsorted(utimes, utimes + half, side="right") - 1
+    # at a lower rate the neighbors
+    first = np.where(first == last, np.maximum(first - 1, 0), first)
+    seconds = (utimes[last] - utimes[first]) * 1e-6
+    steps = np.linalg.norm(rows[last, :2] - rows[first, :2], axis=1)
+    is_one = (rows[last, EPOCH] == rows[first, EPOCH]) & (seconds > 0.0) & (seconds * 1e6 <= MAX_GAP_US)
+    return np.where(is_one, steps / np.where(seconds > 0.0, seconds, 1.0), math.nan)
+
+
+def compute_headings(rows: Array) -> Array:
+    """Return the headings of poses, degrees clockwise from grid north, 0 to 360."""
+    w, x, y, z = rows[:, QUATERNION].T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    found: Array = np.mod(90.0 - np.degrees(yaw), 360.0)
+    return found
+
+
+def compute_sigmas(rows: Array) -> Array:
+    """Return the standard deviations of horizontal positions along the worst direction, meters."""
+    east, east_north, _, north, *_ = rows[:, COVARIANCE].T
+    middle, half = 0.5 * (east + north), np.hypot(0.5 * (east - north), east_north)
+    found: Array = np.sqrt(np.maximum(middle + half, 0.0))
+    return found
+
+
+def _interrupt(x: Array, *values: Array, at: npt.NDArray[np.bool_]) -> tuple[Array, ...]:
+    """Return times and values with nan inserted before the marked rows, which interrupts lines."""
+    where = np.flatnonzero(at)
+    return np.insert(x, where, x[where]), *(np.insert(each, where, math.nan) for each in values)
+
+
+def _select_poses(drive: Drive, span: Span) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """Return seconds, speeds, rows, and before which rows lines are interrupted."""
+    utimes, rows = span.select(drive.poses)
+    cut = np.append(False, (np.diff(utimes) > MAX_GAP_US) | (np.diff(rows[:, EPOCH]) != 0))[: len(utimes)]
+    return span.to_seconds(utimes), compute_speeds(utimes, rows), rows, cut
+
+
+def _make_axis(label: str, values: Sequence[Array], least: float, floor: float | None = None) -> Axis:
+    """Return an axis around the finite values, at least `least` wide, and from `floor` upwards if given."""
+    known = np.concatenate([np.asarray(each, float) for each in values] or [np.zeros(0)])
+    known = known[np.isfinite(known)]
+    low, high = charts.value_range((known.min(), known.max()) if len(known) else (), min_width=least)
+    if floor is not None:
+        return Axis(label, floor, max(high, floor + least))
+    return Axis(label, low, high)
+
+
+# --- charts
+
+
+def _make_speed(drive: Drive, span: Span) -> Panel:
+    seconds, speeds, _, cut = _select_poses(drive, span)
+    x, y = _interrupt(seconds, speeds, at=cut)
+    return Panel("Speed", _make_axis("m/s", [y], 1.0, 0.0), [Series("", x, y)])
+
+
+def _make_heading(drive: Drive, span: Span) -> Panel:
+    seconds, _, rows, cut = _select_poses(drive, span)
+    headings = compute_headings(rows)
+    cut = cut | np.append(False, np.abs(np.diff(headings)) > 180.0)[: len(cut)]
+    x, y = _interrupt(seconds, headings, at=cut)
+    return Panel("Heading (from grid north)", _make_axis("deg", [y], 5.0), [Series("", x, y)])
+
+
+def _make_uncertainty(drive: Drive, span: Span) -> Panel:
+    seconds, _, rows, cut = _select_poses(drive, span)
+    x, sigma, level = _interrupt(seconds, compute_sigmas(rows), rows[:, HORIZONTAL], at=cut)
+    series = [Series("protection level", x, level, charts.ORANGE), Series("sigma", x, sigma, charts.BLUE)]
+    return Panel("Horizontal uncertainty", _make_axis("m", [sigma, level], 0.1, 0.0), series)
+
+
+def _make_nis(drive: Drive, span: Span) -> Panel:
+    found = {name: span.select(table) for name, table in sorted(drive.nis.items())}
+    values = [rows[:, 0] for _, rows in found.values()]
+    series = [
+        charts.level("expected", span.axis, 1.0),
+        *(
+            Series(name, span.to_seconds(utimes), rows[:, 0], _choose_color(n), 3.0, "dots")
+            for n, (name, (utimes, rows)) in enumerate(found.items())
+        ),
+    ]
+    return Panel(
+        "Innovations: NIS per degree of freedom", charts.decade_axis("", np.concatenate([[1.0], *values])), series
+    )
+
+
+def _make_rates(drive: Drive, span: Span) -> Panel:
+    return _make_channels(drive, span, "Rates of sensors", "Hz", 0, 1.0)
+
+
+def _make_latencies(drive: Drive, span: Span) -> Panel:
+    return _make_channels(drive, span, "Latencies of sensors: longest in a second", "ms", 1, 1e3)
+
+
+def _make_channels(drive: Drive, span: Span, title: str, unit: str, column: int, scale: float) -> Panel:
+    series = []
+    for n, name in enumerate(list_sensor_channels(drive)):
+        utimes, rows = span.select(drive.channels[name].course)
+        series.append(Series(name, span.to_seconds(utimes), rows[:, column] * scale, _choose_color(n)))
+    return Panel(title, _make_axis(unit, [np.asarray(each.y) for each in series], 1.0), series)
+
+
+def _make_state(drive: Drive, span: Span, state: str) -> Panel:
+    times, values, sigmas = drive.get_state_course(state, span.end, (span.end - span.begin) * 1e-6)
+    x = times + (span.end - span.zero) * 1e-6
+    band = Series("sigma", x, values - sigmas, charts.SKY, shape="band", high=values + sigmas)
+    axis = _make_axis("", [values - sigmas, values + sigmas], 1e-6)
+    return Panel(f"State {state}", axis, [band, Series("value", x, values)])
+
+
+def list_sensor_channels(drive: Drive) -> list[str]:
+    """Return the channels that are no message of the service or of its clients, in alphabetical order."""
+    return [
+        name
+        for name in sorted(drive.channels)
+        if name.removeprefix(drive.prefix) not in BY_NAME and not name.removeprefix(drive.prefix).startswith("REPLY_")
+    ]
+
+
+def _choose_color(number: int) -> str:
+    return charts.PALETTE[number % len(charts.PALETTE)]
+
+
+CHARTS: Final[Mapping[str, Callable[[Drive, Span], Panel]]] = {
+    "speed": _make_speed,
+    "heading": _make_heading,
+    "uncertainty": _make_uncertainty,
+    "innovations": _make_nis,
+    "rates": _make_rates,
+    "latencies": _make_latencies,
+}
+"""Charts by name, in their order; states of the filter are further ones, as `STATE` and their name."""

@@ -1,0 +1,273 @@
+// The north-up map: a canvas on which what the server describes is painted.
+"use strict";
+
+const FIX_COLORS = ["--used", "--rejected", "--monitored", "--undecided"];
+// below this an ellipse is inside its dot, pixels
+const LEAST_ELLIPSE = 3;
+
+function createMap(section, fetchJson, onView) {
+  const canvas = section.querySelector("canvas");
+  const readout = section.querySelector("output");
+  const bar = section.querySelector(".scale");
+  const pen = canvas.getContext("2d");
+  const images = new Map();
+  // the view: null until the first answer, which then fits the track
+  let view = null;
+  let isFollowing = false;
+  let data = null;
+  let isFetching = false;
+  let isStale = false;
+
+  const getSize = () => [canvas.clientWidth, canvas.clientHeight];
+
+  function toPixels(place) {
+    const [width, height] = getSize();
+    return [width / 2 + (place[0] - view[0]) / view[2], height / 2 - (place[1] - view[1]) / view[2]];
+  }
+
+  function toPlace(x, y) {
+    const [width, height] = getSize();
+    return [view[0] + (x - width / 2) * view[2], view[1] - (y - height / 2) * view[2]];
+  }
+
+  async function refresh() {
+    const [width, height] = getSize();
+    if (section.hidden || !width || !height) return;
+    if (isFetching) { isStale = true; return; }
+    isFetching = true;
+    const query = new URLSearchParams({ width, height });
+    const asked = view;
+    if (view) for (const [n, name] of ["east", "north", "scale"].entries()) query.set(name, view[n]);
+    if (isFollowing && view) query.set("follow", 1);
+    try {
+      data = await fetchJson(`/map?${query}`);
+      if (asked === view) view = data.view;
+      paint();
+    } finally {
+      isFetching = false;
+      if (isStale) { isStale = false; refresh(); }
+    }
+  }
+
+  // --- painting
+
+  const readTone = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+  function trace(points) {
+    pen.beginPath();
+    for (const [n, place] of points.entries()) pen[n ? "lineTo" : "moveTo"](...toPixels(place));
+  }
+
+  function paint() {
+    if (!view || !data) return;
+    const [width, height] = getSize();
+    const density = window.devicePixelRatio || 1;
+    if (canvas.width !== Math.round(width * density)) canvas.width = Math.round(width * density);
+    if (canvas.height !== Math.round(height * density)) canvas.height = Math.round(height * density);
+    pen.setTransform(density, 0, 0, density, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    pen.font = "11px system-ui, sans-serif";
+    for (const tile of data.tiles ?? []) paintTile(tile, density);
+    pen.setTransform(density, 0, 0, density, 0, 0);
+    paintGrid(data.grids?.geodetic ?? [], readTone("--line"), [2, 4], true);
+    paintGrid(data.grids?.utm ?? [], readTone("--line"), [], false);
+    pen.lineWidth = 2.5;
+    for (const line of data.trail) {
+      pen.strokeStyle = readTone(line.valid ? "--valid" : "--invalid");
+      trace(line.points);
+      pen.stroke();
+    }
+    paintFixes();
+    for (const [name, place] of Object.entries(data.places)) paintPlace(name, place);
+    if (data.vehicle) paintVehicle(data.vehicle);
+    paintScale();
+    describe();
+  }
+
+  function paintTile(tile, density) {
+    let image = images.get(tile.key);
+    if (!image) {
+      image = new Image();
+      image.onload = paint;
+      image.src = `/tile?key=${encodeURIComponent(tile.key)}`;
+      images.set(tile.key, image);
+    }
+    if (!image.complete || !image.naturalWidth) return;
+    const [nw, ne, sw] = tile.corners.map(toPixels);
+    const { naturalWidth: w, naturalHeight: h } = image;
+    pen.setTransform(
+      (density * (ne[0] - nw[0])) / w, (density * (ne[1] - nw[1])) / w,
+      (density * (sw[0] - nw[0])) / h, (density * (sw[1] - nw[1])) / h,
+      density * nw[0], density * nw[1],
+    );
+    pen.drawImage(image, 0, 0);
+  }
+
+  function paintGrid(lines, color, dash, isAtEnd) {
+    const [width, height] = getSize();
+    pen.strokeStyle = color;
+    pen.setLineDash(dash);
+    pen.lineWidth = 1;
+    for (const line of lines) { trace(line.points); pen.stroke(); }
+    pen.setLineDash([]);
+    pen.fillStyle = readTone("--soft");
+    for (const line of lines) {
+      const [x, y] = toPixels(line.points[isAtEnd ? line.points.length - 1 : 0]);
+      pen.fillText(line.label, Math.min(Math.max(x + 3, 3), width - 90), Math.min(Math.max(y - 3, 46), height - 26));
+    }
+  }
+
+  function paintFixes() {
+    for (const [east, north, color, varE, varN, cov] of data.fixes) {
+      const [x, y] = toPixels([east, north]);
+      pen.fillStyle = pen.strokeStyle = readTone(FIX_COLORS[color]);
+      pen.beginPath();
+      pen.arc(x, y, 2.5, 0, 2 * Math.PI);
+      pen.fill();
+      if (varE === null) continue;
+      const middle = (varE + varN) / 2;
+      const half = Math.hypot((varE - varN) / 2, cov);
+      const [long, short] = [middle + half, middle - half].map((each) => Math.sqrt(Math.max(each, 0)) / view[2]);
+      if (long < LEAST_ELLIPSE) continue;
+      pen.lineWidth = 0.7;
+      pen.beginPath();
+      // pixels go down: the angle turns the other way
+      pen.ellipse(x, y, long, short, -0.5 * Math.atan2(2 * cov, varE - varN), 0, 2 * Math.PI);
+      pen.stroke();
+    }
+  }
+
+  function paintPlace(name, place) {
+    const [x, y] = toPixels(place);
+    pen.fillStyle = readTone("--place");
+    pen.beginPath();
+    pen.arc(x, y, 4, 0, 2 * Math.PI);
+    pen.fill();
+    pen.fillText(name, x + 7, y + 12);
+  }
+
+  function paintVehicle(vehicle) {
+    const [x, y] = toPixels(vehicle.at);
+    const tone = vehicle.valid ? readTone("--vehicle") : readTone("--invalid");
+    pen.strokeStyle = pen.fillStyle = tone;
+    pen.lineWidth = 1.5;
+    if (vehicle.level !== null) {
+      pen.beginPath();
+      pen.arc(x, y, vehicle.level / view[2], 0, 2 * Math.PI);
+      pen.stroke();
+    }
+    pen.save();
+    pen.translate(x, y);
+    pen.rotate((vehicle.heading * Math.PI) / 180);
+    pen.beginPath();
+    pen.moveTo(0, -11);
+    pen.lineTo(7, 8);
+    pen.lineTo(0, 4);
+    pen.lineTo(-7, 8);
+    pen.closePath();
+    pen.fill();
+    pen.strokeStyle = readTone("--paper");
+    pen.lineWidth = 1;
+    pen.stroke();
+    pen.restore();
+  }
+
+  // a bar of 1, 2 or 5 times a power of ten, 60 to 150 pixels long
+  function paintScale() {
+    const longest = 150 * view[2];
+    const power = 10 ** Math.floor(Math.log10(longest));
+    const meters = power * [5, 2, 1].find((each) => each * power <= longest);
+    bar.querySelector("i").style.width = `${meters / view[2]}px`;
+    bar.querySelector("span").textContent = meters >= 1000 ? `${meters / 1000} km` : `${meters} m`;
+  }
+
+  function describe() {
+    canvas.dataset.fixes = data.fixes.length;
+    canvas.dataset.meters = view[2];
+    if (data.vehicle) canvas.dataset.vehicle = toPixels(data.vehicle.at).join(",");
+    canvas.setAttribute("aria-label", `North-up map: ${data.fixes.length} fixes`);
+  }
+
+  function readPlace(x, y) {
+    const [east, north] = toPlace(x, y);
+    const { origin } = data;
+    if (!origin) return `E ${east.toFixed(2)} m, N ${north.toFixed(2)} m from the origin`;
+    const [u, v] = [(east - data.view[0]) / origin.half, (north - data.view[1]) / origin.half];
+    const apply = (c) => c[0] + c[1] * u + c[2] * v + c[3] * u * u + c[4] * u * v + c[5] * v * v;
+    const utm = `UTM ${origin.zone}  E ${(origin.easting + east).toFixed(2)}  N ${(origin.northing + north).toFixed(2)}`;
+    return `${utm}   ${apply(origin.latitude).toFixed(7)}, ${apply(origin.longitude).toFixed(7)}`;
+  }
+
+  // --- pointer
+
+  function zoom(factor, x, y) {
+    if (!view) return;
+    const before = toPlace(x, y);
+    const scale = Math.min(Math.max(view[2] * factor, 1e-3), 1000);
+    view = [view[0], view[1], scale];
+    const after = toPlace(x, y);
+    view = [view[0] + before[0] - after[0], view[1] + before[1] - after[1], scale];
+    paint();
+    refresh();
+  }
+
+  const zoomMiddle = (factor) => zoom(factor, ...getSize().map((each) => each / 2));
+
+  function setFollow(value) {
+    isFollowing = value;
+    section.querySelector("[data-do=follow]").setAttribute("aria-pressed", value);
+    refresh();
+  }
+
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(Math.exp(event.deltaY * 0.0015), event.offsetX, event.offsetY);
+  }, { passive: false });
+  const held = new Map();
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    held.set(event.pointerId, [event.offsetX, event.offsetY]);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!view || !data) return;
+    const now = [event.offsetX, event.offsetY];
+    readout.textContent = readPlace(...now);
+    const last = held.get(event.pointerId);
+    if (!last) return;
+    held.set(event.pointerId, now);
+    if (held.size === 1) {
+      if (isFollowing) setFollow(false);
+      view = [view[0] - (now[0] - last[0]) * view[2], view[1] + (now[1] - last[1]) * view[2], view[2]];
+      paint();
+      refresh();
+    } else {
+      // two fingers: the distance to the other one zooms
+      const other = [...held].find(([id]) => id !== event.pointerId)[1];
+      const length = (place) => Math.hypot(place[0] - other[0], place[1] - other[1]);
+      zoom(length(last) / Math.max(length(now), 1), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    }
+  });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => held.delete(event.pointerId));
+  canvas.addEventListener("keydown", (event) => {
+    const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (event.key === "+") zoomMiddle(0.7);
+    else if (event.key === "-") zoomMiddle(1.4);
+    else if (steps && view) {
+      view = [view[0] + steps[0] * 60 * view[2], view[1] + steps[1] * 60 * view[2], view[2]];
+      refresh();
+    } else return;
+    event.preventDefault();
+    event.stopPropagation();
+  });
+  const actions = {
+    fit: () => { view = null; setFollow(false); },
+    follow: () => setFollow(!isFollowing),
+    in: () => zoomMiddle(0.6),
+    out: () => zoomMiddle(1 / 0.6),
+  };
+  for (const button of section.querySelectorAll("[data-do]"))
+    button.addEventListener("click", () => actions[button.dataset.do]());
+  new ResizeObserver(() => { paint(); refresh(); }).observe(canvas);
+
+  return { refresh, paint };
+}
