@@ -66,8 +66,10 @@ def start_browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[Page]:
-    """Open a link in a page without cookies of others; errors of its console fail the test.
+def open_link(
+    browser: Browser, link: str, sharpness: float = 0.5, expected_errors: tuple[str, ...] = ()
+) -> Iterator[Page]:
+    """Open a link in a page without cookies of others; errors of its console fail the test, but for expected ones.
 
     `sharpness`: pixels along each side of the viewer's scene, not of its panels, relative to those of the page.
     """
@@ -77,7 +79,8 @@ def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[P
     errors: list[str] = []
 
     def on_console(message: ConsoleMessage) -> None:
-        if message.type == "error" and not message.text.startswith(REMOVED_MEANWHILE):
+        expected = (REMOVED_MEANWHILE, *expected_errors)
+        if message.type == "error" and not any(each in message.text for each in expected):
             errors.append(message.text)
 
     page.on("console", on_console)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from modelserver.messages import Invalid
 from modelserver.transforms.so3 import Array
-from modelserver.wire.channels import BY_NAME
+from modelserver.wire.channels import BY_NAME, ChannelUse
 from mstools.recordings.drive import COVARIANCE, EPOCH, HORIZONTAL, INVALID, QUATERNION, Drive, Table
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, StripRow
@@ -237,10 +237,15 @@ def _make_state(drive: Drive, span: Span, state: str) -> Panel:
 
 def list_sensor_channels(drive: Drive) -> list[str]:
     """Return the channels that are no message of the service or of its clients, in alphabetical order."""
+    known = {name: BY_NAME.get(name.removeprefix(drive.prefix)) for name in sorted(drive.channels)}
     return [
         name
-        for name in sorted(drive.channels)
-        if name.removeprefix(drive.prefix) not in BY_NAME and not name.removeprefix(drive.prefix).startswith("REPLY_")
+        for name, channel in known.items()
+        if (
+            not name.removeprefix(drive.prefix).startswith("REPLY_")
+            if channel is None
+            else channel.use is ChannelUse.SENSOR
+        )
     ]
 
 

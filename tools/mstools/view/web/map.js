@@ -7,7 +7,7 @@ const LEAST_ELLIPSE = 3;
 
 function createMap(section, fetchJson, onView) {
   const canvas = section.querySelector("canvas");
-  const readout = section.querySelector("output");
+  const readout = section.querySelector(".readout");
   const bar = section.querySelector(".scale");
   const pen = canvas.getContext("2d");
   const images = new Map();

@@ -1,0 +1,164 @@
+"""The page around the viewer's scene in a real browser: strip, map and plots against the drive they show."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from support_browser import needs_browser, open_link, show
+from support_view import record_drive
+
+pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
+
+from modelserver.earth.geodesy import geodesy_of
+from mstools.commands.demo import find_vehicle_file
+from mstools.recordings.drive import Drive
+from mstools.view.page import open_page
+from mstools.view.signals import compute_headings, compute_speeds
+from mstools.view.sources import open_geometry, open_log
+from mstools.view.viewer import Viewer
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+pytestmark = [pytest.mark.slow, needs_browser]
+
+AT = 20.0
+PHONE = {"width": 390, "height": 800}
+
+
+@pytest.fixture(scope="module")
+def drive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_drive(tmp_path_factory.mktemp("view"), 30.0)
+
+
+@pytest.fixture(scope="module")
+def shown(browser: Browser, drive_log: Path) -> Iterator[tuple[Page, Drive]]:
+    source = open_log(drive_log)
+    with show(browser, source, path="") as page:
+        page.wait_for_function("document.documentElement.dataset.charts !== undefined")
+        page.evaluate(f"seek({AT})")
+        page.wait_for_function(f"state.at.toFixed(1) === '{AT:.1f}'")
+        yield page, source.drive
+
+
+def read_figure(page: Page, name: str) -> float:
+    text = page.locator("#figures div").filter(has_text=re.compile(f"^{name}")).locator("dd").inner_text()
+    return float(re.match(r"[-\d.]+", text)[0])  # type: ignore[index]
+
+
+def test_given_a_time_of_a_log_then_the_strip_has_validity_motion_and_ages(shown: tuple[Page, Drive]) -> None:
+    page, drive = shown
+    assert page.get_by_role("status").inner_text().strip() == "VALID"
+    table = drive.poses
+    row = table.find(drive.begin + round(AT * 1e6))
+    assert read_figure(page, "speed") == pytest.approx(compute_speeds(table.utimes, table.rows)[row], abs=0.02)
+    assert read_figure(page, "heading") == pytest.approx(compute_headings(table.rows)[row], abs=1.0)
+    assert page.get_by_label("Age of each sensor").get_by_role("listitem").count() == 4
+    page.evaluate("seek(1)")
+    page.get_by_role("status").get_by_text("INVALID").wait_for()
+    page.evaluate(f"seek({AT})")
+    page.get_by_role("status").get_by_text("VALID", exact=True).wait_for()
+
+
+def test_given_the_map_when_the_vehicle_is_pointed_at_then_its_coordinates_are_read_within_a_meter(
+    shown: tuple[Page, Drive],
+) -> None:
+    page, drive = shown
+    page.get_by_role("button", name="Map").click()
+    canvas = page.locator("#map canvas")
+    page.wait_for_function("document.querySelector('#map canvas').dataset.vehicle !== undefined")
+    assert int(canvas.get_attribute("data-fixes") or 0) > 20
+    page.get_by_role("button", name="Follow").click()
+    for _ in range(4):
+        page.get_by_role("button", name="+", exact=True).click()
+    page.wait_for_timeout(1000)
+    x, y = map(float, (canvas.get_attribute("data-vehicle") or "").split(","))
+    canvas.hover(position={"x": x, "y": y})
+    text = page.locator("#map .readout").inner_text()
+    numbers = list(map(float, re.findall(r"-?\d+\.\d+", text)))
+    assert drive.origin is not None
+    pose = drive.get_picture(drive.begin + round(AT * 1e6)).pose
+    assert pose is not None
+    place = (drive.origin.easting + pose.xyz[0], drive.origin.northing + pose.xyz[1])
+    assert math.dist(numbers[:2], place) < 1.0
+    latitude, longitude = numbers[2:4]
+    assert math.dist(geodesy_of(drive.origin).utm_from_geodetic(latitude, longitude, 0.0)[:2], numbers[:2]) < 0.1
+    page.get_by_role("button", name="Map").click()
+
+
+def test_given_the_plots_then_they_have_the_drive_and_a_click_shows_that_time(shown: tuple[Page, Drive]) -> None:
+    page, drive = shown
+    x, y = page.evaluate(
+        "(() => { const {x, y} = strip.ownerDocument.getElementById('charts')._fullData[0];"
+        " return [[...x], [...y]]; })()"
+    )
+    at = min(range(len(x)), key=lambda n: abs(x[n] - AT))
+    row = drive.poses.find(drive.begin + round(x[at] * 1e6) + 500)
+    assert y[at] == pytest.approx(compute_speeds(drive.poses.utimes, drive.poses.rows)[row], abs=0.01)
+    chart = page.locator("#charts")
+    left, width = page.evaluate(
+        "(() => { const chart = document.getElementById('charts');"
+        " return [chart._fullLayout._size.l, chart._fullLayout.xaxis._length]; })()"
+    )
+    chart.click(position={"x": left + width / 2, "y": 80})
+    page.wait_for_function(f"Math.abs(state.at - {(drive.end - drive.begin) * 0.5e-6}) < 0.5")
+    page.evaluate("document.getElementById('charts').scrollIntoView()")
+    page.evaluate("Plotly.relayout(document.getElementById('charts'), {'xaxis.range': [10, 12]})")
+    page.wait_for_function("document.getElementById('charts')._fullData[0].x.length < 200")
+    assert page.evaluate("document.getElementById('strip')._fullLayout.xaxis.range") == [10, 12]
+    page.get_by_role("button", name="All").click()
+    page.wait_for_function("document.getElementById('charts')._fullLayout.xaxis.range[1] > 25")
+    page.evaluate(f"seek({AT})")
+
+
+def test_given_signals_that_are_chosen_then_they_are_drawn_and_the_browser_remembers_them(
+    shown: tuple[Page, Drive],
+) -> None:
+    page, _ = shown
+    page.get_by_text("Signals").click()
+    page.get_by_label("rates").check()
+    page.wait_for_function("document.documentElement.dataset.charts.includes('rates')")
+    assert page.evaluate("[...document.getElementById('charts')._fullData].map(each => each.name)").count("IMU") == 1
+    assert "rates" in page.evaluate("localStorage['modelserver.charts']")
+    page.get_by_label("rates").uncheck()
+    page.get_by_text("Signals").click()
+
+
+def test_given_a_telephone_then_nothing_is_wider_than_its_screen(shown: tuple[Page, Drive]) -> None:
+    page, _ = shown
+    size = page.viewport_size
+    page.set_viewport_size(PHONE)  # type: ignore[arg-type]
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    page.set_viewport_size(size)  # type: ignore[arg-type]
+
+
+def test_given_a_geometry_file_then_the_scene_is_alone(browser: Browser) -> None:
+    with show(browser, open_geometry(find_vehicle_file(), {}), path="") as page:
+        page.wait_for_function("state !== null")
+        assert page.locator("#plots").is_hidden()
+        assert page.get_by_role("button", name="Map").is_hidden()
+        assert page.get_by_role("status").is_hidden()
+        assert "revision" in page.locator("#revision").inner_text()
+
+
+def test_given_a_viewer_that_ends_then_the_page_reports_it_and_returns_with_the_next(
+    browser: Browser, drive_log: Path
+) -> None:
+    source = open_log(drive_log)
+    served = open_page(port=0)
+    Viewer(served, source)
+    port = int(served.link.rsplit(":", 1)[1].strip("/"))
+    with open_link(browser, served.link, expected_errors=("ERR_CONNECTION_REFUSED", "WebSocket")) as page:
+        page.wait_for_function("state !== null")
+        served.close()
+        page.get_by_role("alert").wait_for()
+        served = open_page(port=port)
+        Viewer(served, source)
+        page.get_by_role("alert").wait_for(state="hidden")
+    served.close()
