@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import glob
 import os
-import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,14 +19,10 @@ from typing import Any, Final
 from modelserver.errors import ModelServerError
 from modelserver.server.journal.writer import list_segments
 from mstools.archive.storage import open_filesystem, unify_errors
-from mstools.recordings.bag_log import import_bag
+from mstools.recordings.bag_log import BAG_BEGINNINGS, BAG_SUFFIXES, BEGINNING
 
 LCM_MAGIC: Final = b"\xed\xa1\xda\x01"
-BAG_MAGICS: Final = (b"#ROSBAG V", b"\x89MCAP0\r\n")
-BEGINNING: Final = 16
-"""Bytes read of a file to recognize it: more than each of these."""
-
-SUFFIXES: Final = (".lcm", ".bag", ".mcap")
+SUFFIXES: Final = (".lcm", *BAG_SUFFIXES)
 """Names of recordings: one of these is a log also if its beginning is damaged."""
 
 CHUNK: Final = 1 << 20
@@ -86,7 +81,7 @@ def _is_one(folder: Path) -> bool:
 
 def _begins_as_recording(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(BEGINNING).startswith((LCM_MAGIC, *BAG_MAGICS))
+        return file.read(BEGINNING).startswith((LCM_MAGIC, *BAG_BEGINNINGS))
 
 
 def _expand_url(given: str) -> Iterator[str]:
@@ -107,7 +102,9 @@ def _expand_url(given: str) -> Iterator[str]:
 
 def _begins_as_recording_at(fs: Any, path: str, size: int) -> bool:
     # storage refuses a range of an empty file; the order of the arguments differs between file systems
-    return size >= BEGINNING and bool(fs.cat_file(path, start=0, end=BEGINNING).startswith((LCM_MAGIC, *BAG_MAGICS)))
+    return size >= BEGINNING and bool(
+        fs.cat_file(path, start=0, end=BEGINNING).startswith((LCM_MAGIC, *BAG_BEGINNINGS))
+    )
 
 
 @contextmanager
@@ -122,32 +119,6 @@ def fetch(log: str) -> Iterator[Path]:
         with unify_errors(log):
             fs.get_file(remote, str(path))
         yield path
-
-
-@contextmanager
-def open_lcm_log(path: Path) -> Iterator[Path]:
-    """Give the LCM log of a recording: itself, or a temporary one for a journal, a bag or an MCAP file.
-
-    Raises RecordingError for what is no recording, OSError.
-    """
-    if path.is_file() and not _is_bag(path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
-        log = Path(folder) / f"{path.stem}.lcm"
-        if path.is_dir() and (segments := list_segments(path)):
-            with log.open("wb") as out:
-                for each in segments:
-                    with each.open("rb") as file:
-                        shutil.copyfileobj(file, out)
-        else:
-            import_bag(path, log)
-        yield log
-
-
-def _is_bag(path: Path) -> bool:
-    with path.open("rb") as file:
-        return path.suffix in SUFFIXES[1:] or file.read(BEGINNING).startswith(BAG_MAGICS)
 
 
 def identify(log: str) -> str:

@@ -25,9 +25,10 @@ from modelserver.messages import Decision, Event, Invalid, Verdict
 from modelserver.server.recordings import OfflineRun, TrackRow, relax_garbage_collector
 from modelserver.server.vehicle import Vehicle
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.archive.logs import fetch, identify, open_lcm_log
+from mstools.archive.logs import fetch, identify
 from mstools.archive.storage import UNREAD, Storage, digest
 from mstools.archive.tables import SCHEMA_VERSION, ArchiveError, TableWriter
+from mstools.recordings.bag_log import open_lcm_log
 from mstools.report.findings import collect_findings, has_nis, is_position_reset
 from mstools.report.replay_data import ReplayCollector, count_reasons, integrate_distance
 

@@ -212,8 +212,9 @@ def find_drive(drives: Sequence[ArchivedDrive], name: str) -> ArchivedDrive:
 
 def write_report(drive: ArchivedDrive, config: Path, page: Path) -> None:
     """Write the replay report of a drive; one that cannot be read gets none, with a note."""
-    from mstools.archive.logs import fetch, open_lcm_log
+    from mstools.archive.logs import fetch
     from mstools.commands.replay import replay_offline
+    from mstools.recordings.bag_log import open_lcm_log
 
     try:
         with fetch(drive.log) as path, open_lcm_log(path) as log:

@@ -36,7 +36,9 @@ SHOWN_NOTES = 5
 
 
 def command(
-    file: Annotated[Path | None, argument("[FILE]", "A geometry file, vehicle file, or LCM log.")] = None,
+    file: Annotated[
+        Path | None, argument("[FILE]", "A geometry file, vehicle file, LCM log, journal, ROS bag, or MCAP file.")
+    ] = None,
     live: Annotated[bool, option("--live", "Follow the running service.")] = False,
     model: Annotated[Path | None, option("--model FILE", "Geometry for a log, in place of its own.")] = None,
     config: Annotated[
@@ -62,9 +64,9 @@ def command(
 
     The page shows bodies, frames, constraints and joints in 3D, the vehicle in the world with trail, fixes and
     uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
-    --config the localization runs on a log that has no poses, such as an imported one. With
-    --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
-    to the running service, signed with --key. It needs the extra view; without it, the error names the
+    --config the localization runs on a recording that has no poses, such as a bag; without, its fixes and rates are
+    shown. With --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies it
+    when saved to the running service, signed with --key. It needs the extra view; without it, the error names the
     command that adds it. Nothing is loaded from the internet.
 
     \b
@@ -72,7 +74,7 @@ def command(
       modelserver view config/raptor/geometry.yaml
       modelserver view config/raptor/vehicle.yaml --edit --key reload.key
       modelserver view drive.lcm
-      modelserver view imported.lcm -c vehicle.yaml
+      modelserver view drive.bag -c vehicle.yaml
       modelserver view --live
     """
     if live == (file is not None):
@@ -88,10 +90,11 @@ def command(
     editing = open_editing(file, settings, url, prefix, key or "") if edit and file is not None else None
     with ExitStack() as stack:
         shown = file
-        if config is not None and file is not None:
+        if file is not None:
             from mstools.commands.replay import open_localized
+            from mstools.recordings.bag_log import open_lcm_log
 
-            shown = stack.enter_context(open_localized(file, config))
+            shown = stack.enter_context(open_localized(stack.enter_context(open_lcm_log(file)), config))
         source = open_source(shown, model, settings, url, prefix, timeout, editing)
         stack.callback(source.close)
         try:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import statistics
-from collections.abc import Iterable, Mapping
-from contextlib import closing
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -14,6 +16,7 @@ import lcm
 from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.formats import save_model
 from modelserver.messages import JointsSample, SensorHeader
+from modelserver.server.journal.writer import list_segments
 from modelserver.server.recordings import LARGEST_DELAY_S, LOOKED_AT, StampAxis
 from modelserver.wire import codec
 from mstools.recordings.bags import (
@@ -32,6 +35,38 @@ from mstools.recordings.bags import (
     read_stamp,
 )
 from mstools.terminal.output import check_writable, escape, show_progress, write_beside, write_file
+
+BAG_BEGINNINGS: Final = (b"#ROSBAG V", b"\x89MCAP0\r\n")
+BEGINNING: Final = 16
+"""Bytes read of a file to recognize it: more than each of these, and those of an LCM log."""
+
+BAG_SUFFIXES: Final = (".bag", ".mcap")
+
+
+@contextmanager
+def open_lcm_log(path: Path) -> Iterator[Path]:
+    """Give the LCM log of a recording: itself, or a temporary one for a journal, a bag or an MCAP file.
+
+    Raises RecordingError for what is no recording, OSError.
+    """
+    if path.is_file() and not _is_bag(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="modelserver-") as folder:
+        log = Path(folder) / f"{path.stem}.lcm"
+        if path.is_dir() and (segments := list_segments(path)):
+            with log.open("wb") as out:
+                for each in segments:
+                    with each.open("rb") as file:
+                        shutil.copyfileobj(file, out)
+        else:
+            import_bag(path, log)
+        yield log
+
+
+def _is_bag(path: Path) -> bool:
+    with path.open("rb") as file:
+        return path.suffix in BAG_SUFFIXES or file.read(BEGINNING).startswith(BAG_BEGINNINGS)
 
 
 @dataclass(slots=True)

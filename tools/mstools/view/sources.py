@@ -12,6 +12,7 @@ from typing import Final
 from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
+from modelserver.errors import RecordingError
 from modelserver.formats.yaml_geometry import ModelSnapshot
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.model import Model
@@ -127,6 +128,17 @@ def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession
 # --- log
 
 
+class NoGeometry(LocalPlatform):
+    """Queries of a log without geometry: none has an answer."""
+
+    def __init__(self, where: str):
+        self.where = where
+
+    def read_state(self) -> tuple[MirrorState, int]:
+        """Return that nothing is known."""
+        return MirrorState(), 0
+
+
 def open_log(path: Path, prefix: str = "", model: Path | None = None) -> Source:
     """Open a log of the service; `model` is a geometry file in place of the log's.
 
@@ -144,8 +156,17 @@ def open_log(path: Path, prefix: str = "", model: Path | None = None) -> Source:
         notes = [*map(str, log.damage)]
         # reads the log from its beginning, and forgets the damage
         notes += measure(islice(log, LOOKED_AT)).describe()
-    answers = LogPlatform(path, prefix, given, contents)
-    drive.base_frame = drive.base_frame or answers.base_frame
+    answers: LocalPlatform
+    try:
+        answers = LogPlatform(path, prefix, given, contents)
+        drive.base_frame = drive.base_frame or answers.base_frame
+    except RecordingError as error:
+        if not drive.begin:
+            raise
+        notes.append(f"only track, fixes and rates are shown: {error}")
+        answers = NoGeometry(f"in {path}")
+    if not drive.poses.count:
+        notes.append("no pose of the service is in it: -c vehicle.yaml runs the localization on it")
     folder = model.resolve().parent if model is not None else None
     return Source(path.name, drive, answers, folder, notes=tuple(notes))
 
