@@ -535,8 +535,8 @@ def make_geometry(vehicle: NewVehicle) -> str:
             more, comment = ", rpy_deg: [180, 0, 0]", f"{MARK}: the unit and its own axes; here x forward, z down"
         lines.append(frame("ImuUnit", template.imu, comment, more))
     if vehicle.has_camera:
-        place = f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"
-        lines.append(frame("CameraMount", template.camera, place))
+        what = f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"
+        lines.append(frame("CameraMount", template.camera, what))
     lines += _list_visuals(_draw_vehicle(vehicle), "    # what viewers draw, of typical size; it changes no answer")
     if vehicle.has_camera:
         if vehicle.head:
