@@ -16,6 +16,7 @@ import pytest
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Locator, Page
+    from viser import ViserServer
 
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
@@ -97,6 +98,15 @@ def open_link(browser: Browser, link: str, sharpness: float = 0.5) -> Iterator[P
 @contextmanager
 def show(browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5) -> Iterator[Page]:
     """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_link`."""
+    with serve(browser, source, editing, sharpness) as (page, _):
+        yield page
+
+
+@contextmanager
+def serve(
+    browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5
+) -> Iterator[tuple[Page, ViserServer]]:
+    """Show a source as `show` does; yield the page and its server."""
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
@@ -108,7 +118,7 @@ def show(browser: Browser, source: Source, editing: Editing | None = None, sharp
     try:
         with open_link(browser, served.link, sharpness) as page:
             page.get_by_role("tab", name="Query").wait_for()
-            yield page
+            yield page, served.server
     finally:
         stop.set()
         thread.join(10.0)

@@ -1,6 +1,6 @@
 """Plain shapes of a vehicle without a drawing, for viewers: wheels, housings, masts, frusta of cameras.
 
-What a sensor sees is translucent: viewers take it for no part of the vehicle (`view` neither stands it on the ground).
+What a sensor sees is translucent, and so for viewers no part of the vehicle: the ground is not below it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from modelserver.geometry.parts import DIMENSIONS, Material, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 
-RUBBER: Final = Material("rubber", (0.17, 0.17, 0.18, 1.0))
+RUBBER: Final = Material("rubber", (0.2, 0.2, 0.21, 1.0))
 METAL: Final = Material("metal", (0.62, 0.64, 0.67, 1.0))
-DARK: Final = Material("dark", (0.20, 0.21, 0.23, 1.0))
+DARK: Final = Material("dark", (0.27, 0.28, 0.31, 1.0))
 PAINT: Final = Material("paint", (0.93, 0.66, 0.16, 1.0))
 GLASS: Final = Material("glass", (0.20, 0.26, 0.32, 1.0))
 ANTENNA: Final = Material("antenna", (0.92, 0.92, 0.90, 1.0))

@@ -187,10 +187,10 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         [
             # wheelbase 2.7 m, tires 205/55 R16
             *_draw_wheels(((x, y, 0.0) for x in (0.0, 2.7) for y in (0.775, -0.775)), 0.316, 0.205),
-            shapes.make_box((4.4, 1.34, 0.3), (1.35, 0.0, 0.4), shapes.DARK),
-            shapes.make_box((4.3, 1.76, 0.25), (1.35, 0.0, 0.76), shapes.PAINT),
-            shapes.make_box((2.5, 1.5, 0.37), (0.5, 0.0, 1.07), shapes.GLASS),
-            shapes.make_box((2.3, 1.45, 0.045), (0.5, 0.0, 1.2775), shapes.PAINT),
+            shapes.make_box((4.4, 1.34, 0.2), (1.35, 0.0, 0.33), shapes.DARK),
+            shapes.make_box((4.3, 1.66, 0.48), (1.35, 0.0, 0.66), shapes.PAINT),
+            shapes.make_box((2.4, 1.48, 0.36), (0.55, 0.0, 1.08), shapes.GLASS),
+            shapes.make_box((2.3, 1.45, 0.04), (0.6, 0.0, 1.28), shapes.PAINT),
         ],
     ),
 }

@@ -105,8 +105,8 @@ class MeshFolders:
         for folder in self._list_parents():
             yield from _select_folders(folder / name)
         ros1, ros2 = (self.environment.get(each, "").split(os.pathsep) for each in ROS_VARIABLES)
-        for root in filter(None, ros1):
-            yield from _search(Path(root), name)
+        for each in filter(None, ros1):
+            yield from _search(Path(each), name)
         yield from _select_folders(*[Path(root) / "share" / name for root in filter(None, ros2)])
 
     def _list_parents(self) -> list[Path]:

@@ -65,8 +65,8 @@ GRID_LABELS: Final = 1
 AMBIENT_LIGHT: Final = 1.5
 """Intensity of the light on sides that no lamp reaches; the lamp above has 3."""
 
-SOFT_LIGHT: Final = 0.5
-"""Intensity of the surroundings as a light, which replaces a part of the ambient light."""
+SOFT_LIGHT: Final = (0.3, 0.5)
+"""With shadows: intensities of the light of the surroundings, and of what is left of the ambient light beside it."""
 
 SHADOW: Final = 0.25
 """Opacity of the shadow on the ground."""
@@ -113,6 +113,7 @@ class VehicleScene:
         self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
         self._points: dict[str, Array] = {}
+        self._solid: dict[str, Array] = {}
         self._ground = 0.0
         self.unread: dict[str, list[str]] = {}
         """Mesh files that are not drawn, by the reason."""
@@ -174,8 +175,8 @@ class VehicleScene:
         Where no graphics card draws them, each picture takes several times as long.
         """
         self._scene.configure_default_lights(cast_shadow=is_on)
-        self._scene.configure_environment_map("studio" if is_on else None, environment_intensity=SOFT_LIGHT)
-        self._light.intensity = AMBIENT_LIGHT - SOFT_LIGHT if is_on else AMBIENT_LIGHT
+        self._scene.configure_environment_map("studio" if is_on else None, environment_intensity=SOFT_LIGHT[0])
+        self._light.intensity = SOFT_LIGHT[1] if is_on else AMBIENT_LIGHT
         self._grid.shadow_opacity = SHADOW if is_on else 0.0
 
     # --- geometry
@@ -186,7 +187,7 @@ class VehicleScene:
             each.remove()
         # went with its body
         self._gizmo = None
-        self._bodies, self._poses, self._labels, self._points, self.unread = {}, {}, [], {}, {}
+        self._bodies, self._poses, self._labels, self._points, self._solid, self.unread = {}, {}, [], {}, {}, {}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
         size = self._size = max([0.5, *(float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies)])
@@ -202,17 +203,13 @@ class VehicleScene:
                 node.position = self._poses[body.name].xyz
             self._draw_body(root, body, size)
         self._place_bodies(self._frames, self._frames.compute_bodies())
-        joined = [self._poses[name].transform(self._points[name]) for name in self._frames.paths]
+        joined = [self._poses[name].transform(self._solid[name]) for name in self._frames.paths]
         self._ground = min((float(each[:, 2].min()) for each in joined if len(each)), default=0.0)
 
     def list_points(self) -> Array:
         """Return the outermost points (n, 3) of shapes and frames in the scene, as they are drawn."""
-        assert self._frames is not None
-        found = [np.zeros((0, 3))]
-        for body in self._frames.model.bodies:
-            places = np.array([frame.pose.xyz for frame in body]).reshape(-1, 3)
-            found.append(self._poses[body.name].transform(np.concatenate([self._points[body.name], places])))
-        points = np.concatenate(found)
+        found = [pose.transform(self._points[name]) for name, pose in self._poses.items()]
+        points = np.concatenate([np.zeros((0, 3)), *found])
         vehicle = Pose(self._vehicle.position.tolist(), self._vehicle.wxyz.tolist())
         return vehicle.transform(points) + self._world.position
 
@@ -223,11 +220,12 @@ class VehicleScene:
 
     def _draw_body(self, root: str, body: Body, size: float) -> None:
         points: list[Array] = []
+        solid: list[Array] = []
         for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
             drawn = [
                 node
                 for number, shape in enumerate(shapes)
-                if (node := self._draw_shape(f"{root}/{kind}/{number}", shape, kind, points)) is not None
+                if (node := self._draw_shape(f"{root}/{kind}/{number}", shape, kind, points, solid)) is not None
             ]
             # what can be clicked hides from the pointer what is behind it: frames in a stand-in box, and the gizmo
             if kind != "box" and body.frames and not self.is_edited:
@@ -235,7 +233,9 @@ class VehicleScene:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
             if drawn:
                 break
-        self._points[body.name] = np.concatenate([np.zeros((0, 3)), *points])
+        places = np.array([frame.pose.xyz for frame in body]).reshape(-1, 3)
+        self._points[body.name] = np.concatenate([places, *points])
+        self._solid[body.name] = np.concatenate([np.zeros((0, 3)), *solid])
         self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0))
         if not body.frames:
             return
@@ -260,8 +260,11 @@ class VehicleScene:
         node.on_click(lambda event: self._pick(find_frame(event), False))
         node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
 
-    def _draw_shape(self, name: str, shape: Shape, kind: str, points: list[Array]) -> Any:
-        """Draw a shape, and append its outermost points in the body; None for a mesh that cannot be read."""
+    def _draw_shape(self, name: str, shape: Shape, kind: str, points: list[Array], solid: list[Array]) -> Any:
+        """Draw a shape; None for a mesh that cannot be read.
+
+        Its outermost points in the body are appended to `points`, and to `solid` where it is part of the vehicle.
+        """
         stated = shape.material.color if shape.material is not None else None
         color, opacity = BODY_COLOR, 0.2 if kind == "box" else 1.0
         if stated is not None:
@@ -284,8 +287,9 @@ class VehicleScene:
             corners = mesh.vertices * np.array(shape.size)
         else:
             corners = _list_outline(shape)
+        points.append(shape.pose.transform(corners))
         if not is_translucent:
-            points.append(shape.pose.transform(corners))
+            solid.append(points[-1])
         if shape.kind is ShapeKind.BOX:
             return scene.add_box(name, dimensions=np.array(shape.size), **look)
         if shape.kind is ShapeKind.CYLINDER:
