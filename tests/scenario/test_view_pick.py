@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support_browser import TIMEOUT_MS, choose, needs_browser, serve, show
+from support_view import record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from modelserver import load_model
 from mstools.view.camera import VIEWS
-from mstools.view.sources import open_geometry
+from mstools.view.sources import open_geometry, open_log
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -126,3 +127,26 @@ def test_given_keys_then_the_camera_shows_all_from_there_until_a_person_moves_it
             page.wait_for_timeout(200)
         wait_for_view(page, client, (float(back[0]), float(back[1]), float(back[2])))
         assert np.linalg.norm(client.camera.position - client.camera.look_at) > 2.0 * np.linalg.norm(back)
+
+
+def test_given_a_vehicle_that_is_no_longer_followed_then_the_camera_is_where_the_vehicle_is(
+    browser: Browser, tmp_path: Path
+) -> None:
+    source = open_log(record_drive(tmp_path, 6.0))
+    with serve(browser, source) as (page, server):
+        page.get_by_role("tab", name="Time").click()
+        page.get_by_role("button", name="Play").click()
+        page.get_by_role("button", name="Pause").wait_for()
+        # to the end, where playback stops
+        page.get_by_role("button", name="Play").wait_for()
+        (client,) = server.get_clients().values()
+        position, pose = client.camera.position.copy(), source.drive.get_picture().pose
+        assert pose is not None
+        assert np.linalg.norm(pose.position) > 1.0
+        page.get_by_role("tab", name="Display").click()
+        page.get_by_label("Follow the vehicle").click(force=True)
+        for _ in range(TIMEOUT_MS // 200):
+            if np.linalg.norm(client.camera.position - position - pose.position) < 0.1:
+                return
+            page.wait_for_timeout(200)
+        raise AssertionError(f"the camera moved by {client.camera.position - position}, not by {pose.position}")

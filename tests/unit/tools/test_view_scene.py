@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import base64
 import json
 import math
 import re
@@ -41,6 +42,8 @@ f 1 2 4
 f 1 4 3
 f 2 3 4
 """
+PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4z8AAAAMBAQDJ/pLvAAAAAElFTkSuQmCC"
+"""A PNG file of one red pixel."""
 
 
 @pytest.fixture
@@ -98,7 +101,7 @@ def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named
     (tmp_path / "meshes" / "bad.ply").write_bytes(b"no mesh")
     folders = MeshFolders(tmp_path)
     for file in ("meshes/mast.obj", "package://robot/meshes/mast.obj", f"file://{tmp_path}/meshes/mast.obj"):
-        assert len(folders.read(file).vertices) == 12
+        assert sorted(folders.read(file).outline.tolist()) == [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]]
     for file, reason in (
         ("missing.stl", "not found in .*--package-path"),
         ("package://robot/missing.stl", "package robot not found .*ROS_PACKAGE_PATH.*--package-path FOLDER"),
@@ -146,7 +149,7 @@ def test_given_folders_of_packages_then_meshes_are_found_there_also_for_a_geomet
         ("package://cart/meshes/mast.obj", 2),
         ("package://mast/meshes/mast.obj", 3),
     ):
-        assert folders.read(file).vertices[:, 0].max() == number, file
+        assert folders.read(file).outline[:, 0].max() == number, file
     # a folder that is itself the package
     assert MeshFolders(None, (tmp_path / "given" / "arm",), {}).find("package://arm/meshes/mast.obj").is_file()
     secret = tmp_path / "secret.obj"
@@ -158,10 +161,9 @@ def test_given_folders_of_packages_then_meshes_are_found_there_also_for_a_geomet
         folders.find("package://arm/meshes/none.obj")
 
 
-def read_materials(glb: bytes) -> list[dict[str, Any]]:
-    """Return the materials of a GLB file (glTF 2.0, 4.4: a JSON chunk after a header of 12 bytes)."""
-    length = int.from_bytes(glb[12:16], "little")
-    return [dict(each) for each in json.loads(glb[20 : 20 + length])["materials"]]
+def read_tree(glb: bytes) -> dict[str, Any]:
+    """Return the JSON chunk of a GLB file, after a header of 12 bytes (glTF 2.0, 4.4)."""
+    return dict(json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")]))
 
 
 def test_given_colors_of_a_mesh_then_they_are_drawn_and_those_of_the_shape_replace_them(tmp_path: Path) -> None:
@@ -181,7 +183,7 @@ def test_given_colors_of_a_mesh_then_they_are_drawn_and_those_of_the_shape_repla
     folders = MeshFolders(tmp_path)
 
     def find_colors(file: str, color: tuple[float, float, float, float] | None = None) -> list[tuple[float, ...]]:
-        materials = read_materials(folders.read(file, color).glb)
+        materials = read_tree(folders.read(file, color).glb)["materials"]
         assert all(each["doubleSided"] for each in materials)
         assert all(each["pbrMetallicRoughness"]["metallicFactor"] == 0.0 for each in materials)
         return [tuple(each["pbrMetallicRoughness"]["baseColorFactor"]) for each in materials]
@@ -190,20 +192,46 @@ def test_given_colors_of_a_mesh_then_they_are_drawn_and_those_of_the_shape_repla
     assert {round(each[0], 2) for each in find_colors("two.obj")} == {0.22, 0.0}
     assert [round(each[0], 2) for each in find_colors("metal.glb")] == [0.5]
     assert [round(each[0], 2) for each in find_colors("cm.dae")] == [0.22]
-    assert np.ptp(folders.read("cm.dae").vertices, axis=0) == pytest.approx([0.01] * 3)
+    assert np.ptp(folders.read("cm.dae").outline, axis=0) == pytest.approx([0.01] * 3)
     assert find_colors("vertices.ply") == [(1.0, 1.0, 1.0, 1.0)]
     assert b"COLOR_0" in folders.read("vertices.ply").glb
     assert find_colors("plain.stl")[0][0] == pytest.approx(0.477, abs=0.001)
     for file in ("two.obj", "vertices.ply", "plain.stl", "metal.glb"):
         assert {each[1:] for each in find_colors(file, (0.0, 1.0, 0.0, 0.5))} == {(1.0, 0.0, 0.5)}
         assert b"COLOR_0" not in folders.read(file, (0.0, 1.0, 0.0, 0.5)).glb
-        assert read_materials(folders.read(file, (0.0, 1.0, 0.0, 0.5)).glb)[0]["alphaMode"] == "BLEND"
+        assert read_tree(folders.read(file, (0.0, 1.0, 0.0, 0.5)).glb)["materials"][0]["alphaMode"] == "BLEND"
 
 
 def test_given_a_round_mesh_then_its_edges_alone_are_sharp(tmp_path: Path) -> None:
     trimesh.creation.cylinder(1.0, 1.0, sections=32).export(tmp_path / "wheel.stl")
+    tree = read_tree(MeshFolders(tmp_path).read("wheel.stl").glb)
+    corners = tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     # rim and two ends of 32 corners each, and the centers of the ends
-    assert len(MeshFolders(tmp_path).read("wheel.stl").vertices) == 4 * 32 + 2
+    assert tree["accessors"][corners]["count"] == 4 * 32 + 2
+
+
+def test_given_a_texture_then_its_picture_is_drawn(tmp_path: Path) -> None:
+    (tmp_path / "red.png").write_bytes(base64.b64decode(PIXEL))
+    (tmp_path / "flat.mtl").write_text("newmtl red\nKd 1 1 1\nmap_Kd red.png\n")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl red\nf 1/1 2/2 3/3\n"
+    (tmp_path / "flat.obj").write_text(f"mtllib flat.mtl\n{triangle}")
+    mesh = MeshFolders(tmp_path).read("flat.obj")
+    tree = read_tree(mesh.glb)
+    assert tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert "TEXCOORD_0" in tree["meshes"][0]["primitives"][0]["attributes"]
+    assert len(tree["images"]) == 1
+    # flat: without a volume
+    assert len(mesh.outline) == 3
+
+
+def test_given_shadows_then_they_are_drawn_in_another_light(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    plain = (scene._grid.shadow_opacity, scene._light.intensity)
+    scene.set_shadows(True)
+    assert scene._grid.shadow_opacity > plain[0] == 0.0
+    assert scene._light.intensity < plain[1]
+    scene.set_shadows(False)
+    assert (scene._grid.shadow_opacity, scene._light.intensity) == plain
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)

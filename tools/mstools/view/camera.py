@@ -137,6 +137,14 @@ class ViewCamera:
             if self._fitted and any(at.is_near(each) for each in self._initial):
                 self._fit(client, at.position - at.look_at)
 
+    def move(self, offset: Array) -> None:
+        """Move all cameras, so that the picture stays where the whole scene moves."""
+        for number, client in self._server.get_clients().items():
+            # what it looks at moves with it
+            client.camera.position = client.camera.position + offset
+            if number in self._set:
+                self._set[number] = CameraPose(*(each + offset for each in self._set[number]))
+
     def _fit_loaded(self) -> None:
         points = self._list_points()
         size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0

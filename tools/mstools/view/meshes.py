@@ -22,6 +22,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from scipy.spatial import ConvexHull, QhullError
 from trimesh.exchange.gltf import export_glb
 
 from modelserver.transforms.so3 import Array
@@ -50,10 +51,10 @@ class MeshError(ValueError):
 
 
 class Mesh(NamedTuple):
-    """A mesh as the page draws it: a GLB file, and its vertices (n, 3) in meters before its scale."""
+    """A mesh as the page draws it: a GLB file, and its outermost vertices (n, 3) before its scale."""
 
     glb: bytes
-    vertices: Array
+    outline: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +176,15 @@ def _read_mesh(path: Path, mtime: int, color: Rgba | None) -> Mesh:
     finish = functools.partial(_finish_materials, color=color or MESH_COLOR, is_linear=is_linear)
     export: Any = export_glb
     glb = export(drawn, include_normals=False, tree_postprocessor=finish)
-    return Mesh(glb, np.concatenate(vertices))
+    return Mesh(glb, _find_outline(np.concatenate(vertices)))
+
+
+def _find_outline(vertices: Array) -> Array:
+    """Return the corners of the convex hull; all vertices of what is flat, which has none."""
+    try:
+        return np.asarray(vertices[ConvexHull(vertices).vertices])
+    except QhullError:
+        return vertices
 
 
 def _prepare(mesh: Any, is_linear: bool, with_colors: bool) -> trimesh.Trimesh:

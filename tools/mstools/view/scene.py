@@ -214,6 +214,11 @@ class VehicleScene:
         return vehicle.transform(points) + self._world.position
 
     @property
+    def center(self) -> Array:
+        """The place of the base frame in the scene (3)."""
+        return np.asarray(self._vehicle.position + self._world.position)
+
+    @property
     def heading(self) -> float:
         """The yaw of the vehicle in the scene, radians."""
         return float(Pose((0.0, 0.0, 0.0), self._vehicle.wxyz.tolist()).rpy[2])
@@ -284,7 +289,7 @@ class VehicleScene:
                 if shape.file not in files:
                     files.append(shape.file)
                 return None
-            corners = mesh.vertices * np.array(shape.size)
+            corners = mesh.outline * np.array(shape.size)
         else:
             corners = _list_outline(shape)
         points.append(shape.pose.transform(corners))

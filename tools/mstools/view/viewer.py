@@ -66,6 +66,7 @@ class Viewer:
         self._server = page.server
         self._actions = Actions()
         self._model: Model | None = None
+        self._is_following = True
         self._named: tuple[NameLabels, tuple[str, str]] | None = None
         self._next_slider = self._next_state = self._next_fixes = 0.0
         gui = page.server.gui
@@ -150,7 +151,11 @@ class Viewer:
             if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
-            self._scene.show(picture, display.follow.value)
+            center, is_following = self._scene.center, display.follow.value
+            self._scene.show(picture, is_following)
+            if is_following != self._is_following:
+                self._is_following = is_following
+                self._camera.move(self._scene.center - center)
             self._scene.show_trail(utimes, track)
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
