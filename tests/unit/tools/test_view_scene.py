@@ -17,13 +17,20 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from support_lcm import reserved_url
 from trimesh.visual.material import PBRMaterial
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
+from modelserver import load_model
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
+from modelserver.messages import SnapshotPart
 from modelserver.transforms.pose import Pose
+from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import encode_event
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.new import TEMPLATES, Device, NewVehicle, make_geometry
+from mstools.commands.view import open_source
 from mstools.recordings.drive import Picture
 from mstools.view.camera import VIEWS, fit_camera
 from mstools.view.meshes import MeshError, MeshFolders
@@ -159,6 +166,32 @@ def test_given_folders_of_packages_then_meshes_are_found_there_also_for_a_geomet
             folders.find(file)
     with pytest.raises(MeshError, match="not found in package arm, which is"):
         folders.find("package://arm/meshes/none.obj")
+
+
+def test_given_the_geometry_of_a_log_or_a_service_then_its_meshes_are_drawn_from_the_folders_given(
+    page: Page, tmp_path: Path
+) -> None:
+    (tmp_path / "given" / "arm").mkdir(parents=True)
+    (tmp_path / "given" / "arm" / "mast.obj").write_text(TETRAHEDRON)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="a"><visual><geometry><mesh filename="package://arm/mast.obj"/></geometry></visual>'
+        "</link></robot>"
+    )
+    model = load_model(urdf)
+    whole = encode_snapshot(ModelSnapshot("r", model, "a:Origin", "a:Origin", 60.0, "JOINTS"))
+    log = tmp_path / "drive.lcm"
+    log.write_bytes(
+        encode_event(0, 10**15, b"MODEL_SNAPSHOT", encode(SnapshotPart(10**15, model.revision, 0, 1, whole)))
+    )
+    packages = (tmp_path / "given",)
+    for given in ((), packages):
+        scene = make_scene(page, open_source(log, None, None, "", "", 1.0, packages=given))
+        assert list(scene.unread.values()) == ([] if given else [["package://arm/mast.obj"]])
+    with reserved_url() as url:
+        live = open_source(None, None, None, url, "", 1.0, packages=packages)
+        live.close()
+    assert live.meshes == MeshFolders(None, packages)
 
 
 def read_tree(glb: bytes) -> dict[str, Any]:
