@@ -290,7 +290,7 @@ def test_given_a_direction_then_the_camera_sees_all_that_is_drawn_and_as_large_a
     scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
     points = scene.list_points()
     assert np.ptp(points, axis=0)[2] > 2.0
-    for aspect, direction in product((0.5, 1.0, 2.0), VIEWS.values()):
+    for aspect, direction in product((0.5, 1.0, 2.0), (*VIEWS.values(), (0.0, 0.3, -1.0))):
         position, target = fit_camera(points, np.array(direction), math.radians(45.0), aspect)
         back = (position - target) / np.linalg.norm(position - target)
         assert back == pytest.approx(np.array(direction) / np.linalg.norm(direction))
@@ -300,6 +300,8 @@ def test_given_a_direction_then_the_camera_sees_all_that_is_drawn_and_as_large_a
         across = np.abs((points - position) @ right) / depth / (math.tan(math.radians(22.5)) * aspect)
         along = np.abs((points - position) @ np.cross(back, right)) / depth / math.tan(math.radians(22.5))
         assert 0.75 < max(across.max(), along.max()) < 1.0
+    above = fit_camera(points, np.array((0.0, 0.0, 2.0)), math.radians(45.0), 1.0)
+    assert above.position[:2] == pytest.approx(above.look_at[:2])
 
 
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:

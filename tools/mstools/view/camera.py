@@ -33,8 +33,8 @@ ASPECT: Final = 1.2
 MARGIN: Final = 1.12
 """Distance of the camera relative to the least one, so that nothing touches the border."""
 
-MIN_DISTANCE: Final = 0.05
-"""Meters: of a model that is a point."""
+MIN_DISTANCE: Final = 0.2
+"""Least distance of the camera, meters: a model that is a point has axes of 25 mm."""
 
 GROWTH: Final = 1.2
 """A loaded model that is larger or smaller by more than this is fitted again; an edit is not."""
@@ -69,13 +69,11 @@ class CameraPose(NamedTuple):
 def fit_camera(points: Array, direction: Array, fov: float, aspect: float) -> CameraPose:
     """Return the pose of a camera that sees all points (n, 3) from a direction (3), with z up in the picture.
 
-    `fov` is the vertical angle of view in radians, `aspect` the width of the picture by its height.
+    Straight from above or below, x is up. `fov` is the vertical angle of view in radians, `aspect` the width of the picture by its height.
     """
-    if not len(points):
-        points = np.zeros((1, 3))
     back = direction / np.linalg.norm(direction)
     right = np.cross((0.0, 0.0, 1.0), back)
-    right /= np.linalg.norm(right)
+    right = right / np.linalg.norm(right) if right.any() else np.array((0.0, -1.0, 0.0))
     axes = np.stack([right, np.cross(back, right), back])
     # the middle along each axis of the picture: that of the points would be where most of them are
     seen = points @ axes.T
@@ -147,7 +145,9 @@ class ViewCamera:
 
     def _fit_loaded(self) -> None:
         points = self._list_points()
-        size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        if not len(points):
+            return
+        size = max(float(np.ptp(points, axis=0).max()), MIN_DISTANCE)
         if self._fitted / GROWTH <= size <= self._fitted * GROWTH:
             return
         self._fitted = size
@@ -166,8 +166,10 @@ class ViewCamera:
         return np.array((c * x - s * y, s * x + c * y, z))
 
     def _fit(self, client: viser.ClientHandle, direction: Array) -> None:
-        camera = client.camera
-        found = fit_camera(self._list_points(), direction, camera.fov, camera.aspect)
+        camera, points = client.camera, self._list_points()
+        if not len(points):
+            return
+        found = fit_camera(points, direction, camera.fov, camera.aspect)
         camera.position, camera.look_at = found
         self._set[client.client_id] = found
 

@@ -10,7 +10,7 @@ Scene nodes, of which `/world` alone moves with the follow camera (the vehicle t
 Bodies that no constraints join to the base frame are drawn beside the vehicle.
 
 The ground, `/world/grid`, is at the height of the lowest point of the vehicle with its joints at their defaults, below
-the base frame. Translucent shapes, such as what a camera sees, are not of the vehicle there.
+the base frame. Translucent shapes, such as what a camera sees, do not count there.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class VehicleScene:
     def set_shadows(self, is_on: bool) -> None:
         """Turn shadows and the light of the surroundings on or off.
 
-        Where no graphics card draws them, each picture takes several times as long.
+        They are for a machine with a graphics card: in software, the first picture would come seconds later.
         """
         self._scene.configure_default_lights(cast_shadow=is_on)
         self._scene.configure_environment_map("studio" if is_on else None, environment_intensity=SOFT_LIGHT[0])
