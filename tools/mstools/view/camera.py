@@ -69,7 +69,8 @@ class CameraPose(NamedTuple):
 def fit_camera(points: Array, direction: Array, fov: float, aspect: float) -> CameraPose:
     """Return the pose of a camera that sees all points (n, 3) from a direction (3), with z up in the picture.
 
-    Straight from above or below, x is up. `fov` is the vertical angle of view in radians, `aspect` the width of the picture by its height.
+    Straight from above or below, x is up. `fov` is the vertical angle of view in radians, `aspect` the width of the
+    picture by its height.
     """
     back = direction / np.linalg.norm(direction)
     right = np.cross((0.0, 0.0, 1.0), back)
