@@ -16,6 +16,7 @@ import pytest
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Locator, Page
+    from viser import ViserServer
 
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
@@ -105,6 +106,15 @@ def show(
 
     `path`: `scene` shows the scene with its tabs alone, an empty one the whole page.
     """
+    with serve(browser, source, editing, sharpness, path) as (page, _):
+        yield page
+
+
+@contextmanager
+def serve(
+    browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5, path: str = "scene"
+) -> Iterator[tuple[Page, ViserServer]]:
+    """Show a source as `show` does; yield the page and its server."""
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
@@ -116,7 +126,7 @@ def show(
     try:
         with open_link(browser, f"{served.link}{path}", sharpness) as page:
             (page if path else page.frame_locator("#scene")).get_by_role("tab", name="Query").wait_for()
-            yield page
+            yield page, served.server
     finally:
         stop.set()
         thread.join(10.0)

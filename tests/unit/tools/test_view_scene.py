@@ -3,26 +3,41 @@
 from __future__ import annotations
 
 import ast
+import base64
+import json
 import math
 import re
 import shlex
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 import yaml
+from support_lcm import reserved_url
+from trimesh.visual.material import PBRMaterial
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
+from modelserver import load_model
+from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
+from modelserver.messages import SnapshotPart
 from modelserver.transforms.pose import Pose
+from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import encode_event
 from mstools.commands.demo import find_vehicle_file
+from mstools.commands.new import TEMPLATES, Device, NewVehicle, make_geometry
+from mstools.commands.view import open_source
 from mstools.recordings.drive import Picture
+from mstools.view.camera import VIEWS, fit_camera
+from mstools.view.meshes import MeshError, MeshFolders
 from mstools.view.page import Page, escape_markdown, open_page
-from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid, read_mesh
+from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid
 from mstools.view.sources import Source, list_coordinates, open_geometry
-from mstools.view.viewer import describe_answer, format_code
+from mstools.view.viewer import describe_answer, describe_unread, format_code
 
 TETRAHEDRON = """\
 v 0 0 0
@@ -34,6 +49,8 @@ f 1 2 4
 f 1 4 3
 f 2 3 4
 """
+PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4z8AAAAMBAQDJ/pLvAAAAAElFTkSuQmCC"
+"""A PNG file of one red pixel."""
 
 
 @pytest.fixture
@@ -44,7 +61,7 @@ def page() -> Iterator[Page]:
 
 
 def make_scene(page: Page, source: Source) -> VehicleScene:
-    scene = VehicleScene(page.server, source.folder, lambda frame, is_reference: None)
+    scene = VehicleScene(page.server, source.meshes, lambda frame, is_reference: None)
     assert source.drive.model is not None
     scene.set_model(source.drive.model, source.drive.base_frame)
     return scene
@@ -87,19 +104,21 @@ def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named
     # the binary chunk begins with the numbers of the corners
     head, _, tail = bytes(trimesh.creation.box().export(file_type="glb")).partition(b"BIN\0")
     (tmp_path / "meshes" / "short.glb").write_bytes(head + b"BIN\0" + (99).to_bytes(4, "little") + tail[4:])
-    assert len(read_mesh("meshes/mast.obj", tmp_path).faces) == 4
-    assert len(read_mesh("package://robot/meshes/mast.obj", tmp_path).faces) == 4
     (tmp_path / "meshes" / "empty.stl").write_bytes(b"no mesh")
     (tmp_path / "meshes" / "bad.ply").write_bytes(b"no mesh")
-    for file, folder, reason in (
-        ("missing.stl", tmp_path, "not found"),
-        ("meshes/empty.stl", tmp_path, "no triangles"),
-        ("meshes/bad.ply", tmp_path, "cannot be read"),
-        ("meshes/short.glb", tmp_path, "corners that it does not have"),
-        ("meshes/mast.obj", None, "not from the bus"),
+    folders = MeshFolders(tmp_path)
+    for file in ("meshes/mast.obj", "package://robot/meshes/mast.obj", f"file://{tmp_path}/meshes/mast.obj"):
+        assert sorted(folders.read(file).outline.tolist()) == [[0, 0, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    for file, reason in (
+        ("missing.stl", "not found in .*--package-path"),
+        ("package://robot/missing.stl", "package robot not found .*ROS_PACKAGE_PATH.*--package-path FOLDER"),
+        ("package://", "not found"),
+        ("meshes/empty.stl", "no triangles"),
+        ("meshes/bad.ply", "cannot be read"),
+        ("meshes/short.glb", "corners that it does not have"),
     ):
-        with pytest.raises(ValueError, match=reason):
-            read_mesh(file, folder)
+        with pytest.raises(MeshError, match=reason):
+            folders.read(file)
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(
         '<robot name="r"><link name="a"><visual><geometry><mesh filename="meshes/mast.obj"/></geometry></visual></link>'
@@ -110,10 +129,179 @@ def test_given_a_mesh_then_it_is_read_from_the_folder_and_a_missing_one_is_named
         '<joint name="k" type="fixed"><parent link="a"/><child link="c"/></joint></robot>'
     )
     scene = make_scene(page, open_geometry(urdf, {}))
-    assert scene.unread == ["missing.stl: not found"]
+    assert list(scene.unread.values()) == [["missing.stl"]]
+    assert "<wbr>missing" not in describe_unread(scene.unread)
+    assert all(each in describe_unread(scene.unread) for each in ("missing.stl", "--package-path"))
     drawn = {node.name.partition("/body/")[2] for node in page.server.scene._handle_from_node_name.values()}
     assert {"0/visual/0", "1/collision/0", "2/box/0"} < drawn
     assert not {"0/collision/0", "0/box/0", "1/box/0"} & drawn
+
+
+def test_given_folders_of_packages_then_meshes_are_found_there_also_for_a_geometry_from_the_bus(tmp_path: Path) -> None:
+    def make(folder: str, number: int) -> Path:
+        place = tmp_path / folder / "meshes"
+        place.mkdir(parents=True)
+        (place / "mast.obj").write_text(TETRAHEDRON.replace("v 1 0 0", f"v {number} 0 0"))
+        return tmp_path / folder
+
+    make("given/arm", 1)
+    workspace = make("workspace/src/stack/cart", 2)
+    (workspace / "package.xml").write_text("<package/>")
+    make("prefix/share/mast", 3)
+    environment = {"ROS_PACKAGE_PATH": f"/none:{tmp_path}/workspace", "AMENT_PREFIX_PATH": f"{tmp_path}/prefix"}
+    folders = MeshFolders(None, (tmp_path / "given",), environment)
+    for file, number in (
+        ("package://arm/meshes/mast.obj", 1),
+        ("arm/meshes/mast.obj", 1),
+        ("package://cart/meshes/mast.obj", 2),
+        ("package://mast/meshes/mast.obj", 3),
+    ):
+        assert folders.read(file).outline[:, 0].max() == number, file
+    # a folder that is itself the package
+    assert MeshFolders(None, (tmp_path / "given" / "arm",), {}).find("package://arm/meshes/mast.obj").is_file()
+    secret = tmp_path / "secret.obj"
+    secret.write_text(TETRAHEDRON)
+    for file in (str(secret), f"file://{secret}", "package://arm/../../secret.obj", f"package://{secret}"):
+        with pytest.raises(MeshError, match="from the bus"):
+            folders.find(file)
+    with pytest.raises(MeshError, match="not found in package arm, which is"):
+        folders.find("package://arm/meshes/none.obj")
+
+
+def test_given_the_geometry_of_a_log_or_a_service_then_its_meshes_are_drawn_from_the_folders_given(
+    page: Page, tmp_path: Path
+) -> None:
+    (tmp_path / "given" / "arm").mkdir(parents=True)
+    (tmp_path / "given" / "arm" / "mast.obj").write_text(TETRAHEDRON)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="a"><visual><geometry><mesh filename="package://arm/mast.obj"/></geometry></visual>'
+        "</link></robot>"
+    )
+    model = load_model(urdf)
+    whole = encode_snapshot(ModelSnapshot("r", model, "a:Origin", "a:Origin", 60.0, "JOINTS"))
+    log = tmp_path / "drive.lcm"
+    log.write_bytes(
+        encode_event(0, 10**15, b"MODEL_SNAPSHOT", encode(SnapshotPart(10**15, model.revision, 0, 1, whole)))
+    )
+    packages = (tmp_path / "given",)
+    for given in ((), packages):
+        scene = make_scene(page, open_source(log, None, None, "", "", 1.0, packages=given))
+        assert list(scene.unread.values()) == ([] if given else [["package://arm/mast.obj"]])
+    with reserved_url() as url:
+        live = open_source(None, None, None, url, "", 1.0, packages=packages)
+        live.close()
+    assert live.meshes == MeshFolders(None, packages)
+
+
+def read_tree(glb: bytes) -> dict[str, Any]:
+    """Return the JSON chunk of a GLB file, after a header of 12 bytes (glTF 2.0, 4.4)."""
+    return dict(json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")]))
+
+
+def test_given_colors_of_a_mesh_then_they_are_drawn_and_those_of_the_shape_replace_them(tmp_path: Path) -> None:
+    (tmp_path / "two.mtl").write_text("newmtl red\nKd 0.5 0 0\nnewmtl green\nKd 0 1 0\n")
+    faces = TETRAHEDRON.replace("f 1 3 2", "usemtl red\nf 1 3 2").replace("f 1 4 3", "usemtl green\nf 1 4 3")
+    (tmp_path / "two.obj").write_text(f"mtllib two.mtl\n{faces}")
+    colored = trimesh.creation.box()
+    colored.visual.vertex_colors = np.tile((255, 0, 0, 255), (8, 1))  # type: ignore[union-attr]
+    colored.export(tmp_path / "vertices.ply")
+    trimesh.creation.box().export(tmp_path / "plain.stl")
+    metal = PBRMaterial(baseColorFactor=(128, 0, 0, 255), metallicFactor=1.0)
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(material=metal)
+    box.export(tmp_path / "metal.glb")
+    text = str(box.export(file_type="dae").decode())
+    (tmp_path / "cm.dae").write_text(text.replace("<up_axis>", '<unit name="cm" meter="0.01"/><up_axis>'))
+    folders = MeshFolders(tmp_path)
+
+    def find_colors(file: str, color: tuple[float, float, float, float] | None = None) -> list[tuple[float, ...]]:
+        materials = read_tree(folders.read(file, color).glb)["materials"]
+        assert all(each["doubleSided"] for each in materials)
+        assert all(each["pbrMetallicRoughness"]["metallicFactor"] == 0.0 for each in materials)
+        return [tuple(each["pbrMetallicRoughness"]["baseColorFactor"]) for each in materials]
+
+    # 128/255 in sRGB is 0.216 of the intensity of 1 (IEC 61966-2-1); what glTF has is linear
+    assert {round(each[0], 2) for each in find_colors("two.obj")} == {0.22, 0.0}
+    assert [round(each[0], 2) for each in find_colors("metal.glb")] == [0.5]
+    assert [round(each[0], 2) for each in find_colors("cm.dae")] == [0.22]
+    assert np.ptp(folders.read("cm.dae").outline, axis=0) == pytest.approx([0.01] * 3)
+    assert find_colors("vertices.ply") == [(1.0, 1.0, 1.0, 1.0)]
+    assert b"COLOR_0" in folders.read("vertices.ply").glb
+    assert find_colors("plain.stl")[0][0] == pytest.approx(0.477, abs=0.001)
+    for file in ("two.obj", "vertices.ply", "plain.stl", "metal.glb"):
+        assert {each[1:] for each in find_colors(file, (0.0, 1.0, 0.0, 0.5))} == {(1.0, 0.0, 0.5)}
+        assert b"COLOR_0" not in folders.read(file, (0.0, 1.0, 0.0, 0.5)).glb
+        assert read_tree(folders.read(file, (0.0, 1.0, 0.0, 0.5)).glb)["materials"][0]["alphaMode"] == "BLEND"
+
+
+def test_given_a_round_mesh_then_its_edges_alone_are_sharp(tmp_path: Path) -> None:
+    trimesh.creation.cylinder(1.0, 1.0, sections=32).export(tmp_path / "wheel.stl")
+    tree = read_tree(MeshFolders(tmp_path).read("wheel.stl").glb)
+    corners = tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    # rim and two ends of 32 corners each, and the centers of the ends
+    assert tree["accessors"][corners]["count"] == 4 * 32 + 2
+
+
+def test_given_a_texture_then_its_picture_is_drawn(tmp_path: Path) -> None:
+    (tmp_path / "red.png").write_bytes(base64.b64decode(PIXEL))
+    (tmp_path / "flat.mtl").write_text("newmtl red\nKd 1 1 1\nmap_Kd red.png\n")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl red\nf 1/1 2/2 3/3\n"
+    (tmp_path / "flat.obj").write_text(f"mtllib flat.mtl\n{triangle}")
+    mesh = MeshFolders(tmp_path).read("flat.obj")
+    tree = read_tree(mesh.glb)
+    assert tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert "TEXCOORD_0" in tree["meshes"][0]["primitives"][0]["attributes"]
+    assert len(tree["images"]) == 1
+    # flat: without a volume
+    assert len(mesh.outline) == 3
+
+
+def test_given_shadows_then_they_are_drawn_in_another_light(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    plain = (scene._grid.shadow_opacity, scene._light.intensity)
+    scene.set_shadows(True)
+    assert scene._grid.shadow_opacity > plain[0] == 0.0
+    assert scene._light.intensity < plain[1]
+    scene.set_shadows(False)
+    assert (scene._grid.shadow_opacity, scene._light.intensity) == plain
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_given_a_new_vehicle_then_its_wheels_are_on_the_ground(kind: str, page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "geometry.yaml"
+    device = Device(None)
+    path.write_text(make_geometry(NewVehicle("rover", TEMPLATES[kind], device, device, device, has_camera=True)))
+    scene = make_scene(page, open_geometry(path, {}))
+    for height in (0.0, 7.0):
+        scene.show(Picture(1, Pose((3.0, 4.0, height))))
+        assert scene._grid.position[2] == pytest.approx(height, abs=1e-4)
+
+
+@pytest.mark.parametrize(("name", "ground"), [("raptor", -0.65 + 0.017), ("husky", -0.13228)])
+def test_given_a_vehicle_then_the_grid_is_below_its_wheels(name: str, ground: float, page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file().parents[1] / name / "vehicle.yaml", {}))
+    scene.show(Picture(1))
+    assert scene._grid.position[2] == pytest.approx(ground, abs=1e-4)
+    assert scene.unread == {}
+
+
+def test_given_a_direction_then_the_camera_sees_all_that_is_drawn_and_as_large_as_it_fits(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    points = scene.list_points()
+    assert np.ptp(points, axis=0)[2] > 2.0
+    for aspect, direction in product((0.5, 1.0, 2.0), (*VIEWS.values(), (0.0, 0.3, -1.0))):
+        position, target = fit_camera(points, np.array(direction), math.radians(45.0), aspect)
+        back = (position - target) / np.linalg.norm(position - target)
+        assert back == pytest.approx(np.array(direction) / np.linalg.norm(direction))
+        right = np.cross((0.0, 0.0, 1.0), back) / np.linalg.norm(np.cross((0.0, 0.0, 1.0), back))
+        depth = -(points - position) @ back
+        assert depth.min() > 0.0
+        across = np.abs((points - position) @ right) / depth / (math.tan(math.radians(22.5)) * aspect)
+        along = np.abs((points - position) @ np.cross(back, right)) / depth / math.tan(math.radians(22.5))
+        assert 0.75 < max(across.max(), along.max()) < 1.0
+    above = fit_camera(points, np.array((0.0, 0.0, 2.0)), math.radians(45.0), 1.0)
+    assert above.position[:2] == pytest.approx(above.look_at[:2])
 
 
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:

@@ -59,7 +59,7 @@ def test_given_a_mesh_file_with_markup_in_its_name_then_it_is_listed_as_text(pag
     (tmp_path / "robot.urdf").write_text(URDF)
     viewer = Viewer(page, open_geometry(tmp_path / "robot.urdf", {}))
     viewer.draw(0.0, 0.0)
-    assert r"\<b\>\{x\}\*.stl: not found" in viewer._notes.content
+    assert r"- \<b\>\{x\}\*.stl" in viewer._notes.content
 
 
 def test_given_no_service_then_the_page_reports_it_and_shows_no_time(page: Page) -> None:

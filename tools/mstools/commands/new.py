@@ -24,12 +24,13 @@ import yaml
 
 from modelserver.errors import ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.formats import check_file, save_model
-from modelserver.geometry import Body, JointType, Model, ModelBuilder, ShapeKind, names
+from modelserver.geometry import Body, JointType, Model, ModelBuilder, Shape, ShapeKind, names
 from modelserver.messages import GpsSample, ImuSample
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 from msdrivers.registry import KINDS, CanSettings, DeviceKind, ModbusSettings, SerialSettings, TcpSettings
+from mstools import shapes
 from mstools.commands.check import check_vehicle
 from mstools.robot_localization import EkfSettings, read_ekf_settings
 from mstools.terminal.options import choose_name, option
@@ -42,8 +43,8 @@ Place: TypeAlias = tuple[float, float, float]
 class VehicleTemplate:
     """A kind of vehicle. Lengths in meters; x forward, y left, z up from the base frame.
 
-    `wheels` are the contact points of the wheels with encoders; `settings` are filter settings that the kind needs, and
-    `note` is a comment for its vehicle file.
+    `wheels` are the contact points of the wheels with encoders; `shapes` are what is drawn of the kind. `settings` are
+    filter settings that it needs, and `note` is a comment for its vehicle file.
     """
 
     summary: str
@@ -54,6 +55,7 @@ class VehicleTemplate:
     imu: Place
     camera: Place
     max_speed: float
+    shapes: Sequence[Shape]
     settings: Mapping[str, float] = field(default_factory=dict)
     note: str = ""
 
@@ -77,6 +79,19 @@ def _make_two(prefix: str, width: float) -> dict[str, Place]:
     return {f"{prefix}left": (0.0, width / 2, 0.0), f"{prefix}right": (0.0, -width / 2, 0.0)}
 
 
+def _draw_wheels(places: Iterable[Place], radius: float, width: float) -> list[Shape]:
+    return [shape for place in places for shape in shapes.make_wheel(place, radius, width)]
+
+
+def _draw_tracks(width: float, length: float, radius: float, breadth: float) -> list[Shape]:
+    """Return two tracks: two rollers each, and what runs around them."""
+    drawn = []
+    for y in (width / 2, -width / 2):
+        drawn += _draw_wheels(((x, y, 0.0) for x in (length / 2 - radius, radius - length / 2)), radius, breadth)
+        drawn.append(shapes.make_box((length - 2 * radius, breadth, 2 * radius), (0.0, y, radius), shapes.RUBBER))
+    return drawn
+
+
 MIDDLE: Final = "on the ground in the middle of the wheels"
 REAR_AXLE: Final = "on the ground below the middle of the rear axle"
 
@@ -90,6 +105,11 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.0, 0.0, 0.25),
         (0.3, 0.0, 0.45),
         3.0,
+        [
+            *_draw_wheels(_make_four(0.5, 0.6).values(), 0.165, 0.11),
+            shapes.make_box((0.85, 0.46, 0.2), (0.0, 0.0, 0.22), shapes.DARK),
+            shapes.make_box((0.72, 0.46, 0.05), (0.0, 0.0, 0.345), shapes.PAINT),
+        ],
     ),
     "differential": VehicleTemplate(
         "two driven wheels and a caster",
@@ -100,6 +120,12 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.0, 0.0, 0.2),
         (0.2, 0.0, 0.35),
         3.0,
+        [
+            *_draw_wheels(_make_two("", 0.5).values(), 0.1, 0.04),
+            Shape(ShapeKind.SPHERE, (0.04,), Pose((-0.22, 0.0, 0.04)), material=shapes.RUBBER),
+            shapes.make_box((0.52, 0.42, 0.14), (-0.04, 0.0, 0.16), shapes.DARK),
+            shapes.make_box((0.52, 0.42, 0.04), (-0.04, 0.0, 0.25), shapes.PAINT),
+        ],
     ),
     "ackermann": VehicleTemplate(
         "a small vehicle with steered front wheels, encoders on the rear ones",
@@ -110,6 +136,11 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.2, 0.0, 0.4),
         (0.8, 0.0, 0.7),
         8.0,
+        [
+            *_draw_wheels(((x, y, 0.0) for x in (0.0, 0.8) for y in (0.3, -0.3)), 0.2, 0.13),
+            shapes.make_box((1.25, 0.44, 0.22), (0.4, 0.0, 0.31), shapes.DARK),
+            shapes.make_box((0.95, 0.56, 0.16), (0.4, 0.0, 0.5), shapes.PAINT),
+        ],
     ),
     "tracked": VehicleTemplate(
         "two tracks",
@@ -120,6 +151,11 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.0, 0.0, 0.4),
         (0.5, 0.0, 0.6),
         3.0,
+        [
+            *_draw_tracks(0.8, 1.3, 0.16, 0.18),
+            shapes.make_box((1.15, 0.6, 0.3), (0.0, 0.0, 0.31), shapes.DARK),
+            shapes.make_box((1.0, 0.6, 0.08), (0.0, 0.0, 0.5), shapes.PAINT),
+        ],
     ),
     "mecanum": VehicleTemplate(
         "four mecanum wheels, which also move it sideways",
@@ -130,6 +166,11 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.0, 0.0, 0.15),
         (0.2, 0.0, 0.3),
         2.0,
+        [
+            *_draw_wheels(_make_four(0.4, 0.4).values(), 0.1, 0.08),
+            shapes.make_box((0.58, 0.3, 0.14), (0.0, 0.0, 0.14), shapes.DARK),
+            shapes.make_box((0.5, 0.3, 0.03), (0.0, 0.0, 0.225), shapes.PAINT),
+        ],
         {"side_sigma": 1.0},
         "The mean speed of mecanum wheels is the speed ahead; nothing measures the one sideways (side_sigma). The\n"
         "heading is found from the way driven: drive straight ahead until the pose is valid.",
@@ -143,9 +184,23 @@ TEMPLATES: Final[Mapping[str, VehicleTemplate]] = {
         (0.5, 0.0, 0.6),
         (1.6, 0.0, 1.3),
         60.0,
+        [
+            # wheelbase 2.7 m, tires 205/55 R16
+            *_draw_wheels(((x, y, 0.0) for x in (0.0, 2.7) for y in (0.775, -0.775)), 0.316, 0.205),
+            shapes.make_box((4.4, 1.34, 0.2), (1.35, 0.0, 0.33), shapes.DARK),
+            shapes.make_box((4.3, 1.66, 0.48), (1.35, 0.0, 0.66), shapes.PAINT),
+            shapes.make_box((2.4, 1.48, 0.36), (0.55, 0.0, 1.08), shapes.GLASS),
+            shapes.make_box((2.3, 1.45, 0.04), (0.6, 0.0, 1.28), shapes.PAINT),
+        ],
     ),
 }
 """Kinds of vehicles by the name that `--vehicle` takes."""
+
+CAMERA_VIEW: Final = (math.radians(60.0), math.radians(45.0), 0.3)
+"""Angles of view of the drawn camera, wide and high, and how far it is drawn, m: those of a usual 4:3 camera."""
+
+LENS: Final[Place] = (0.03, 0.0, 0.02)
+"""The entrance pupil of the camera from where it is fixed."""
 
 
 BASE_WORDS: Final = ("base_footprint", "base_link", "base")
@@ -480,19 +535,68 @@ def make_geometry(vehicle: NewVehicle) -> str:
             more, comment = ", rpy_deg: [180, 0, 0]", f"{MARK}: the unit and its own axes; here x forward, z down"
         lines.append(frame("ImuUnit", template.imu, comment, more))
     if vehicle.has_camera:
+        what = f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"
+        lines.append(frame("CameraMount", template.camera, what))
+    lines += _list_visuals(_draw_vehicle(vehicle), "    # what viewers draw, of typical size; it changes no answer")
+    if vehicle.has_camera:
+        if vehicle.head:
+            lines += [*_HEAD_BODY, *_list_visuals([shapes.make_disc(0.035, 0.05, (0.0, 0.0, 0.025), shapes.DARK)])]
         lines += [
-            frame("CameraMount", template.camera, f"{MARK}: where the {'head' if vehicle.head else 'camera'} is fixed"),
-            *(_HEAD_BODY if vehicle.head else ()),
             "  Camera:",
             "    frames:",
             "      Mount: {}",
             "      # the optical frame: z ahead out of the lens, x right, y down in the image",
-            f"      Lens: {{xyz: [0.03, 0, 0.02], rpy_deg: [-90, 0, -90]}}   # {MARK}: the entrance pupil",
+            frame("Lens", LENS, f"{MARK}: the entrance pupil", ", rpy_deg: [-90, 0, -90]"),
+            *_list_visuals(_draw_camera()),
             "",
             "constraints:",
             *(_make_head_joints(body) if vehicle.head else _fix_camera(body)),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _list_visuals(drawn: Iterable[Shape], comment: str = "") -> Iterator[str]:
+    if comment:
+        yield comment
+    yield "    visuals:"
+    yield from (f"      {line}" for line in shapes.format_shapes(drawn))
+
+
+def _draw_vehicle(vehicle: NewVehicle) -> Iterator[Shape]:
+    """Yield the shapes of a vehicle's body and of what is fixed on it, on masts where that is above the hull."""
+    template = vehicle.template
+    yield from template.shapes
+    if vehicle.gps is not None:
+        x, y, z = template.antenna
+        # of a geodetic antenna's size; the phase center is a little below its top
+        yield shapes.make_disc(0.07, 0.05, (x, y, z - 0.015), shapes.ANTENNA)
+        yield from _draw_mast((x, y, z - 0.04), template.shapes)
+    if vehicle.imu is not None:
+        yield shapes.make_box((0.06, 0.05, 0.03), template.imu, shapes.DEVICE)
+    if vehicle.has_camera:
+        yield from _draw_mast(template.camera, template.shapes)
+
+
+def _draw_mast(top: Place, hull: Iterable[Shape]) -> Iterator[Shape]:
+    """Yield the mast below a place, down to the highest box of a hull there; none where the place is in it."""
+    x, y, z = top
+    below = [
+        each.pose.xyz[2] + each.size[2] / 2.0
+        for each in hull
+        if each.kind is ShapeKind.BOX
+        and abs(x - each.pose.xyz[0]) <= each.size[0] / 2.0
+        and abs(y - each.pose.xyz[1]) <= each.size[1] / 2.0
+    ]
+    if below and z > max(below):
+        yield shapes.make_disc(0.012, z - max(below), (x, y, (z + max(below)) / 2.0), shapes.METAL)
+
+
+def _draw_camera() -> Iterator[Shape]:
+    """Yield the housing of the camera behind its lens, the lens, and what it sees."""
+    x, y, z = LENS
+    yield shapes.make_box((0.06, 0.07, 0.04), (x - 0.03, y, z), shapes.DARK)
+    yield shapes.make_beam((x, y, z), (x + 0.01, y, z), 0.03, shapes.GLASS)
+    yield from shapes.make_frustum(Pose(LENS), *CAMERA_VIEW)
 
 
 _HEAD_BODY: Final = (

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 import webbrowser
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -45,6 +46,12 @@ def command(
         Path | None, option("--config -c FILE", "Vehicle file: run the localization on a log that has no poses.")
     ] = None,
     settings: Variables = None,
+    package_path: Annotated[
+        list[Path] | None,
+        option(
+            "--package-path FOLDER", "Find meshes here too, package://NAME in the folder NAME. Repeatable.", exists=True
+        ),
+    ] = None,
     bind: Annotated[
         str, option("--bind ADDRESS", "Serve the page at this address. Beyond loopback its link has a token.")
     ] = LOOPBACK,
@@ -95,7 +102,7 @@ def command(
             from mstools.recordings.bag_log import open_lcm_log
 
             shown = stack.enter_context(open_localized(stack.enter_context(open_lcm_log(file)), config))
-        source = open_source(shown, model, settings, url, prefix, timeout, editing)
+        source = open_source(shown, model, settings, url, prefix, timeout, editing, package_path or ())
         stack.callback(source.close)
         try:
             page = open_page(bind, DEFAULT_PORT if port is None else port, with_token=edit)
@@ -152,16 +159,17 @@ def open_source(
     prefix: str,
     timeout: float,
     editing: Editing | None = None,
+    packages: Sequence[Path] = (),
 ) -> Source:
     """Open what is to be shown, or edited. Raises GeometryError, ConfigError, RecordingError, OSError."""
     from mstools.view.sources import open_geometry, open_live, open_log
 
     if file is None:
-        return open_live(url, prefix, timeout)
+        return open_live(url, prefix, timeout, packages)
     kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
     if kind is FileKind.LOG:
-        return open_log(file, prefix, model)
+        return open_log(file, prefix, model, packages)
     if model is not None:
         raise typer.BadParameter(f"goes with a log, but {file} is none: {kind.value}", param_hint="--model")
     session = None if editing is None else editing.session
-    return open_geometry(file, parse_variables(settings), session)
+    return open_geometry(file, parse_variables(settings), session, packages)

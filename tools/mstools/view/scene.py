@@ -8,6 +8,9 @@ Scene nodes, of which `/world` alone moves with the follow camera (the vehicle t
     /world/vehicle/edges        constraints, a segment each
 
 Bodies that no constraints join to the base frame are drawn beside the vehicle.
+
+The ground, `/world/grid`, is at the height of the lowest point of the vehicle with its joints at their defaults, below
+the base frame. Translucent shapes, such as what a camera sees, do not count there.
 """
 
 from __future__ import annotations
@@ -15,8 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
-from itertools import pairwise
-from pathlib import Path
+from itertools import pairwise, product
 from typing import Any, Final
 
 import numpy as np
@@ -32,8 +34,8 @@ from modelserver.geometry.parts import Body, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FramePoses, Picture
+from mstools.view.meshes import MeshError, MeshFolders
 
-MAX_MESH_BYTES: Final = 50_000_000
 MAX_TRAIL_POINTS: Final = 4_000
 TRAIL_PERIOD_US: Final = 5_000_000
 MAX_FIXES: Final = 10_000
@@ -63,6 +65,18 @@ GRID_LABELS: Final = 1
 AMBIENT_LIGHT: Final = 1.5
 """Intensity of the light on sides that no lamp reaches; the lamp above has 3."""
 
+SOFT_LIGHT: Final = (0.3, 0.5)
+"""With shadows: intensities of the light of the surroundings, and of what is left of the ambient light beside it."""
+
+SHADOW: Final = 0.25
+"""Opacity of the shadow on the ground."""
+
+CYLINDER_SIDES: Final = 48
+"""Sides of a drawn cylinder: half a pixel less than a circle at a radius of 250 pixels (1 - cos(pi / 48) = 0.002)."""
+
+MIN_OPACITY: Final = 0.5
+"""Least opacity of what is part of the vehicle, and not what a sensor sees."""
+
 GIZMO_SCALE: Final = 0.2
 """Length of the gizmo's arrows, as a part of the size of the model."""
 
@@ -83,13 +97,13 @@ class VehicleScene:
 
     Parameters
     ----------
-    folder : of the geometry file, in which mesh files are looked up; None reads none
+    meshes : the folders in which mesh files are looked up
     pick : called with the full name of a frame that was clicked, and whether Shift was held
     """
 
-    def __init__(self, server: viser.ViserServer, folder: Path | None, pick: Callable[[str, bool], None]):
+    def __init__(self, server: viser.ViserServer, meshes: MeshFolders, pick: Callable[[str, bool], None]):
         self._scene = server.scene
-        self._folder = folder
+        self._meshes = meshes
         self._pick = pick
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._frames: FramePoses | None = None
@@ -98,27 +112,28 @@ class VehicleScene:
         self._path: tuple[str, ...] = ()
         self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
-        self.unread: list[str] = []
-        """Mesh files that could not be read, with the reason."""
+        self._points: dict[str, Array] = {}
+        self._solid: dict[str, Array] = {}
+        self._ground = 0.0
+        self.unread: dict[str, list[str]] = {}
+        """Mesh files that are not drawn, by the reason."""
         self.is_edited = False
         """Whether it has a gizmo: bodies are not clicked then, frames are."""
-        # without reflections and shadows, which show nothing of a geometry: where no graphics card draws them, the
-        # first picture would come seconds later
-        self._scene.configure_default_lights(cast_shadow=False)
-        self._scene.configure_environment_map(hdri=None)
-        self._scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
+        self._light = self._scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
         self._world = self._scene.add_frame("/world", show_axes=False)
         self._vehicle = self._scene.add_frame("/world/vehicle", show_axes=False)
-        self._scene.add_grid(
+        self._grid = self._scene.add_grid(
             "/world/grid",
             infinite_grid=True,
             cell_size=1.0,
             section_size=10.0,
             cell_color=(205, 205, 205),
             section_color=(160, 160, 160),
-            fade_distance=150.0,
-            shadow_opacity=0.0,
+            # from three quarters at 10 m to a tenth at 100 m: lines that are nearer than a pixel would flicker
+            fade_distance=200.0,
+            fade_strength=4.0,
         )
+        self.set_shadows(False)
         self._trail = self._add_lines("/world/trail", TRAIL_COLOR, 3.0)
         self._trail_end = self._add_lines("/world/trail_end", TRAIL_COLOR, 3.0)
         self._trail_span = (0, 0)
@@ -154,15 +169,25 @@ class VehicleScene:
             name, np.zeros((0, 2, 3), np.float32), color, thickness=width, thickness_units="screen"
         )
 
+    def set_shadows(self, is_on: bool) -> None:
+        """Turn shadows and the light of the surroundings on or off.
+
+        They are for a machine with a graphics card: in software, the first picture would come seconds later.
+        """
+        self._scene.configure_default_lights(cast_shadow=is_on)
+        self._scene.configure_environment_map("studio" if is_on else None, environment_intensity=SOFT_LIGHT[0])
+        self._light.intensity = SOFT_LIGHT[1] if is_on else AMBIENT_LIGHT
+        self._grid.shadow_opacity = SHADOW if is_on else 0.0
+
     # --- geometry
 
-    def set_model(self, model: Model, base_frame: str) -> float:
-        """Draw another model, and return its size in meters; `base_frame` is the frame whose pose is published."""
+    def set_model(self, model: Model, base_frame: str) -> None:
+        """Draw another model; `base_frame` is the frame whose pose is published."""
         for each in self._bodies.values():
             each.remove()
         # went with its body
         self._gizmo = None
-        self._bodies, self._poses, self._labels, self.unread = {}, {}, [], []
+        self._bodies, self._poses, self._labels, self._points, self._solid, self.unread = {}, {}, [], {}, {}, {}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
         size = self._size = max([0.5, *(float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies)])
@@ -178,18 +203,44 @@ class VehicleScene:
                 node.position = self._poses[body.name].xyz
             self._draw_body(root, body, size)
         self._place_bodies(self._frames, self._frames.compute_bodies())
-        return size
+        joined = [self._poses[name].transform(self._solid[name]) for name in self._frames.paths]
+        self._ground = min((float(each[:, 2].min()) for each in joined if len(each)), default=0.0)
+
+    def list_points(self) -> Array:
+        """Return the outermost points (n, 3) of shapes and frames in the scene, as they are drawn."""
+        found = [pose.transform(self._points[name]) for name, pose in self._poses.items()]
+        points = np.concatenate([np.zeros((0, 3)), *found])
+        vehicle = Pose(self._vehicle.position.tolist(), self._vehicle.wxyz.tolist())
+        return vehicle.transform(points) + self._world.position
+
+    @property
+    def center(self) -> Array:
+        """The place of the base frame in the scene (3)."""
+        return np.asarray(self._vehicle.position + self._world.position)
+
+    @property
+    def heading(self) -> float:
+        """The yaw of the vehicle in the scene, radians."""
+        return float(Pose((0.0, 0.0, 0.0), self._vehicle.wxyz.tolist()).rpy[2])
 
     def _draw_body(self, root: str, body: Body, size: float) -> None:
+        points: list[Array] = []
+        solid: list[Array] = []
         for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
-            nodes = [self._draw_shape(f"{root}/{kind}/{number}", shape, kind) for number, shape in enumerate(shapes)]
-            drawn = [node for node in nodes if node is not None]
+            drawn = [
+                node
+                for number, shape in enumerate(shapes)
+                if (node := self._draw_shape(f"{root}/{kind}/{number}", shape, kind, points, solid)) is not None
+            ]
             # what can be clicked hides from the pointer what is behind it: frames in a stand-in box, and the gizmo
             if kind != "box" and body.frames and not self.is_edited:
                 for node in drawn:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
             if drawn:
                 break
+        places = np.array([frame.pose.xyz for frame in body]).reshape(-1, 3)
+        self._points[body.name] = np.concatenate([places, *points])
+        self._solid[body.name] = np.concatenate([np.zeros((0, 3)), *solid])
         self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0))
         if not body.frames:
             return
@@ -214,30 +265,44 @@ class VehicleScene:
         node.on_click(lambda event: self._pick(find_frame(event), False))
         node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
 
-    def _draw_shape(self, name: str, shape: Shape, kind: str) -> Any:
-        """Draw a shape; None for a mesh that cannot be read."""
+    def _draw_shape(self, name: str, shape: Shape, kind: str, points: list[Array], solid: list[Array]) -> Any:
+        """Draw a shape; None for a mesh that cannot be read.
+
+        Its outermost points in the body are appended to `points`, and to `solid` where it is part of the vehicle.
+        """
+        stated = shape.material.color if shape.material is not None else None
         color, opacity = BODY_COLOR, 0.2 if kind == "box" else 1.0
-        if shape.material is not None and shape.material.color is not None:
-            red, green, blue, opacity = shape.material.color
-            color = (round(255 * red), round(255 * green), round(255 * blue))
+        if stated is not None:
+            *rgb, opacity = stated
+            color = (round(255 * rgb[0]), round(255 * rgb[1]), round(255 * rgb[2]))
         scene = self._scene
-        look: dict[str, Any] = {"color": color, "opacity": opacity if opacity < 1.0 else None}
-        look |= {"wxyz": shape.pose.wxyz, "position": shape.pose.xyz}
+        place: dict[str, Any] = {"wxyz": shape.pose.wxyz, "position": shape.pose.xyz}
+        look: dict[str, Any] = {"color": color, "opacity": opacity if opacity < 1.0 else None, **place}
+        is_translucent = stated is not None and opacity < MIN_OPACITY
+        # what a sensor sees throws no shadow
+        look["cast_shadow"] = not is_translucent
+        if shape.kind is ShapeKind.MESH:
+            try:
+                mesh = self._meshes.read(shape.file, stated)
+            except MeshError as error:
+                files = self.unread.setdefault(str(error), [])
+                if shape.file not in files:
+                    files.append(shape.file)
+                return None
+            corners = mesh.outline * np.array(shape.size)
+        else:
+            corners = _list_outline(shape)
+        points.append(shape.pose.transform(corners))
+        if not is_translucent:
+            solid.append(points[-1])
         if shape.kind is ShapeKind.BOX:
             return scene.add_box(name, dimensions=np.array(shape.size), **look)
         if shape.kind is ShapeKind.CYLINDER:
-            return scene.add_cylinder(name, shape.size[0], shape.size[1], **look)
+            return scene.add_cylinder(name, shape.size[0], shape.size[1], radial_segments=CYLINDER_SIDES, **look)
         if shape.kind is ShapeKind.SPHERE:
             return scene.add_icosphere(name, shape.size[0], **look)
-        try:
-            mesh = read_mesh(shape.file, self._folder)
-        except (OSError, ValueError) as error:
-            problem = f"{shape.file}: {error}"
-            if problem not in self.unread:
-                self.unread.append(problem)
-            return None
-        vertices = np.asarray(mesh.vertices, np.float32) * np.array(shape.size, np.float32)
-        return scene.add_mesh_simple(name, vertices, np.asarray(mesh.faces, np.uint32), side="double", **look)
+        x, y, z = shape.size
+        return scene.add_glb(name, mesh.glb, scale=(x, y, z), **place)
 
     def show_labels(self, shown: NameLabels, chosen: Collection[str] = ()) -> None:
         """Show the names of bodies or frames, and those of some frames in any case."""
@@ -252,6 +317,7 @@ class VehicleScene:
             self._place_bodies(self._frames, moved)
         pose = picture.pose or Pose.identity()
         self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
+        self._grid.position = (0.0, 0.0, float(pose.transform((0.0, 0.0, self._ground))[2]))
         x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
         self._world.position = (-x, -y, -z)
 
@@ -404,32 +470,17 @@ def _make_box(body: Body) -> Shape:
     return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
 
 
-def read_mesh(file: str, folder: Path | None) -> trimesh.Trimesh:
-    """Read a mesh file. Raises OSError, ValueError with the reason.
-
-    `file` is a path or a package URL, looked up from `folder`, and for a package also from the folders above it.
-    """
-    if folder is None:
-        raise ValueError("meshes are read with a geometry file, not from the bus")
-    relative = file.removeprefix("file://").removeprefix("package://")
-    places = [folder / relative]
-    if file.startswith("package://"):
-        inside = relative.partition("/")[2]
-        places += [parent / name for parent in (folder, *folder.parents[:3]) for name in (relative, inside)]
-    path = next((each for each in places if each.is_file()), None)
-    if path is None:
-        raise ValueError("not found")
-    if path.stat().st_size > MAX_MESH_BYTES:
-        raise ValueError(f"larger than {MAX_MESH_BYTES // 1_000_000} MB")
-    try:
-        mesh = trimesh.load_mesh(path)
-    except Exception as error:
-        raise ValueError(f"cannot be read: {error or type(error).__name__}") from None
-    if not len(mesh.faces):
-        raise ValueError("has no triangles")
-    if not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices) and np.isfinite(mesh.vertices).all()):
-        raise ValueError("has triangles with corners that it does not have")
-    return mesh
+def _list_outline(shape: Shape) -> Array:
+    """Return points (n, 3) of a box, cylinder or sphere around its center: corners, or points on its circles."""
+    if shape.kind is ShapeKind.BOX:
+        return np.array(list(product((-0.5, 0.5), repeat=3))) * shape.size
+    radius = shape.size[0]
+    if shape.kind is ShapeKind.SPHERE:
+        return radius * np.asarray(trimesh.creation.icosphere(2).vertices)
+    angles = np.linspace(0.0, 2.0 * math.pi, CYLINDER_SIDES, endpoint=False)
+    circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ends = [np.column_stack([circle, np.full(len(circle), z)]) for z in (-shape.size[1] / 2.0, shape.size[1] / 2.0)]
+    return np.concatenate(ends)
 
 
 def compute_ellipsoid(covariance: Array, quantile: float) -> tuple[Vector3, Pose]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -25,6 +25,7 @@ from mstools.edit import EditedFile, EditSession
 from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
 from mstools.terminal.output import load_given_model, read_with_progress
+from mstools.view.meshes import MeshFolders
 
 FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""
@@ -34,14 +35,14 @@ FILE_UTIME: Final = 10**15
 class Source:
     """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
 
-    `folder` is that of the geometry file, in which its meshes are; `notes` are what is odd about a log. `set_joints`
+    `meshes` are the folders in which mesh files are looked up; `notes` are what is odd about a log. `set_joints`
     moves the joints of a geometry file, `set_model` shows it as edited.
     """
 
     title: str
     drive: Drive
     answers: LocalPlatform | Platform
-    folder: Path | None = None
+    meshes: MeshFolders = field(default_factory=MeshFolders)
     is_live: bool = False
     set_joints: Callable[[Mapping[str, float]], None] | None = None
     set_model: Callable[[Model], None] | None = None
@@ -92,8 +93,12 @@ def list_coordinates(model: Model) -> list[tuple[str, Joint, int]]:
     ]
 
 
-def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession | None = None) -> Source:
+def open_geometry(
+    path: Path, variables: Mapping[str, str], session: EditSession | None = None, packages: Sequence[Path] = ()
+) -> Source:
     """Open a geometry file, or that of a vehicle file; one that is edited may have errors.
+
+    `packages` are folders in which its meshes are looked up too.
 
     Raises GeometryError, ConfigError, OSError.
     """
@@ -102,7 +107,8 @@ def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession
     model = load_given_model(geometry, variables) if session is None else session.drawn
     drive = Drive(keep_geometry=True)
     answers = FilePlatform(model, next(frame.full_name for body in model.bodies for frame in body), f"in {path}")
-    source = Source(f"{model.name or path.name}", drive, answers, geometry.resolve().parent)
+    meshes = MeshFolders(geometry.resolve().parent, tuple(packages))
+    source = Source(f"{model.name or path.name}", drive, answers, meshes)
 
     def set_joints(positions: Mapping[str, float]) -> None:
         answers.set_joints(positions)
@@ -139,8 +145,8 @@ class NoGeometry(LocalPlatform):
         return MirrorState(), 0
 
 
-def open_log(path: Path, prefix: str = "", model: Path | None = None) -> Source:
-    """Open a log of the service; `model` is a geometry file in place of the log's.
+def open_log(path: Path, prefix: str = "", model: Path | None = None, packages: Sequence[Path] = ()) -> Source:
+    """Open a log of the service; `model` is a geometry file in place of the log's, `packages` as for `open_geometry`.
 
     Raises RecordingError, GeometryError, OSError.
     """
@@ -168,16 +174,16 @@ def open_log(path: Path, prefix: str = "", model: Path | None = None) -> Source:
     if not drive.poses.count:
         notes.append("no pose of the service is in it: -c vehicle.yaml runs the localization on it")
     folder = model.resolve().parent if model is not None else None
-    return Source(path.name, drive, answers, folder, notes=tuple(notes))
+    return Source(path.name, drive, answers, MeshFolders(folder, tuple(packages)), notes=tuple(notes))
 
 
 # --- running service
 
 
-def open_live(url: str, prefix: str, timeout: float) -> Source:
+def open_live(url: str, prefix: str, timeout: float, packages: Sequence[Path] = ()) -> Source:
     drive = Drive(prefix)
     answers = Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="view")
-    source = Source("live", drive, answers, is_live=True)
+    source = Source("live", drive, answers, MeshFolders(None, tuple(packages)), is_live=True)
     stop = threading.Event()
     bus = open_lcm(resolve_url(url))
     arguments = (bus, prefix, drive.feed, stop.is_set, source.lock)

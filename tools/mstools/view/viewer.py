@@ -7,7 +7,7 @@ import math
 import shlex
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
@@ -25,6 +25,7 @@ from modelserver.transforms.so3 import Array
 from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.terminal.health import format_body, format_duration
+from mstools.view.camera import ViewCamera
 from mstools.view.dashboard import Dashboard, Shown
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
@@ -63,6 +64,7 @@ class Viewer:
         self._server = page.server
         self._actions = Actions()
         self._model: Model | None = None
+        self._is_following = True
         self._named: tuple[NameLabels, tuple[str, str]] | None = None
         self._next_slider = self._next_state = self._next_fixes = 0.0
         gui = page.server.gui
@@ -70,7 +72,8 @@ class Viewer:
         gui.main_panel.dock_right()
         self._title = ""
         self._show_title("")
-        self._scene = VehicleScene(page.server, source.folder, self._pick)
+        self._scene = VehicleScene(page.server, source.meshes, self._pick)
+        self._camera = ViewCamera(page.server, self._scene.list_points, lambda: self._scene.heading)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Query"):
             self._query = QueryPanel(gui, source)
@@ -90,7 +93,9 @@ class Viewer:
             with tabs.add_tab("Joints"):
                 self._joints = JointsPanel(gui, source, self._actions)
         with tabs.add_tab("Display"):
+            self._camera.add_controls(gui, self._actions)
             self._display = DisplayPanel(gui)
+            self._actions.on_update(self._display.shadows, lambda: self._scene.set_shadows(self._display.shadows.value))
             self._notes = gui.add_markdown("")
         self._dashboard = Dashboard(
             source,
@@ -149,12 +154,17 @@ class Viewer:
             fixes = drive.get_fixes(picture.utime) if now >= self._next_fixes else None
             origin, (model, base_frame) = drive.origin, drive.get_geometry(utime)
         with self._server.atomic():
-            if model is not None and model is not self._model:
+            is_loaded = model is not None and model is not self._model
+            if model is not None and is_loaded:
                 self._set_model(model, base_frame)
             if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
                 self._named = named
                 self._scene.show_labels(*named)
-            self._scene.show(picture, display.follow.value)
+            center, is_following = self._scene.center, display.follow.value
+            self._scene.show(picture, is_following)
+            if is_following != self._is_following:
+                self._is_following = is_following
+                self._camera.move(self._scene.center - center)
             self._scene.show_trail(utimes, track)
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
@@ -162,6 +172,7 @@ class Viewer:
             confidence = int(display.confidence.value.split()[0])
             self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
+            self._camera.update(is_loaded)
         is_playing = self._time is not None and self._time.is_playing
         places = {}
         if picture.pose is not None and (frame := self._scene.get_frame_pose(self._query.frames[0])) is not None:
@@ -187,19 +198,27 @@ class Viewer:
             self._server.gui.set_panel_label(title)
 
     def _set_model(self, model: Model, base_frame: str) -> None:
-        size = self._scene.set_model(model, base_frame)
+        self._scene.set_model(model, base_frame)
         self._named = None
-        if self._model is None:
-            self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
-            self._server.initial_camera.position = (1.2 * size, 1.6 * size, 1.3 * size)
         self._model = model
         self._query.set_model(model, base_frame)
         if self._joints is not None:
             self._joints.set_model(model)
         if self._editor is not None:
             self._editor.show_gizmo()
-        rows = "\n".join(f"- {escape_markdown(each)}" for each in self._scene.unread)
-        self._notes.content = f"Meshes that are not drawn:\n\n{rows}" if rows else ""
+        self._notes.content = describe_unread(self._scene.unread)
+
+
+def describe_unread(unread: Mapping[str, Sequence[str]]) -> str:
+    """Return the meshes that are not drawn, by the reason, as Markdown."""
+    if not unread:
+        return ""
+    parts = [f"Meshes that are not drawn: {sum(map(len, unread.values()))}"]
+    for reason, files in unread.items():
+        # a long path is broken at its slashes: a page cuts what is wider than the panel
+        rows = "\n".join(f"- {escape_markdown(each).replace('/', '/<wbr>')}" for each in files)
+        parts.append(f"**{escape_markdown(reason).replace('/', '/<wbr>')}**\n\n{rows}")
+    return "\n\n".join(parts)
 
 
 # --- panels
@@ -588,6 +607,9 @@ class DisplayPanel:
         confidences = tuple(f"{each} %" for each in CHI_SQUARE_3)
         self.confidence = gui.add_dropdown("Confidence", confidences, initial_value="95 %")
         self.trail = gui.add_dropdown("Trail", tuple(TRAILS), initial_value="10 min")
+        self.shadows: Any = gui.add_checkbox(
+            "Shadows", False, hint="And soft light; for a machine with a graphics card"
+        )
 
 
 class JointsPanel:
