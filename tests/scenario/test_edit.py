@@ -132,7 +132,7 @@ def press(page: Page, name: str) -> None:
 def set_number(page: Page, label: str, value: str) -> None:
     """Set a number of the selected item."""
     find_fields(page, label).nth(0).fill(value)
-    press(page, "Set")
+    page.keyboard.press("Enter")
 
 
 def wait_for_value(field: Locator, value: str) -> None:
@@ -216,6 +216,37 @@ def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edit
     sigma = load_model(path).frame("FLEA:Lens").sigma
     assert sigma is not None
     assert sigma.position[0] == 0.015
+
+
+def test_given_numbers_that_are_typed_in_any_way_then_the_file_has_what_was_typed(edited_page: EditedPage) -> None:
+    path, page, _ = edited_page
+    select_item(page, "frame", "FLEA:Lens")
+    x, y = (find_fields(page, f"{axis} (m)") for axis in "xy")
+    x.click(click_count=3)
+    page.keyboard.type("-0.2")
+    page.keyboard.press("Tab")
+    # the cursor is in the next field, and stays there while the first one is set; faster than the page sends
+    page.keyboard.type("1e-1")
+    page.keyboard.press("Tab")
+    page.keyboard.type("\u22120,25")
+    page.keyboard.press("Tab")
+    wait_for_text(page, "^geometry.yaml: not saved$")
+    x.click()
+    page.keyboard.press("Control+A")
+    page.keyboard.type("-0.3")
+    page.keyboard.press("Enter")
+    page.keyboard.type("5")
+    y.click(click_count=3)
+    page.keyboard.type("1/3")
+    page.keyboard.press("Enter")
+    wait_for_text(page, r"^y \(m\): '1/3' is not a number; accepted are numbers such as")
+    y.fill("0.15")
+    # not left: the selection of another item sets it
+    select_item(page, "constraint", MOUNT)
+    press(page, "Save ...")
+    press(page, "Save")
+    wait_for_text(page, "^geometry.yaml: saved$")
+    assert load_model(path).frame("FLEA:Lens").pose.xyz == (-0.35, 0.15, -0.25)
 
 
 def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edited_page: EditedPage) -> None:
