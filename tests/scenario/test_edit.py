@@ -26,6 +26,7 @@ from PIL import Image
 
 from modelserver.client.remote import Platform
 from modelserver.formats import load_model
+from mstools.view.scene import SELECTED_COLOR
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
@@ -302,6 +303,22 @@ def test_given_other_items_and_kinds_in_turn_then_the_gizmo_is_where_the_item_is
     shown, hidden, again = pictures
     assert (np.abs(shown - hidden).sum(axis=2) > 90).sum() > 50, "the gizmo has vanished"
     assert (np.abs(shown - again).sum(axis=2) > 90).sum() < 50, "the gizmo was somewhere else"
+
+
+def test_given_a_selected_item_then_it_is_outlined_without_the_gizmo_too(edited_page: EditedPage) -> None:
+    _, page, _ = edited_page
+    box = find_fields(page, "Gizmo")
+    if not box.is_visible():
+        page.get_by_text("Gizmo", exact=True).first.click()
+    box.set_checked(False)
+    counts = []
+    for kind, name in (("body", "Raptor"), ("frame", "FLEA:Lens"), ("constraint", MOUNT)):
+        select_item(page, kind, name)
+        picture = take_picture(page)[:, :SCENE_WIDTH]
+        counts.append(int((np.abs(picture - SELECTED_COLOR).sum(axis=2) < 60).sum()))
+    # the Raptor is larger than what is mounted on it
+    assert counts[0] > 2 * max(counts[1:]), counts
+    assert min(counts) > 50, counts
 
 
 def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page: EditedPage) -> None:

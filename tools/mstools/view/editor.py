@@ -369,8 +369,15 @@ class Editor:
     # --- gizmo
 
     def show_gizmo(self) -> None:
-        """Show the gizmo at what is selected, where the scene has it."""
+        """Outline what is selected, and show the gizmo at it, where the scene has it."""
         place = self._fields.find_place()
+        part = self._fields.part
+        if isinstance(part, Constraint):
+            # what it moves
+            body, pose = names.split(part.to)[0], self._session.drawn.frame(part.to).pose
+            self._scene.mark(body, pose)
+        else:
+            self._scene.mark(self._item.name.partition(":")[0], part.pose if part is not None else None)
         if not self._gizmo.value or place is None:
             self._scene.hide_gizmo()
             return
@@ -627,7 +634,7 @@ class ItemFields:
         self._actions = actions
         self._item = item
         self._folder: Any = None
-        self._part: BodyFrame | Constraint | None = None
+        self.part: BodyFrame | Constraint | None = None
         self._shown: list[ShownField] = []
         self._fields: dict[str, Any] = {}
         self._count = 0
@@ -647,7 +654,7 @@ class ItemFields:
 
     def show(self, item: GeometryItem) -> None:
         """Show an item. Fields that stay the same ones stay on the page, with what is typed in them."""
-        self._part = find_part(self._session.drawn, item)
+        self.part = find_part(self._session.drawn, item)
         shown = self._list_fields(item)
         is_same = item == self._item and _list_layout(shown) == _list_layout(self._shown)
         self._item, self._shown = item, shown
@@ -679,13 +686,13 @@ class ItemFields:
             users = ", ".join(document.list_users(template))
             hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
             shown.append(ShownField("template", (f"For all of {template}: {users}",), False, hint=hint))
-        part: BodyFrame | Constraint | Body | None = self._part
+        part: BodyFrame | Constraint | Body | None = self.part
         if isinstance(part, Constraint):
             frames = tuple(list_frames(document))
             for key, frame in (("from", part.from_), ("to", part.to)):
                 shown.append(ShownField(key, (key,), frame if frame in frames else frames[0], frames))
-        if self._part is not None:
-            shown += _list_pose_fields(self._part.pose, self._part.sigma)
+        if self.part is not None:
+            shown += _list_pose_fields(self.part.pose, self.part.sigma)
         if isinstance(part, Constraint):
             shown += self._list_joint_fields(item, part.joint)
         part = part or next((each for each in self._session.drawn.bodies if each.name == item.name), None)
@@ -859,12 +866,12 @@ class ItemFields:
             document = document.set_sigma(item, stated[0], stated[1], in_template)
         if "description" in changed:
             document = document.set_description(item, values["description"].strip(), in_template)
-        if isinstance(self._part, Constraint):
+        if isinstance(self.part, Constraint):
             if changed & {"from", "to"}:
                 document = document.set_ends(item.name, values["from"], values["to"])
-            joint = self._read_joint(self._part.joint, values, differing)
-            if joint != self._part.joint:
-                document = document.set_joint(item.name, self._part.joint, joint)
+            joint = self._read_joint(self.part.joint, values, differing)
+            if joint != self.part.joint:
+                document = document.set_joint(item.name, self.part.joint, joint)
         return document.rename(item, name, in_template) if name else document
 
     def _read_joint(self, old: Joint, values: Mapping[str, Any], differing: Collection[str]) -> Joint:
@@ -911,7 +918,7 @@ class ItemFields:
 
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
-        model, part = self._session.drawn, self._part
+        model, part = self._session.drawn, self.part
         if part is None:
             return None
         if isinstance(part, BodyFrame):
@@ -920,10 +927,10 @@ class ItemFields:
 
     def set_dragged(self, pose: Pose, steps: tuple[float, float], is_end: bool) -> None:
         """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
-        if self._part is None:
+        if self.part is None:
             return
         meters, degrees = steps
-        moved, turned = self._part.pose.distance(pose)
+        moved, turned = self.part.pose.distance(pose)
         if moved > SAME:
             self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])
         if turned > SAME:

@@ -69,6 +69,26 @@ GIZMO_SCALE: Final = 0.2
 LABEL_SPACING: Final = 20.0
 """Meters."""
 
+NO_LINES: Final = np.zeros((0, 2, 3))
+
+SELECTED_COLOR: Final[Rgb] = (130, 40, 240)
+MARK_SCALE: Final = 0.12
+"""Edge of the cube that marks a frame, as a part of the size of the model: axes have 0.05, the gizmo covers less."""
+
+OUTLINE_SCALE: Final = 1.01
+"""Size of an outline relative to its shape, whose surface would hide half of each line."""
+
+_CUBE: Final = np.array(
+    [
+        (a, b)
+        for a in np.ndindex(2, 2, 2)
+        for b in np.ndindex(2, 2, 2)
+        if a < b and sum(p != q for p, q in zip(a, b, strict=True)) == 1
+    ],
+    float,
+)
+"""The 12 edges of the unit cube (12, 2, 3), corners at 0 and 1."""
+
 
 class NameLabels(StrEnum):
     """Which names stand in the scene."""
@@ -146,12 +166,13 @@ class VehicleScene:
         )
         self._gizmo: Any = None
         self._gizmo_count = 0
+        self._mark: Any = None
         self._ellipsoid = self._scene.add_icosphere("/world/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False)
 
-    def _add_lines(self, name: str, color: Rgb, width: float) -> Any:
-        """Add a node of line segments, none at first, `width` pixels wide."""
+    def _add_lines(self, name: str, color: Rgb, width: float, points: Array = NO_LINES) -> Any:
+        """Add a node of line segments (n, 2, 3), `width` pixels wide."""
         return self._scene.add_line_segments(
-            name, np.zeros((0, 2, 3), np.float32), color, thickness=width, thickness_units="screen"
+            name, points.astype(np.float32), color, thickness=width, thickness_units="screen"
         )
 
     # --- geometry
@@ -161,7 +182,7 @@ class VehicleScene:
         for each in self._bodies.values():
             each.remove()
         # went with its body
-        self._gizmo = None
+        self._gizmo = self._mark = None
         self._bodies, self._poses, self._labels, self.unread = {}, {}, [], []
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
@@ -321,6 +342,43 @@ class VehicleScene:
             self._gizmo.remove()
             self._gizmo = None
 
+    def mark(self, body: str, place: Pose | None) -> None:
+        """Outline a body, and a frame on it at `place`, where they are drawn."""
+        if self._mark is not None:
+            self._mark.remove()
+            self._mark = None
+        node = self._bodies.get(body)
+        if node is None or self._frames is None:
+            return
+        shapes = list(_list_shapes(self._frames.model.body(body)))
+        if place is not None:
+            shapes.append(Shape(ShapeKind.BOX, (MARK_SCALE * self._size,) * 3, place))
+        edges = [self._outline(each) for each in shapes]
+        # as for the gizmo
+        self._gizmo_count += 1
+        self._mark = self._add_lines(
+            f"{node.name}/selected{self._gizmo_count}", SELECTED_COLOR, 3.0, np.concatenate(edges)
+        )
+
+    def _outline(self, shape: Shape) -> Array:
+        """Return the edges (12, 2, 3) of the box around a shape, on its body; none of a mesh that cannot be read."""
+        low, high = -np.array(shape.size) / 2.0, np.array(shape.size) / 2.0
+        if shape.kind is ShapeKind.CYLINDER:
+            radius, length = shape.size
+            high = np.array((radius, radius, length / 2.0))
+            low = -high
+        elif shape.kind is ShapeKind.SPHERE:
+            high = np.full(3, shape.size[0])
+            low = -high
+        elif shape.kind is ShapeKind.MESH:
+            try:
+                low, high = np.sort(read_mesh(shape.file, self._folder).bounds * np.array(shape.size), axis=0)
+            except (OSError, ValueError):
+                return NO_LINES
+        center, half = (low + high) / 2.0, OUTLINE_SCALE * (high - low) / 2.0
+        corners = (center + (2.0 * _CUBE - 1.0) * half).reshape(-1, 3)
+        return shape.pose.transform(corners).reshape(-1, 2, 3)
+
     def show_trail(self, utimes: npt.NDArray[np.int64], points: Array) -> None:
         """Draw the trail through points (n, 3) in World:UTM at times (n,), microseconds.
 
@@ -402,6 +460,10 @@ def _make_box(body: Body) -> Shape:
     low, high = corners.min(axis=0), corners.max(axis=0)
     x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()
     return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
+
+
+def _list_shapes(body: Body) -> tuple[Shape, ...]:
+    return body.visuals or body.collisions or (_make_box(body),)
 
 
 def read_mesh(file: str, folder: Path | None) -> trimesh.Trimesh:
