@@ -127,7 +127,12 @@ def find_gizmo(page: Page) -> tuple[tuple[float, float], list[tuple[float, float
 
 
 def press(page: Page, name: str) -> None:
-    page.get_by_role("button", name=name, exact=True).last.click()
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def confirm(page: Page, name: str) -> None:
+    """Press a button of a dialog."""
+    page.get_by_role("dialog").get_by_role("button", name=name, exact=True).click()
 
 
 def set_number(page: Page, label: str, value: str) -> None:
@@ -161,13 +166,13 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
         wait_for_text(page, "^geometry.yaml: not saved$")
         # nothing is applied yet
         assert platform.get_pose(*pair).transformation.pose == before
-        press(page, "Save ...")
-        wait_for_text(page, r"\+    xyz: \[0.0625, 0, 0\]")
         press(page, "Save")
+        wait_for_text(page, r"\+    xyz: \[0.0625, 0, 0\]")
+        confirm(page, "Save")
         wait_for_text(page, "^geometry.yaml: saved$")
-        press(page, "Apply to the service ...")
-        wait_for_text(page, f"constraint {MOUNT} moves by 62.5 mm")
         press(page, "Apply")
+        wait_for_text(page, f"constraint {MOUNT} moves by 62.5 mm")
+        confirm(page, "Apply")
         applied = time.monotonic()
         after = before
         while after == before:
@@ -176,15 +181,15 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
         assert after.xyz[0] - before.xyz[0] == pytest.approx(0.0625 * math.cos(math.radians(12.0)), abs=1e-6)
         wait_for_text(page, "^applied: ")
         # undone, saved and applied
-        press(page, f"Undo: edit {MOUNT}")
+        press(page, "Undo")
         wait_for_text(page, "^geometry.yaml: not saved$")
-        press(page, "Save ...")
-        wait_for_text(page, r"\-    xyz: \[0.0625, 0, 0\]")
         press(page, "Save")
+        wait_for_text(page, r"\-    xyz: \[0.0625, 0, 0\]")
+        confirm(page, "Save")
         wait_for_text(page, "^geometry.yaml: saved$")
-        press(page, "Apply to the service ...")
-        wait_for_text(page, f"constraint {MOUNT} moves by 62.5 mm")
         press(page, "Apply")
+        wait_for_text(page, f"constraint {MOUNT} moves by 62.5 mm")
+        confirm(page, "Apply")
         wait_for_text(page, "^applied: ")
         assert platform.get_pose(*pair).transformation.pose == before
     assert (folder / "geometry.yaml").read_bytes() == (RAPTOR / "geometry.yaml").read_bytes()
@@ -205,14 +210,15 @@ def test_given_a_wrong_number_then_a_click_leads_to_it_and_nothing_is_saved(edit
     set_number(page, "sigma x (m)", "-0.5")
     wait_for_text(page, "cannot be saved")
     wait_for_text(page, "a standard deviation is not negative, got -0.5")
-    assert page.get_by_role("button", name="Save ...").is_disabled()
+    press(page, "Save")
+    wait_for_text(page, "^not saved: the geometry has errors")
     select_item(page, "body", "Raptor")
     press(page, "1: FLEA:Lens")
     wait_for_value(find_fields(page, "Name"), "Lens")
     set_number(page, "sigma x (m)", "0.015")
     wait_for_text(page, "^geometry.yaml: not saved$")
-    press(page, "Save ...")
     press(page, "Save")
+    confirm(page, "Save")
     wait_for_text(page, "^geometry.yaml: saved$")
     sigma = load_model(path).frame("FLEA:Lens").sigma
     assert sigma is not None
@@ -244,8 +250,8 @@ def test_given_numbers_that_are_typed_in_any_way_then_the_file_has_what_was_type
     y.fill("0.15")
     # not left: the selection of another item sets it
     select_item(page, "constraint", MOUNT)
-    press(page, "Save ...")
     press(page, "Save")
+    confirm(page, "Save")
     wait_for_text(page, "^geometry.yaml: saved$")
     assert load_model(path).frame("FLEA:Lens").pose.xyz == (-0.35, 0.15, -0.25)
 
@@ -280,7 +286,7 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
     assert values != pytest.approx(before, abs=0.009)
     for value, old in zip(values, before, strict=True):
         assert value == pytest.approx(old) or value * 100 == pytest.approx(round(value * 100))
-    press(page, "Undo: edit Raptor:CG")
+    press(page, "Undo")
     wait_for_text(page, "^geometry.yaml: saved$")
     wait_for_value(find_fields(page, "x (m)"), f"{before[0]:g}")
     find_fields(page, "Gizmo").set_checked(False)
@@ -328,10 +334,10 @@ def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page:
     wait_for_text(page, "^geometry.yaml: not saved$")
     other = path.read_text().replace("name: raptor", "name: other")
     path.write_text(other)
-    press(page, "Save ...")
     press(page, "Save")
+    confirm(page, "Save")
     wait_for_text(page, "changed meanwhile on disk")
     assert path.read_text() == other
-    press(page, "Read the file again")
-    press(page, "Drop them")
+    press(page, "Read again")
+    confirm(page, "Drop them")
     wait_for_text(page, "^geometry.yaml: saved$")

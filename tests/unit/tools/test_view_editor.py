@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,9 +21,11 @@ from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
 from mstools.edit import EditedFile, EditSession, GeometryItem, ItemKind
-from mstools.view.editor import SNAPS, Editing, Editor
+from mstools.view.editor import SNAPS, Editing, Editor, format_diff
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import VehicleScene
+from mstools.view.sources import open_geometry
+from mstools.view.viewer import Viewer
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
@@ -48,6 +51,9 @@ class EditedPage:
             self.fields._fields[key].value = value
         self.fields.set()
         return self.message
+
+    def undo(self) -> None:
+        self.editor._step(self.session.undo, self.session.undo_name, "undone")
 
     def leave(self, **texts: str) -> str:
         """Report texts of fields that were left, by their labels, as the page does; return the message."""
@@ -119,6 +125,36 @@ def test_given_a_file_with_an_error_then_it_opens_with_its_problems_and_can_be_f
     assert (session.file.path).read_text() == (RAPTOR / "geometry.yaml").read_text()
 
 
+def test_given_a_file_that_is_no_yaml_then_it_is_fixed_as_text(tmp_path: Path) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text("modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}\n")
+    opened = open_page(port=0)
+    session = EditSession(EditedFile.open(path))
+    viewer = Viewer(opened, open_geometry(path, {}, session), Editing(session))
+    viewer.draw(0.0, 0.0)
+    editor = viewer._editor
+    assert editor is not None
+    assert "not well-formed" in editor._problem_texts.content
+    assert "(line 4)" in editor._problem_texts.content
+    assert editor._text.value == session.document.text
+    editor._new.value = "B"
+    for kind in ItemKind:
+        editor._add(kind)
+        assert "not done" in editor._message.content
+    editor._text.value += "  B: {frames: {Origin: {}}}}\n"
+    editor._write_text()
+    assert session.has_errors
+    editor._text.value = "modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}}\n"
+    editor._write_text()
+    viewer.draw(0.1, 0.1)
+    assert not session.has_errors
+    assert (editor._item.name, editor._text.value) == ("A", "A: {frames: {Origin: {}}}")
+    session.save()
+    viewer._query.close()
+    editor.close()
+    opened.close()
+
+
 @pytest.mark.slow
 def test_given_all_items_then_their_fields_without_a_change_change_nothing(page: EditedPage) -> None:
     before = page.session.document.text
@@ -137,7 +173,7 @@ def test_given_numbers_then_the_frame_moves_and_undo_brings_it_back(page: Edited
     assert frame.sigma is not None
     assert frame.sigma.position == (0.002, 0.002, 0.002)
     assert page.shown == [page.model]
-    page.editor._step(page.session.undo)
+    page.undo()
     assert not page.session.is_changed
     assert page.fields._fields["xyz"].value == (0.05, 0.0, 0.06)
 
@@ -157,7 +193,8 @@ def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: E
     assert page.session.has_errors
     assert "not negative" in page.editor._problem_texts.content
     assert "cannot be saved" in page.editor._status.content
-    assert page.editor._save.disabled
+    page.editor._ask_save()
+    assert page.message == "not saved: the geometry has errors; fix them first"
     assert page.editor._buttons[0].label == "1: FLEA:Lens"
     page.editor.select(NOD)
     page.editor.select(LENS)
@@ -270,8 +307,8 @@ def test_given_a_drag_then_the_fields_follow_and_its_end_is_one_change(page: Edi
     turned = Pose.from_rpy((0.012, 0.0, 0.0), 0.0, 0.0, math.radians(44.0))
     page.fields.set_dragged(turned, SNAPS["1 cm, 5 deg"], is_end=True)
     assert np.degrees(page.constraint("FrontNoddingSICKFixed").pose.rpy) == pytest.approx([0.0, 0.0, 45.0])
-    page.editor._step(page.session.undo)
-    page.editor._step(page.session.undo)
+    page.undo()
+    page.undo()
     assert not page.session.is_changed
 
 
@@ -289,7 +326,8 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     page.set(to="Beacon:Origin")
     assert page.model.get_transformation("Beacon:Lamp", "Raptor:CabRearRailCenter").pose == Pose.identity()
     editor.select(GeometryItem(ItemKind.FRAME, "Beacon:Lamp"))
-    editor._new.value = ""
+    # the name was used
+    assert editor._new.value == ""
     editor._duplicate()
     assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp2")
     editor.select(GeometryItem(ItemKind.BODY, "Beacon"))
@@ -298,6 +336,21 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     editor._new.value = "World"
     editor._add(ItemKind.BODY)
     assert "reserved" in page.message
+    assert editor._new.value == "World"
+
+
+def test_given_a_diff_then_its_lines_are_colored_and_escaped() -> None:
+    shown = format_diff("--- a\n+++ b\n@@ -1 +1 @@\n same\n-<old>\n+new\n ")
+    lines = re.findall('<div style="([^"]*)">([^<]+)</div>', shown)
+    assert [text for _, text in lines] == ["--- a", "+++ b", "@@ -1 +1 @@", " same", "-&lt;old&gt;", "+new", " "]
+    red, green = "#e03131", "#2b8a3e"
+    assert [(red in style, green in style) for style, _ in lines] == [
+        *[(False, False)] * 4,
+        (True, False),
+        (False, True),
+        (False, False),
+    ]
+    assert "pre-wrap" in shown
 
 
 @pytest.mark.slow
@@ -385,7 +438,7 @@ def test_given_a_field_that_is_left_then_it_alone_is_set_and_the_others_stay_as_
     assert page.model.frame(LENS.name).pose.xyz == (0.12, -0.1, 0.06)
     # as it was typed
     assert field.texts[1] == "-1e-1"
-    page.editor._step(page.session.undo)
+    page.undo()
     assert field.texts == ("0.12", "0", "0.06")
 
 

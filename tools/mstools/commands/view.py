@@ -63,9 +63,9 @@ def command(
     The page shows bodies, frames, constraints and joints in 3D, the vehicle in the world with trail, fixes and
     uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
     --config the localization runs on a log that has no poses, such as an imported one. With
-    --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
-    to the running service, signed with --key. It needs the extra view; without it, the error names the
-    command that adds it. Nothing is loaded from the internet.
+    --edit it changes a geometry file (YAML), or that of a vehicle file, or begins a new one, checks each change, and
+    applies what is saved to the running service, signed with --key. It needs the extra view; without it, the error
+    names the command that adds it. Nothing is loaded from the internet.
 
     \b
     Examples:
@@ -104,6 +104,8 @@ def command(
         viewer = Viewer(page, source, editing)
         typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
         sys.stdout.flush()
+        if editing is not None and editing.session.file.is_new:
+            typer.echo(escape(f"modelserver: {file} does not exist yet; the button Save writes it"), err=True)
         if editing is not None and editing.session.has_errors:
             typer.echo(escape(f"modelserver: {source.title}: has errors, listed in the tab Edit"), err=True)
         for each in source.notes[:SHOWN_NOTES]:
@@ -127,14 +129,15 @@ def check_installed() -> None:
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
     """Begin to edit a geometry file, or that of a vehicle file. Raises typer.BadParameter, EditError, OSError.
 
-    Bus and prefix of the service are those given, else of the vehicle file.
+    A file that is not there is a new geometry file. Bus and prefix are those given, else those of the vehicle file.
     """
     from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing
 
-    if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
+    is_new = not os.path.lexists(file)
+    if not is_new and detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
         raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
-    edited = EditedFile.open(file)
+    edited = EditedFile(file, is_new=True) if is_new else EditedFile.open(file)
     check_writable(str(edited.path))
     if edited.config is not None:
         url, prefix = url or edited.config.lcm.url, prefix or edited.config.lcm.channel_prefix
@@ -155,7 +158,7 @@ def open_source(
 
     if file is None:
         return open_live(url, prefix, timeout)
-    kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
+    kind = detect_file_kind(read_start(file, EXAMINED_BYTES)) if editing is None else FileKind.GEOMETRY
     if kind is FileKind.LOG:
         return open_log(file, prefix, model)
     if model is not None:

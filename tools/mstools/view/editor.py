@@ -44,13 +44,12 @@ from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit import SAME_RADIANS, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
+from mstools.edit import SAME_RADIANS, WHOLE_FILE, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.terminal.output import format_count
 from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
-MAX_LABEL: Final = 60
 LOOK_PERIOD_S: Final = 2.0
 """Period at which the file is compared with what was read, seconds."""
 
@@ -113,6 +112,15 @@ folder.addEventListener('keydown', (event) => {{ if (event.key === 'Enter') leav
 """Executed in the page, in the folder of the fields. React takes a value that a script writes for typed if an event
 follows that the script did not write through React's own property."""
 
+_DIFF_STYLE: Final = "font-family: monospace; font-size: 0.8em; white-space: pre-wrap; overflow-wrap: anywhere"
+_DIFF_STYLES: Final = {
+    "+": "color: #2b8a3e; background: rgba(64, 192, 87, 0.15)",
+    "-": "color: #e03131; background: rgba(250, 82, 82, 0.15)",
+    "@": "opacity: 0.6",
+}
+
+HINT: Final = "Save shows the changes first. Apply reloads the geometry in the running service, also after a question"
+
 _PIXEL: Final = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
 
 Change = Callable[[GeometryDocument], GeometryDocument]
@@ -169,12 +177,16 @@ class Editor:
         self._is_outdated = False
         self._buttons: list[Any] = []
         self._status = gui.add_markdown("")
+        buttons: dict[str, Callable[[], object]] = {
+            "Undo": lambda: self._step(session.undo, session.undo_name, "undone"),
+            "Redo": lambda: self._step(session.redo, session.redo_name, "made again"),
+            "Save": self._ask_save,
+            "Apply": self._ask_apply,
+            "Read again": self._ask_read,
+        }
+        group = gui.add_button_group("Changes", tuple(buttons), hint=HINT)
+        group.on_click(lambda event: actions.put(buttons[event.target.value]))
         self._message = gui.add_markdown("")
-        self._undo = self._add_button("Undo", lambda: self._step(session.undo))
-        self._redo = self._add_button("Redo", lambda: self._step(session.redo))
-        self._save = self._add_button("Save ...", self._ask_save)
-        self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
-        self._add_button("Read the file again", self._ask_read)
         self._problems = gui.add_folder("Problems")
         with self._problems:
             self._problem_texts = gui.add_markdown("")
@@ -205,7 +217,7 @@ class Editor:
         return self._actions.add_button(self._gui, label, action)
 
     def _ask(self, title: str, text: str, answer: str, action: Callable[[], object]) -> None:
-        """Show a text in a dialog, and execute an action if a person answers so."""
+        """Show a text in HTML in a dialog, and execute an action if a person answers so."""
         modal: Any = self._gui.add_modal(title)
 
         def confirm() -> None:
@@ -213,7 +225,7 @@ class Editor:
             action()
 
         with modal:
-            self._gui.add_markdown(text)
+            self._gui.add_html(text)
             self._add_button(answer, confirm)
             self._add_button("Cancel", modal.close)
 
@@ -224,7 +236,7 @@ class Editor:
             # what was typed is not lost: it stays until it can be set
             self._kind.value, self._name.value = self._item.kind, self._item.name
             return
-        items = self._session.document.list_items()
+        items = self._session.document.list_items() or [WHOLE_FILE]
         if item not in items:
             return
         self._item = item
@@ -247,22 +259,14 @@ class Editor:
     def _find_first(self, kind: ItemKind) -> GeometryItem:
         """Return the first item of a kind, without one the first of all."""
         items = self._session.document.list_items()
-        return next((each for each in items if each.kind is kind), items[0])
+        return next((each for each in items if each.kind is kind), next(iter(items), WHOLE_FILE))
 
     def _refresh(self) -> None:
         session = self._session
         self._next_look = 0.0
         self._show_status()
-        for button, name, change in (
-            (self._undo, "Undo", session.undo_name),
-            (self._redo, "Redo", session.redo_name),
-        ):
-            button.label = f"{name}: {change}"[:MAX_LABEL] if change else name
-            button.disabled = not change
-        self._save.disabled = not session.is_changed or session.has_errors
-        self._apply.disabled = session.is_changed
         self._show_problems()
-        if self._item not in session.document.list_items():
+        if self._item not in (session.document.list_items() or [WHOLE_FILE]):
             self._item = self._find_first(self._item.kind)
         self.select(self._item)
         if session.model is not None and session.model is not self._shown:
@@ -276,7 +280,7 @@ class Editor:
         state = "not saved" if session.is_changed else "saved"
         if errors:
             state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
-                "the last model" if session.model is not None else "the bodies, not joined"
+                "the last model" if session.model is not None else "the bodies that can be read, not joined"
             )
         if self._is_outdated:
             state += ". **The file changed meanwhile on disk:** read it again before you go on"
@@ -295,6 +299,7 @@ class Editor:
         if notes:
             text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
         self._problem_texts.content = text
+        self._problems.visible = bool(found)
         with self._problems:
             for number, problem in enumerate(shown, 1):
                 culprit = self._session.find_culprit(problem)
@@ -319,9 +324,12 @@ class Editor:
         self._report(problem and f"not done: {problem}")
         return problem
 
-    def _step(self, action: Callable[[], None]) -> None:
-        self._do(action)
+    def _step(self, action: Callable[[], None], change: str, done: str) -> None:
+        """Undo a change or make it again."""
+        problem = self._do(action)
         self._refresh()
+        if not problem:
+            self._report(f"{done}: {change}" if change else f"nothing to be {done}")
 
     def _change(self, name: str, change: Change, new: GeometryItem | None = None) -> str:
         """Make a change, after which `new` is selected; return why it cannot be made."""
@@ -337,6 +345,9 @@ class Editor:
 
     def _add(self, kind: ItemKind) -> None:
         name, item, frames = self._new.value.strip(), self._item, list_frames(self._session.document)
+        if kind is not ItemKind.BODY and not frames:
+            self._report("not done: there is no frame yet; add a body first")
+            return
         body = (frames[0] if item.kind is ItemKind.CONSTRAINT else item.name).partition(":")[0]
         new, change = name, lambda document: document.add_body(name)
         if kind is ItemKind.FRAME:
@@ -348,14 +359,19 @@ class Editor:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
             change = lambda document: document.add_constraint(name, from_, others[-1])  # noqa: E731
-        self._change(f"add {new}", change, GeometryItem(kind, new))
+        self._make(f"add {new}", change, GeometryItem(kind, new))
+
+    def _make(self, name: str, change: Change, new: GeometryItem) -> None:
+        """Make a change that adds an item; its name is used then."""
+        if not self._change(name, change, new):
+            self._new.value = ""
 
     def _duplicate(self) -> None:
         item = self._item
         plain = item.name.rpartition(":")[2]
         name = self._new.value.strip() or _find_free_name(self._session.document, item)
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
-        self._change(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
+        self._make(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
 
     def _delete(self) -> None:
         item = self._item
@@ -393,11 +409,14 @@ class Editor:
     def _ask_save(self) -> None:
         if not self._fields.commit():
             return
-        diff, shown = self._session.make_diff(), self._session.document
-        # longer than what the file may have
-        fence = "`" * (3 + diff.count("`"))
-        text = f"{fence}diff\n{diff}\n{fence}"
-        self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
+        session = self._session
+        if session.has_errors:
+            self._report("not saved: the geometry has errors; fix them first")
+        elif not session.is_changed:
+            self._report("nothing to be saved")
+        else:
+            shown, diff = session.document, format_diff(session.make_diff())
+            self._ask(f"Save {session.file.path.name}", diff, "Save", lambda: self._write_file(shown))
 
     def _ask_read(self) -> None:
         """Read the file again, after a question if changes would be lost."""
@@ -409,7 +428,8 @@ class Editor:
 
     def _read_file(self) -> None:
         self._fields.drop()
-        self._step(self._session.read)
+        self._do(self._session.read)
+        self._refresh()
 
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
@@ -420,6 +440,13 @@ class Editor:
         message = self._message.content
         self._refresh()
         self._message.content = message
+
+    def _ask_apply(self) -> None:
+        if self._fields.commit():
+            if self._session.is_changed:
+                self._report("not applied: save the changes first; the service reads the file")
+            else:
+                self._start_reload(dry_run=True)
 
     def _start_reload(self, dry_run: bool) -> None:
         """Ask the service what a reload would change, or reload."""
@@ -455,16 +482,32 @@ class Editor:
             self._report(f"the service has this geometry already, revision {reply.revision}")
         else:
             self._report("")
-            changes = "\n".join(f"- {escape_markdown(each)}" for each in reply.changes)
-            self._ask("Apply to the running service", changes, "Apply", lambda: self._start_reload(dry_run=False))
+            changes = "".join(f"<li>{html.escape(each)}</li>" for each in reply.changes)
+            self._ask(
+                "Apply to the running service",
+                f"<ul>{changes}</ul>",
+                "Apply",
+                lambda: self._start_reload(dry_run=False),
+            )
 
     def close(self) -> None:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
+def format_diff(diff: str) -> str:
+    """Return a unified diff in HTML: what is added in green, what is removed in red, long lines in several."""
+    rows = []
+    for number, line in enumerate(diff.splitlines()):
+        # the first two have the names of the files
+        style = _DIFF_STYLES.get(line[:1], "") if number > 1 else "opacity: 0.6"
+        rows.append(f'<div style="{style}">{html.escape(line) or " "}</div>')
+    return f'<div style="{_DIFF_STYLE}">{"".join(rows)}</div>'
+
+
 def _describe_problem(problem: Problem) -> str:
     fix = f"; {problem.fix}" if problem.fix else ""
-    place = f" ({problem.element})" if problem.element else ""
+    where = problem.element or (f"line {problem.line}" if problem.line else "")
+    place = f" ({where})" if where else ""
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
 
 
@@ -680,6 +723,8 @@ class ItemFields:
     def _list_fields(self, item: GeometryItem) -> list[ShownField]:
         document = self._session.document
         self._exact = {}
+        if item == WHOLE_FILE:
+            return [ShownField("note", (), "No body can be read: write the file under *As text*.")]
         shown = [ShownField("name", ("Name",), item.name.rpartition(":")[2])]
         template = document.find_template(item)
         if template:

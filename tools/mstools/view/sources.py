@@ -96,11 +96,11 @@ def open_geometry(path: Path, variables: Mapping[str, str], session: EditSession
 
     Raises GeometryError, ConfigError, OSError.
     """
-    file = EditedFile.open(path)
+    file = EditedFile.open(path) if session is None else session.file
     geometry, base_frame = file.path, file.config.base_frame if file.config is not None else ""
     model = load_given_model(geometry, variables) if session is None else session.drawn
     drive = Drive(keep_geometry=True)
-    answers = FilePlatform(model, next(frame.full_name for body in model.bodies for frame in body), f"in {path}")
+    answers = FilePlatform(model, next((frame.full_name for body in model.bodies for frame in body), ""), f"in {path}")
     source = Source(f"{model.name or path.name}", drive, answers, geometry.resolve().parent)
 
     def set_joints(positions: Mapping[str, float]) -> None:
