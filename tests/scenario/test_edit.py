@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from support_browser import TIMEOUT_MS, choose, find_fields, needs_browser, open_link, select_item
+from support_browser import TIMEOUT_MS, choose, find_fields, needs_browser, open_link, select_item, wait_until_sent
 from support_command import run_command
 from support_lcm import TIMEOUT_S, reserved_url
 from support_signing import ALLOWED, write_test_key
@@ -68,15 +68,15 @@ def edited_page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> I
     with (
         reserved_url() as url,
         run_command(["run", "-c", str(folder / "vehicle.yaml")], url),
-        edit(browser, folder, url) as page,
+        edit(browser, folder / "vehicle.yaml", url) as page,
     ):
         yield EditedPage(folder / "geometry.yaml", page, url)
 
 
 @contextmanager
-def edit(browser: Browser, folder: Path, url: str, *more: str) -> Iterator[Page]:
-    """Open the editor of a folder's vehicle file as a person does: by the command, and its link in a browser."""
-    words = ["view", str(folder / "vehicle.yaml"), "--edit", "--no-browser", "--port", "0", *more]
+def edit(browser: Browser, path: Path, url: str, *more: str) -> Iterator[Page]:
+    """Open the editor of a file as a person does: by the command, and its link in a browser."""
+    words = ["view", str(path), "--edit", "--no-browser", "--port", "0", *more]
     with ExitStack() as stack:
         process = stack.enter_context(run_command(words, url, stdout=subprocess.PIPE))
         assert process.stdout is not None
@@ -160,7 +160,7 @@ def test_given_the_mount_of_the_front_laser_then_an_edit_changes_answers_and_is_
         stack.enter_context(run_command(["run", "-c", str(folder / "vehicle.yaml")], lcm_url))
         platform = stack.enter_context(Platform(lcm_url, timeout=1.0, retries=30))
         before = platform.get_pose(*pair).transformation.pose
-        page = stack.enter_context(edit(browser, folder, lcm_url, "--key", key))
+        page = stack.enter_context(edit(browser, folder / "vehicle.yaml", lcm_url, "--key", key))
         select_item(page, "constraint", MOUNT)
         set_number(page, "x (m)", "0.0625")
         wait_for_text(page, "^geometry.yaml: not saved$")
@@ -199,7 +199,7 @@ def test_given_no_key_then_the_service_denies_and_the_answer_stays(edited_page: 
     pair = ("FrontSICKLaser:Scan", "Raptor:CG")
     with Platform(edited_page.url, timeout=1.0, retries=30) as platform:
         before = platform.get_pose(*pair).transformation.pose
-        press(edited_page.page, "Apply to the service ...")
+        press(edited_page.page, "Apply")
         wait_for_text(edited_page.page, "^not applied: .*not signed")
         assert platform.get_pose(*pair).transformation.pose == before
 
@@ -341,3 +341,43 @@ def test_given_a_file_that_changed_meanwhile_then_it_stays_as_it_is(edited_page:
     press(page, "Read again")
     confirm(page, "Drop them")
     wait_for_text(page, "^geometry.yaml: saved$")
+
+
+def test_given_a_path_without_a_file_then_a_geometry_begins_and_is_there_once_it_is_saved(
+    browser: Browser, tmp_path: Path, lcm_url: str
+) -> None:
+    path = tmp_path / "geometry.yaml"
+    with edit(browser, path, lcm_url) as page:
+        page.get_by_text("Add, copy, delete").click()
+        find_fields(page, "New name").fill("Mast")
+        press(page, "Add body")
+        wait_for_value(find_fields(page, "Name"), "Mast")
+        # the name was used; a copy gets a free one
+        wait_for_value(find_fields(page, "New name"), "")
+        press(page, "Duplicate")
+        wait_for_value(find_fields(page, "Name"), "Mast2")
+        assert not path.exists()
+        press(page, "Save")
+        added = page.get_by_text(re.compile(r"^\+  Base:$"))
+        assert added.evaluate("(line) => getComputedStyle(line).color") == "rgb(43, 138, 62)"
+        confirm(page, "Save")
+        wait_for_text(page, f"^saved {re.escape(str(path))}")
+    assert [body.name for body in load_model(path, repair=True).bodies] == ["Base"]
+    assert "  Mast2:\n" in path.read_text()
+
+
+def test_given_a_file_that_is_no_yaml_then_it_is_fixed_as_text(browser: Browser, tmp_path: Path, lcm_url: str) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text("modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}\n")
+    with edit(browser, path, lcm_url) as page:
+        wait_for_text(page, "the YAML is not well-formed.*line 4")
+        page.get_by_text("As text", exact=True).last.click()
+        page.locator("textarea").first.fill("modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}}\n")
+        wait_until_sent(page)
+        press(page, "Write text")
+        wait_for_text(page, "^geometry.yaml: not saved$")
+        wait_for_value(find_fields(page, "Name"), "A")
+        press(page, "Save")
+        confirm(page, "Save")
+        wait_for_text(page, "^geometry.yaml: saved$")
+    assert load_model(path).frame("A:Origin").pose.xyz == (0.0, 0.0, 0.0)

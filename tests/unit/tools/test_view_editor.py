@@ -57,7 +57,8 @@ class EditedPage:
 
     def leave(self, **texts: str) -> str:
         """Report texts of fields that were left, by their labels, as the page does; return the message."""
-        self.fields._set_left(json.dumps([0, str(self.fields._count), *texts.items()]))
+        shown = str(self.fields._count)
+        self.fields._set_left(json.dumps([0, *[(shown, *each) for each in texts.items()]]))
         return self.message
 
     @property
@@ -446,7 +447,7 @@ def test_given_a_field_that_was_left_when_another_item_is_selected_then_that_has
     page: EditedPage,
 ) -> None:
     page.editor.select(LENS)
-    message = json.dumps([0, str(page.fields._count), ("x (m)", "0.12")])
+    message = json.dumps([0, (str(page.fields._count), "x (m)", "0.12")])
     page.fields._set_left(message)
     page.editor.select(GeometryItem(ItemKind.FRAME, "Raptor:CG"))
     before = page.session.document.text

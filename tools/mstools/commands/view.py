@@ -63,9 +63,9 @@ def command(
     The page shows bodies, frames, constraints and joints in 3D, the vehicle in the world with trail, fixes and
     uncertainty, and answers where one frame is in another. A log has a slider, playback, and jumps to events. With
     --config the localization runs on a log that has no poses, such as an imported one. With
-    --edit it changes a geometry file (YAML), or that of a vehicle file, or begins a new one, checks each change, and
-    applies what is saved to the running service, signed with --key. It needs the extra view; without it, the error
-    names the command that adds it. Nothing is loaded from the internet.
+    --edit it changes a geometry file (YAML), or that of a vehicle file, checks each change, and applies what is saved
+    to the running service, signed with --key. It needs the extra view; without it, the error names the
+    command that adds it. Nothing is loaded from the internet.
 
     \b
     Examples:

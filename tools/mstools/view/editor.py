@@ -88,24 +88,24 @@ const find = (input) => input.closest('.mantine-Flex-root')?.querySelector('labe
 const carrier = [...folder.querySelectorAll('input')].find((each) => find(each) === '{CARRIER}');
 carrier.closest('.mantine-Flex-root').parentElement.style.display = 'none';
 const write = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
-const typed = new Set(), left = new Map();
-let timer, shown;
+const typed = new Map(), left = new Map();
+let timer;
 const send = () => {{
-  write.call(carrier, JSON.stringify([Date.now(), shown, ...left]));
+  write.call(carrier, JSON.stringify([Date.now(), ...left.values()]));
   carrier.dispatchEvent(new Event('input', {{bubbles: true}}));
 }};
 const leave = (input) => {{
-  if (!typed.delete(input)) return;
-  shown = folder.querySelector('[data-shown]').dataset.shown;
-  left.set(find(input), input.value);
+  if (!typed.has(input)) return;
+  left.set(input, [...typed.get(input), input.value]);
+  typed.delete(input);
   send();
   clearTimeout(timer);
   timer = setTimeout(() => {{ send(); left.clear(); }}, {RESEND_MS});
 }};
 folder.addEventListener('input', (event) => {{
   if (!event.isTrusted) return;
-  typed.add(event.target);
-  left.delete(find(event.target));
+  typed.set(event.target, [folder.querySelector('[data-shown]').dataset.shown, find(event.target)]);
+  left.delete(event.target);
 }}, true);
 folder.addEventListener('focusout', (event) => leave(event.target));
 folder.addEventListener('keydown', (event) => {{ if (event.key === 'Enter') leave(event.target); }});"""
@@ -822,23 +822,20 @@ class ItemFields:
     # --- what is set
 
     def _choose(self, field: Any, shown: ShownField, value: Any) -> None:
-        if self._fields.get(shown.key) is field:
+        if field in self._fields.values():
             field.value = value
             self.set(shown.labels)
 
     def _list_texts(self) -> list[TypedText]:
-        texts = []
+        texts: list[TypedText] = []
         for field in self._fields.values():
             texts += field.fields if isinstance(field, NumberFields) else [field] * isinstance(field, TypedText)
         return texts
 
     def _set_left(self, message: str) -> None:
         """Set the fields that were left, with the texts that they had on the page."""
-        _, shown, *left = json.loads(message)
-        if shown != str(self._count):
-            # sent again, after another item was selected
-            return
-        texts = dict(left)
+        # of another item, if they are sent again after it was selected
+        texts = {label: text for shown, label, text in json.loads(message)[1:] if shown == str(self._count)}
         for field in self._list_texts():
             if field.label in texts:
                 field.value = texts[field.label]
