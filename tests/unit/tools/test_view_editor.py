@@ -16,10 +16,11 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
-from modelserver.errors import Problem, Severity
+from modelserver.errors import ModelServerError, Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
+from mstools.commands.view import open_editing
 from mstools.edit import EditedFile, EditSession, GeometryItem, ItemKind
 from mstools.view.editor import SNAPS, Editing, Editor, format_diff
 from mstools.view.page import Actions, open_page
@@ -154,6 +155,18 @@ def test_given_a_file_that_is_no_yaml_then_it_is_fixed_as_text(tmp_path: Path) -
     viewer._query.close()
     editor.close()
     opened.close()
+
+
+def test_given_a_path_without_a_file_then_only_yaml_begins_a_new_one(tmp_path: Path) -> None:
+    session = open_editing(tmp_path / "new.yaml", None, "", "", "").session
+    assert session.file.is_new
+    assert session.model is not None
+    assert list(tmp_path.iterdir()) == []
+    for name in ("robot.urdf", "drive.lcm", "new"):
+        with pytest.raises(FileNotFoundError):
+            open_editing(tmp_path / name, None, "", "", "")
+    with pytest.raises(ModelServerError, match="create it first"):
+        open_editing(tmp_path / "absent" / "new.yaml", None, "", "", "")
 
 
 @pytest.mark.slow
@@ -476,6 +489,12 @@ def test_given_a_wrong_value_then_it_stays_to_be_seen_and_can_be_fixed(page: Edi
     page.leave(**{"x (m)": "0.05"})
     assert not page.session.has_errors
     assert page.session.document.text == before
+    page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "SpeedLanFixed"))
+    page.set(to="Raptor:CG")
+    assert page.session.has_errors
+    assert page.fields._fields["to"].value == "Raptor:CG"
+    page.undo()
+    assert page.fields._fields["to"].value == "SpeedLan:BracketHole"
 
 
 def test_given_a_typed_number_when_another_item_is_selected_then_it_is_set(page: EditedPage) -> None:

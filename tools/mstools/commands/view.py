@@ -129,12 +129,12 @@ def check_installed() -> None:
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
     """Begin to edit a geometry file, or that of a vehicle file. Raises typer.BadParameter, EditError, OSError.
 
-    A file that is not there is a new geometry file. Bus and prefix are those given, else those of the vehicle file.
+    A YAML file that is not there is a new geometry file. Bus and prefix are those given, else those of the vehicle file.
     """
     from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing
 
-    is_new = not os.path.lexists(file)
+    is_new = file.suffix.lower() in (".yaml", ".yml") and not os.path.lexists(file)
     if not is_new and detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
         raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
     edited = EditedFile(file, is_new=True) if is_new else EditedFile.open(file)

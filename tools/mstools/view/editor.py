@@ -702,9 +702,11 @@ class ItemFields:
         is_same = item == self._item and _list_layout(shown) == _list_layout(self._shown)
         self._item, self._shown = item, shown
         if is_same:
-            with self._server.atomic():
-                for each in shown:
-                    self._update(each)
+            if not self._is_wrong:
+                with self._server.atomic():
+                    for each in shown:
+                        self._update(each)
+            # else what was set stays to be seen: the scene has the last model without an error
             return
         self._fields = {}
         old = self._folder
@@ -804,11 +806,7 @@ class ItemFields:
         field = self._fields.get(shown.key)
         if field is None or shown.key == "template":
             return
-        if isinstance(field, NumberFields):
-            # else what was set stays to be seen: the scene has the last model without an error, and not these numbers
-            if not self._is_wrong:
-                field.show(shown.value)
-        elif isinstance(field, TypedText):
+        if isinstance(field, NumberFields | TypedText):
             field.show(shown.value)
         else:
             if shown.options and field.options != shown.options:
