@@ -129,7 +129,7 @@ def check_installed() -> None:
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
     """Begin to edit a geometry file, or that of a vehicle file. Raises typer.BadParameter, EditError, OSError.
 
-    A YAML file that is not there is a new geometry file. Bus and prefix are those given, else those of the vehicle file.
+    A YAML file that is not there is a new geometry file. Bus and prefix are those given, else of the vehicle file.
     """
     from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing

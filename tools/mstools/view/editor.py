@@ -109,8 +109,8 @@ folder.addEventListener('input', (event) => {{
 }}, true);
 folder.addEventListener('focusout', (event) => leave(event.target));
 folder.addEventListener('keydown', (event) => {{ if (event.key === 'Enter') leave(event.target); }});"""
-"""Executed in the page, in the folder of the fields. React takes a value that a script writes for typed if an event
-follows that the script did not write through React's own property."""
+"""Executed in the page, in the folder of the fields. Each text is reported with the number and label of its fields.
+React regards a value as typed that was written by the setter of all inputs, past its own one, before an event."""
 
 _DIFF_STYLE: Final = "font-family: monospace; font-size: 0.8em; white-space: pre-wrap; overflow-wrap: anywhere"
 _DIFF_STYLES: Final = {
