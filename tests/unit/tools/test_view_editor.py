@@ -59,7 +59,7 @@ class EditedPage:
     def leave(self, **texts: str) -> str:
         """Report texts of fields that were left, by their labels, as the page does; return the message."""
         shown = str(self.fields._count)
-        self.fields._set_left(json.dumps([0, *[(shown, *each) for each in texts.items()]]))
+        self.fields._set_left(json.dumps([0, *[(shown, *each) for each in texts.items()]]), 0)
         return self.message
 
     @property
@@ -461,10 +461,10 @@ def test_given_a_field_that_was_left_when_another_item_is_selected_then_that_has
 ) -> None:
     page.editor.select(LENS)
     message = json.dumps([0, (str(page.fields._count), "x (m)", "0.12")])
-    page.fields._set_left(message)
+    page.fields._set_left(message, 0)
     page.editor.select(GeometryItem(ItemKind.FRAME, "Raptor:CG"))
     before = page.session.document.text
-    page.fields._set_left(message)
+    page.fields._set_left(message, 0)
     assert page.session.document.text == before
 
 

@@ -19,6 +19,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -563,6 +564,16 @@ class TypedText:
     def is_pending(self) -> bool:
         return self.value != self._shown
 
+    def report(self, text: str, client: int) -> None:
+        """Take a text that the page of a client has, and send it to the pages of others.
+
+        A value that is assigned is sent to this client too, and replaces what is typed there meanwhile; viser offers
+        the way without that to its own messages only.
+        """
+        state = self._field._impl
+        state.value = text
+        state.sync_cb(client, {"value": text})
+
     def show(self, text: str) -> None:
         """Show what is set, unless something is pending."""
         if not self.is_pending:
@@ -687,7 +698,13 @@ class ItemFields:
             self._carrier: Any = gui.add_text(CARRIER, "")
             script = html.escape(COMMIT_SCRIPT)
             gui.add_html(f'<img alt="" style="display: none" src="{_PIXEL}" onload="{script}">')
-        actions.on_choice(self._carrier, self._set_left)
+
+        def read(event: Any) -> None:
+            # values that this program sets have no client
+            if event.client_id is not None:
+                actions.put(partial(self._set_left, event.target.value, event.client_id))
+
+        self._carrier.on_update(read)
 
     # --- what is shown
 
@@ -830,13 +847,13 @@ class ItemFields:
             texts += field.fields if isinstance(field, NumberFields) else [field] * isinstance(field, TypedText)
         return texts
 
-    def _set_left(self, message: str) -> None:
-        """Set the fields that were left, with the texts that they had on the page."""
+    def _set_left(self, message: str, client: int) -> None:
+        """Set the fields that were left, with the texts that they had on the page of a client."""
         # of another item, if they are sent again after it was selected
         texts = {label: text for shown, label, text in json.loads(message)[1:] if shown == str(self._count)}
         for field in self._list_texts():
             if field.label in texts:
-                field.value = texts[field.label]
+                field.report(texts[field.label], client)
                 if field.is_pending or self._is_wrong:
                     self.set([field.label])
 
