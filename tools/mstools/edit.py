@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
+import shlex
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain
@@ -28,7 +31,7 @@ import yaml
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.errors import ModelServerError, Problem, SyntaxProblemError, has_error, quote
 from modelserver.files import EXAMINED_BYTES, FileKind, detect_file_kind, read_start
-from modelserver.formats import parse_content, read_content
+from modelserver.formats import bot_frames, parse_content, read_content
 from modelserver.formats.common import format_number, parse_number
 from modelserver.formats.yaml_elements import POSE_KEYS, YamlMapping, read_pose
 from modelserver.formats.yaml_geometry import format_joint_fields, format_scalar_or_list, format_text, quote_text
@@ -369,6 +372,10 @@ class GeometryItem(NamedTuple):
     name: str
 
 
+WHOLE_FILE: Final = GeometryItem(ItemKind.BODY, "")
+"""What is edited of a file without bodies: all of its text."""
+
+
 class GeometryDocument(YamlText):
     """Immutable text of a geometry file in YAML. Changes return another document, or raise EditError.
 
@@ -412,7 +419,7 @@ class GeometryDocument(YamlText):
 
     def get_yaml(self, item: GeometryItem) -> str:
         """Return the entry of an item as it is written, without indentation."""
-        return self.get_entry(self._find_path(item))
+        return self.text if item == WHOLE_FILE else self.get_entry(self._find_path(item))
 
     def _get_template(self, body: str) -> str:
         return self.get_text(("bodies", body, "template"))
@@ -571,8 +578,10 @@ class GeometryDocument(YamlText):
                 text = text.remove(("constraints", constraint))
         return text
 
-    def set_yaml(self, item: GeometryItem, entry: str) -> Self:
+    def set_yaml(self, item: GeometryItem, entry: str) -> GeometryDocument:
         """Write the entry of an item, `name: value`, as given. Its name stays."""
+        if item == WHOLE_FILE:
+            return open_document(entry)
         path = self._find_path(item)
         keys = YamlText(entry).keys()
         if keys != [path[-1]]:
@@ -642,6 +651,27 @@ class GeometryDocument(YamlText):
         return self._set_key(path, key, f"[{', '.join(shown)}]")
 
 
+class UnreadableDocument(GeometryDocument):
+    """Text that is not a YAML mapping. It has no items, and is written as a whole: `set_yaml` of `WHOLE_FILE`."""
+
+    def __init__(self, text: str):
+        super().__init__("")
+        self.text = text
+
+    def add(self, path: KeyPath, entry: str, after: str = "", *, in_block: bool = False) -> Self:
+        """Raise EditError: nothing can be added."""
+        raise EditError("the file has no readable mapping to which this could be added; write it as text first")
+
+
+def open_document(text: str) -> GeometryDocument:
+    """Return the document of a text, an `UnreadableDocument` where it is not a YAML mapping."""
+    with suppress(EditError):
+        document = GeometryDocument(text)
+        if document.keys():
+            return document
+    return UnreadableDocument(text)
+
+
 def _read_pose(text: YamlText, path: KeyPath) -> Pose:
     """Return the pose that an entry states, the identity where it states none or a wrong one."""
     try:
@@ -698,13 +728,28 @@ class Step(NamedTuple):
     change: str
 
 
+NEW_GEOMETRY: Final = """\
+modelserver: geometry/1
+name: {name}
+
+bodies:
+  Base:
+    frames:
+      Origin: {{}}
+"""
+
+
 @dataclass(frozen=True)
 class EditedFile:
-    """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it."""
+    """The geometry file that is edited; `config` of the vehicle file `vehicle` if that names it.
+
+    One that `is_new` need not be there yet: its text is empty until it is saved.
+    """
 
     path: Path
     vehicle: Path | None = None
     config: VehicleConfig | None = None
+    is_new: bool = False
 
     @classmethod
     def open(cls, path: Path) -> EditedFile:
@@ -715,10 +760,18 @@ class EditedFile:
         return cls(Path(config.geometry), path, config)
 
     def read(self) -> str:
-        """Return the text of the file. Raises OSError, GeometryError, EditError for one that is not YAML."""
+        """Return the text of the file. Raises OSError, GeometryError, EditError for one of another format."""
+        if self.is_new and not os.path.lexists(self.path):
+            return ""
         content = read_content(self.path)
-        if content.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
-            raise EditError(f"{self.path} is XML; only YAML is edited: modelserver convert {self.path} geometry.yaml")
+        start = content.removeprefix(b"\xef\xbb\xbf").lstrip()
+        if start.startswith(b"<") or bot_frames.is_bot_param(start):
+            known = "XML" if start.startswith(b"<") else "a libbot2 configuration"
+            given = shlex.quote(str(self.path))
+            raise EditError(
+                f"{self.path} is {known}; only YAML is edited: modelserver convert {given} geometry.yaml, "
+                "then modelserver view geometry.yaml --edit"
+            )
         try:
             return content.decode()
         except UnicodeDecodeError:
@@ -747,18 +800,16 @@ class EditSession:
     def read(self) -> None:
         """Read the file again; all changes are dropped. Raises as `EditSession`, with all as before."""
         saved = self.file.read()
-        document = GeometryDocument(saved.removeprefix(_BOM))
-        if not document.list_items():
-            path = self.file.path
-            raise EditError(f"{path} has no bodies in YAML: modelserver convert {path} geometry.yaml")
+        text = saved.removeprefix(_BOM)
+        if self.file.is_new and not text:
+            text = NEW_GEOMETRY.format(name=format_text(self.file.path.stem))
+        document = open_document(text)
         _, drawn, _ = self.file.check(document.text, self._variables)
-        if drawn is None:
-            raise EditError(f"{self.file.path} has no body that can be drawn: modelserver check {self.file.path}")
         self._saved = saved
         self._steps = [Step(document, "")]
         self._undone: list[Step] = []
-        self.drawn: Model = drawn
-        """The last model without an error; before there is one, the bodies of the file alone."""
+        self.drawn: Model = drawn or Model((), ())
+        """The last model without an error; before there is one, the bodies of the file alone, if it has any."""
         self.model: Model | None = None
         """The last model without an error."""
         self._loaded: GeometryDocument | None = None
@@ -849,6 +900,6 @@ class EditSession:
         if current != self._saved:
             raise EditError(f"{self.file.path} changed meanwhile on disk; nothing is saved. Read it again first")
         text = (_BOM if self._saved.startswith(_BOM) else "") + self.document.text
-        with open_atomic(str(self.file.path), replace=True) as stream:
+        with open_atomic(str(self.file.path), replace=not self.file.is_new or self._saved != "") as stream:
             stream.write(text)
         self._saved = text

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 
 import pytest
+from support_urdf import BOT_FRAMES, URDF
 
 from modelserver.errors import GeometryError
 from modelserver.formats import load_model
-from mstools.edit import EditedFile, EditError, EditSession, GeometryItem, ItemKind
+from mstools.cli import main
+from mstools.edit import WHOLE_FILE, EditedFile, EditError, EditSession, GeometryItem, ItemKind
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
@@ -140,17 +143,108 @@ def test_given_a_folder_without_permission_then_the_error_names_the_file_and_the
     assert session.is_changed
 
 
-def test_given_a_file_that_was_broken_meanwhile_then_it_is_neither_read_nor_overwritten(folder: Path) -> None:
+def test_given_a_file_that_was_broken_meanwhile_then_it_is_not_overwritten_and_can_be_read(folder: Path) -> None:
     path = folder / "geometry.yaml"
     session = open_session(path)
     move(session, 0.07)
     path.write_text("bodies: {")
-    with pytest.raises(EditError, match="not well-formed"):
-        session.read()
-    assert session.is_changed
     with pytest.raises(EditError, match="changed meanwhile"):
         session.save()
     assert path.read_text() == "bodies: {"
+    session.read()
+    assert (session.document.text, session.is_changed, session.has_errors) == ("bodies: {", False, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}\n", "not well-formed"),
+        ("bodies:\n\tA: {frames: {Origin: {}}}\n", "indented with a tab"),
+        ("", "the file is empty"),
+        ("# to do\n", "nothing in the file but comments"),
+        ("some words", "top level is a single value"),
+        ("modelserver: geometry/1\n", "there are no bodies"),
+    ],
+)
+def test_given_a_file_without_readable_bodies_then_it_is_opened_as_text_and_can_be_fixed(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text(text)
+    session = open_session(path)
+    assert session.document.list_items() == []
+    assert session.document.get_yaml(WHOLE_FILE) == text
+    assert message in session.problems[0].message
+    assert session.drawn.bodies == ()
+    with pytest.raises(EditError, match="has errors"):
+        session.save()
+    fixed = "modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}}\n"
+    session.change("write", lambda document: document.set_yaml(WHOLE_FILE, "bodies: ["))
+    assert session.has_errors
+    session.change("write", lambda document: document.set_yaml(WHOLE_FILE, fixed))
+    assert session.document.list_items()[1] == GeometryItem(ItemKind.FRAME, "A:Origin")
+    session.save()
+    assert load_model(path).frame("A:Origin").pose.xyz == (0.0, 0.0, 0.0)
+
+
+def test_given_text_that_cannot_be_read_when_a_body_is_added_then_it_is_written_first(tmp_path: Path) -> None:
+    (tmp_path / "broken.yaml").write_text("bodies: {")
+    session = open_session(tmp_path / "broken.yaml")
+    with pytest.raises(EditError, match="write it as text first"):
+        session.change("add", lambda document: document.add_body("A"))
+    (tmp_path / "short.yaml").write_text("modelserver: geometry/1\n")
+    session = open_session(tmp_path / "short.yaml")
+    session.change("add", lambda document: document.add_body("A"))
+    assert session.model is not None
+    assert session.model.frame("A:Origin").pose.xyz == (0.0, 0.0, 0.0)
+
+
+def test_given_a_new_file_then_it_has_one_body_and_is_there_once_it_is_saved(tmp_path: Path) -> None:
+    path = tmp_path / "my rover.yaml"
+    session = EditSession(EditedFile(path, is_new=True))
+    assert session.model is not None
+    assert [body.name for body in session.model.bodies] == ["Base"]
+    assert session.model.name == "my rover"
+    assert session.is_changed
+    assert not session.has_changed_on_disk()
+    assert not path.exists()
+    assert session.make_diff().startswith(
+        "--- my rover.yaml\n+++ my rover.yaml (edited)\n@@ -0,0 +1,7 @@\n+modelserver"
+    )
+    session.save()
+    assert load_model(path).revision == session.model.revision
+    assert not session.is_changed
+    path.unlink()
+    assert session.has_changed_on_disk()
+    with pytest.raises(EditError, match="changed meanwhile"):
+        session.save()
+
+
+def test_given_a_new_file_that_another_program_wrote_meanwhile_then_it_stays(tmp_path: Path) -> None:
+    path = tmp_path / "rover.yaml"
+    session = EditSession(EditedFile(path, is_new=True))
+    path.write_text("bodies: {}")
+    with pytest.raises(EditError, match="changed meanwhile"):
+        session.save()
+    assert path.read_text() == "bodies: {}"
+
+
+@pytest.mark.parametrize("name", ["robot.urdf", "my frames.cfg"])
+def test_given_another_format_then_the_command_of_the_error_makes_a_file_that_is_edited(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_text(URDF if name.endswith("urdf") else BOT_FRAMES)
+    with pytest.raises(EditError) as caught:
+        open_session(Path(name))
+    first, _, second = str(caught.value).partition("only YAML is edited: ")[2].partition(", then ")
+    program, *words = shlex.split(first)
+    assert program == "modelserver"
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert not ended.value.code
+    assert second == "modelserver view geometry.yaml --edit"
+    assert not open_session(Path("geometry.yaml")).has_errors
 
 
 @pytest.mark.parametrize("begin", ["", "\ufeff"])
@@ -167,10 +261,8 @@ def test_given_a_byte_order_mark_then_it_stays(folder: Path, begin: str) -> None
     ("name", "content", "words"),
     [
         ("geometry.xml", None, "only YAML is edited: modelserver convert"),
-        ("empty.yaml", b"", "no bodies"),
         ("binary.yaml", b"bodies: \xff", "not UTF-8"),
-        ("broken.yaml", b"bodies: {A: {", "not well-formed"),
-        ("frames.cfg", b'coordinate_frames { root_frame = "local"; }', "frames.cfg|line"),
+        ("frames.cfg", b'coordinate_frames { root_frame = "local"; }', "libbot2"),
     ],
 )
 def test_given_a_file_that_is_not_edited_then_the_error_has_why(

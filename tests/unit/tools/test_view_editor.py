@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import html
+import json
 import math
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +16,17 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
-from modelserver.errors import Problem, Severity
+from modelserver.errors import ModelServerError, Problem, Severity
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.transforms.pose import Pose
+from mstools.commands.view import open_editing
 from mstools.edit import EditedFile, EditSession, GeometryItem, ItemKind
-from mstools.view.editor import SNAPS, Editing, Editor
+from mstools.view.editor import SNAPS, Editing, Editor, format_diff
 from mstools.view.page import Actions, open_page
 from mstools.view.scene import VehicleScene
+from mstools.view.sources import open_geometry
+from mstools.view.viewer import Viewer
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 LENS = GeometryItem(ItemKind.FRAME, "FLEA:Lens")
@@ -28,7 +34,7 @@ NOD = GeometryItem(ItemKind.CONSTRAINT, "FrontNoddingSICKAxis")
 
 
 class EditedPage:
-    """An editor on a page that nobody looks at. Its fields are set, and its buttons pressed, by their labels."""
+    """An editor on a page that nobody looks at."""
 
     def __init__(self, path: Path, server: Any):
         self.session = EditSession(EditedFile.open(path))
@@ -41,10 +47,19 @@ class EditedPage:
         self.fields = self.editor._fields
 
     def set(self, **values: Any) -> str:
-        """Set fields, press Set, and return the message."""
+        """Type and choose in fields, set what was changed, and return the message."""
         for key, value in values.items():
             self.fields._fields[key].value = value
         self.fields.set()
+        return self.message
+
+    def undo(self) -> None:
+        self.editor._step(self.session.undo, self.session.undo_name, "undone")
+
+    def leave(self, **texts: str) -> str:
+        """Report texts of fields that were left, by their labels, as the page does; return the message."""
+        shown = str(self.fields._count)
+        self.fields._set_left(json.dumps([0, *[(shown, *each) for each in texts.items()]]), 0)
         return self.message
 
     @property
@@ -112,6 +127,48 @@ def test_given_a_file_with_an_error_then_it_opens_with_its_problems_and_can_be_f
     assert (session.file.path).read_text() == (RAPTOR / "geometry.yaml").read_text()
 
 
+def test_given_a_file_that_is_no_yaml_then_it_is_fixed_as_text(tmp_path: Path) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text("modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}\n")
+    opened = open_page(port=0)
+    session = EditSession(EditedFile.open(path))
+    viewer = Viewer(opened, open_geometry(path, {}, session), Editing(session))
+    viewer.draw(0.0, 0.0)
+    editor = viewer._editor
+    assert editor is not None
+    assert "not well-formed" in editor._problem_texts.content
+    assert "(line 4)" in editor._problem_texts.content
+    assert editor._text.value == session.document.text
+    editor._new.value = "B"
+    for kind in ItemKind:
+        editor._add(kind)
+        assert "not done" in editor._message.content
+    editor._text.value += "  B: {frames: {Origin: {}}}}\n"
+    editor._write_text()
+    assert session.has_errors
+    editor._text.value = "modelserver: geometry/1\nbodies:\n  A: {frames: {Origin: {}}}\n"
+    editor._write_text()
+    viewer.draw(0.1, 0.1)
+    assert not session.has_errors
+    assert (editor._item.name, editor._text.value) == ("A", "A: {frames: {Origin: {}}}")
+    session.save()
+    viewer._query.close()
+    editor.close()
+    opened.close()
+
+
+def test_given_a_path_without_a_file_then_only_yaml_begins_a_new_one(tmp_path: Path) -> None:
+    session = open_editing(tmp_path / "new.yaml", None, "", "", "").session
+    assert session.file.is_new
+    assert session.model is not None
+    assert list(tmp_path.iterdir()) == []
+    for name in ("robot.urdf", "drive.lcm", "new"):
+        with pytest.raises(FileNotFoundError):
+            open_editing(tmp_path / name, None, "", "", "")
+    with pytest.raises(ModelServerError, match="create it first"):
+        open_editing(tmp_path / "absent" / "new.yaml", None, "", "", "")
+
+
 @pytest.mark.slow
 def test_given_all_items_then_their_fields_without_a_change_change_nothing(page: EditedPage) -> None:
     before = page.session.document.text
@@ -130,7 +187,7 @@ def test_given_numbers_then_the_frame_moves_and_undo_brings_it_back(page: Edited
     assert frame.sigma is not None
     assert frame.sigma.position == (0.002, 0.002, 0.002)
     assert page.shown == [page.model]
-    page.editor._step(page.session.undo)
+    page.undo()
     assert not page.session.is_changed
     assert page.fields._fields["xyz"].value == (0.05, 0.0, 0.06)
 
@@ -150,7 +207,8 @@ def test_given_a_wrong_number_then_it_is_listed_and_a_right_one_fixes_it(page: E
     assert page.session.has_errors
     assert "not negative" in page.editor._problem_texts.content
     assert "cannot be saved" in page.editor._status.content
-    assert page.editor._save.disabled
+    page.editor._ask_save()
+    assert page.message == "not saved: the geometry has errors; fix them first"
     assert page.editor._buttons[0].label == "1: FLEA:Lens"
     page.editor.select(NOD)
     page.editor.select(LENS)
@@ -213,7 +271,7 @@ def test_given_another_type_then_the_joint_changes_to_it(page: EditedPage) -> No
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"limits": "5"}, "two numbers, lower and upper"),
+        ({"limits": "5"}, "two numbers with a decimal point, lower and upper"),
         ({"limits": "20, -20"}, "lower one first, got '20, -20'"),
         ({"limits": "a, b"}, "'a' is not a number"),
         ({"default": "70"}, "out of"),
@@ -244,7 +302,7 @@ def test_given_the_frame_of_a_template_then_one_or_all_bodies_change(page: Edite
     page.editor.select(item)
     page.set(xyz=(0.25, 0.0, 0.18), template=True)
     assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
-    page.set(xyz=(0.26, 0.0, 0.18))
+    page.set(xyz=(0.26, 0.0, 0.18), template=False)
     assert page.model.frame("BackNoddingSICK:NoddingAxis").pose.xyz[0] == 0.25
     assert page.model.frame(item.name).pose.xyz[0] == 0.26
 
@@ -263,8 +321,8 @@ def test_given_a_drag_then_the_fields_follow_and_its_end_is_one_change(page: Edi
     turned = Pose.from_rpy((0.012, 0.0, 0.0), 0.0, 0.0, math.radians(44.0))
     page.fields.set_dragged(turned, SNAPS["1 cm, 5 deg"], is_end=True)
     assert np.degrees(page.constraint("FrontNoddingSICKFixed").pose.rpy) == pytest.approx([0.0, 0.0, 45.0])
-    page.editor._step(page.session.undo)
-    page.editor._step(page.session.undo)
+    page.undo()
+    page.undo()
     assert not page.session.is_changed
 
 
@@ -282,7 +340,8 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     page.set(to="Beacon:Origin")
     assert page.model.get_transformation("Beacon:Lamp", "Raptor:CabRearRailCenter").pose == Pose.identity()
     editor.select(GeometryItem(ItemKind.FRAME, "Beacon:Lamp"))
-    editor._new.value = ""
+    # the name was used
+    assert editor._new.value == ""
     editor._duplicate()
     assert editor._item == GeometryItem(ItemKind.FRAME, "Beacon:Lamp2")
     editor.select(GeometryItem(ItemKind.BODY, "Beacon"))
@@ -291,6 +350,21 @@ def test_given_names_then_items_are_added_copied_and_deleted(page: EditedPage) -
     editor._new.value = "World"
     editor._add(ItemKind.BODY)
     assert "reserved" in page.message
+    assert editor._new.value == "World"
+
+
+def test_given_a_diff_then_its_lines_are_colored_and_escaped() -> None:
+    shown = format_diff("--- a\n+++ b\n@@ -1 +1 @@\n same\n-<old>\n+new\n ")
+    lines = re.findall('<div style="([^"]*)">([^<]+)</div>', shown)
+    assert [text for _, text in lines] == ["--- a", "+++ b", "@@ -1 +1 @@", " same", "-&lt;old&gt;", "+new", " "]
+    red, green = "#e03131", "#2b8a3e"
+    assert [(red in style, green in style) for style, _ in lines] == [
+        *[(False, False)] * 4,
+        (True, False),
+        (False, True),
+        (False, False),
+    ]
+    assert "pre-wrap" in shown
 
 
 @pytest.mark.slow
@@ -327,17 +401,100 @@ def test_given_a_number_in_any_notation_then_it_is_what_was_typed(page: EditedPa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("typed", ["1/3", "abc", "", "1 2", "0,1,2", "1.000,5", "--1", "nan", "inf"])
-def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(page: EditedPage, typed: str) -> None:
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("1/3", "'1/3' is not a number; accepted are"),
+        ("abc", "'abc' is not a number; accepted are"),
+        ("", "'' is not a number; accepted are"),
+        ("1 2", "'1 2' is not a number; accepted are"),
+        ("0,1,2", "'0,1,2' is not a number; accepted are"),
+        ("1.000,5", "'1.000,5' is not a number; accepted are"),
+        ("1,000", "'1,000' has two meanings; write 1.000, or no comma"),
+        ("-12,345", "'-12,345' has two meanings; write -12.345, or no comma"),
+        ("--1", "'--1' is not a number; accepted are"),
+        ("nan", "'nan' is not a finite number"),
+        ("inf", "'inf' is not a finite number"),
+    ],
+)
+def test_given_what_is_no_number_then_it_is_marked_and_stays_and_nothing_changes(
+    page: EditedPage, typed: str, words: str
+) -> None:
     page.editor.select(LENS)
     before, field = page.session.document.text, page.fields._fields["xyz"]
     field.texts = (typed, "0", "0.06")
-    assert "color" in field._problem.content
-    assert "x (m)" in page.set()
+    assert f"x (m): {words}" in page.set()
+    assert f"x (m): {words}" in html.unescape(field.fields[0]._problem.content)
     assert page.session.document.text == before
     assert field.texts[0] == typed
     field.texts = ("0.1", "0", "0.06")
-    assert field._problem.content == ""
+    assert page.set() == ""
+    assert field.fields[0]._problem.content == ""
+
+
+def test_given_a_field_that_is_left_then_it_alone_is_set_and_the_others_stay_as_they_are_typed(
+    page: EditedPage,
+) -> None:
+    page.editor.select(LENS)
+    folder, field = page.fields._folder, page.fields._fields["xyz"]
+    # the page sent the first of two digits; the next field is being typed in
+    field.texts = ("0.1", "-", "0.06")
+    assert page.leave(**{"x (m)": "0.12"}) == ""
+    assert page.model.frame(LENS.name).pose.xyz == (0.12, 0.0, 0.06)
+    assert field.texts == ("0.12", "-", "0.06")
+    assert page.fields._folder is folder
+    assert page.session.undo_name == f"edit {LENS.name}"
+    # sent again
+    steps = len(page.session._steps)
+    page.leave(**{"x (m)": "0.12"})
+    assert len(page.session._steps) == steps
+    assert page.leave(**{"y (m)": "-1e-1"}) == ""
+    assert page.model.frame(LENS.name).pose.xyz == (0.12, -0.1, 0.06)
+    # as it was typed
+    assert field.texts[1] == "-1e-1"
+    page.undo()
+    assert field.texts == ("0.12", "0", "0.06")
+
+
+def test_given_a_field_that_was_left_when_another_item_is_selected_then_that_has_its_own_value(
+    page: EditedPage,
+) -> None:
+    page.editor.select(LENS)
+    message = json.dumps([0, (str(page.fields._count), "x (m)", "0.12")])
+    page.fields._set_left(message, 0)
+    page.editor.select(GeometryItem(ItemKind.FRAME, "Raptor:CG"))
+    before = page.session.document.text
+    page.fields._set_left(message, 0)
+    assert page.session.document.text == before
+
+
+def test_given_a_name_that_is_left_then_the_other_fields_stay_on_the_page(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    folder = page.fields._folder
+    page.fields._fields["xyz"].texts = ("0.", "0", "0.06")
+    assert page.leave(Name="Lens2") == ""
+    assert page.editor._item == GeometryItem(ItemKind.FRAME, "FLEA:Lens2")
+    assert page.fields._folder is folder
+    assert page.fields._fields["xyz"].texts[0] == "0."
+    assert "already" in page.leave(Name="BracketFixing")
+    assert page.fields._item == page.editor._item
+
+
+def test_given_a_wrong_value_then_it_stays_to_be_seen_and_can_be_fixed(page: EditedPage) -> None:
+    page.editor.select(LENS)
+    before = page.session.document.text
+    page.leave(**{"x (m)": "2e9"})
+    assert page.session.has_errors
+    assert page.fields._fields["xyz"].texts[0] == "2e9"
+    page.leave(**{"x (m)": "0.05"})
+    assert not page.session.has_errors
+    assert page.session.document.text == before
+    page.editor.select(GeometryItem(ItemKind.CONSTRAINT, "SpeedLanFixed"))
+    page.set(to="Raptor:CG")
+    assert page.session.has_errors
+    assert page.fields._fields["to"].value == "Raptor:CG"
+    page.undo()
+    assert page.fields._fields["to"].value == "SpeedLan:BracketHole"
 
 
 def test_given_a_typed_number_when_another_item_is_selected_then_it_is_set(page: EditedPage) -> None:
@@ -418,7 +575,7 @@ def test_given_a_wrong_number_then_its_old_value_typed_again_is_set(page: Edited
     assert not page.session.has_errors
     assert page.model.frame(LENS.name).pose.xyz == (0.05, 0.0, 0.06)
     assert "description: >-" in page.session.document.text
-    assert page.session.document.text.count("\n") == before.count("\n") + 1
+    assert page.session.document.text == before
 
 
 def test_given_a_file_that_changes_on_disk_then_that_is_shown_until_it_is_read(page: EditedPage) -> None:

@@ -35,7 +35,7 @@ from mstools.recordings.drive import Picture
 from mstools.view.camera import VIEWS, fit_camera
 from mstools.view.meshes import MeshError, MeshFolders
 from mstools.view.page import Page, escape_markdown, open_page
-from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene, compute_ellipsoid
+from mstools.view.scene import CHI_SQUARE_3, MARK_SCALE, OUTLINE_SCALE, NameLabels, VehicleScene, compute_ellipsoid
 from mstools.view.sources import Source, list_coordinates, open_geometry
 from mstools.view.viewer import describe_answer, describe_unread, format_code
 
@@ -302,6 +302,37 @@ def test_given_a_direction_then_the_camera_sees_all_that_is_drawn_and_as_large_a
         assert 0.75 < max(across.max(), along.max()) < 1.0
     above = fit_camera(points, np.array((0.0, 0.0, 2.0)), math.radians(45.0), 1.0)
     assert above.position[:2] == pytest.approx(above.look_at[:2])
+
+
+def test_given_a_selected_body_then_its_shapes_and_the_frame_are_outlined(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "part.obj").write_text(TETRAHEDRON)
+    path = tmp_path / "geometry.yaml"
+    path.write_text("""\
+modelserver: geometry/1
+bodies:
+  Base:
+    visuals:
+      - {box: [2, 1, 1], xyz: [5, 0, 0], rpy_deg: [0, 0, 90]}
+      - {cylinder: {radius: 1, length: 4}}
+      - {sphere: {radius: 3}, xyz: [0, 10, 0]}
+      - {mesh: part.obj, scale: [2, 2, -2]}
+      - {mesh: absent.obj}
+    frames: {Origin: {}, End: {xyz: [0, 0, 20]}}
+""")
+    source = open_geometry(path, {})
+    scene = make_scene(page, source)
+    scene.mark("Base", Pose((0.0, 0.0, 20.0)))
+    boxes = np.array(scene._mark.points).reshape(-1, 24, 3)
+    side = MARK_SCALE * scene._size
+    centers = [(5, 0, 0), (0, 0, 0), (0, 10, 0), (1, 1, -1), (0, 0, 20)]
+    sizes = [(1, 2, 1), (2, 2, 4), (6, 6, 6), (2, 2, 2), (side, side, side)]
+    np.testing.assert_allclose((boxes.max(axis=1) + boxes.min(axis=1)) / 2.0, centers, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(boxes, axis=1), OUTLINE_SCALE * np.array(sizes), rtol=1e-6)
+    # along the axes, four in each direction
+    edges = np.abs(np.diff(np.array(scene._mark.points)[12:24], axis=1)[:, 0]) > 1e-6
+    assert edges.sum(axis=0).tolist() == [4, 4, 4]
+    scene.mark("Other", None)
+    assert scene._mark is None
 
 
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:

@@ -97,7 +97,7 @@ def command(
     editing = open_editing(file, settings, url, prefix, key or "") if edit and file is not None else None
     with ExitStack() as stack:
         shown = file
-        if file is not None:
+        if file is not None and editing is None:
             from mstools.commands.replay import open_localized
             from mstools.recordings.bag_log import open_lcm_log
 
@@ -114,6 +114,8 @@ def command(
         viewer = Viewer(page, source, editing)
         typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
         sys.stdout.flush()
+        if editing is not None and editing.session.file.is_new:
+            typer.echo(escape(f"modelserver: {file} does not exist yet; the button Save writes it"), err=True)
         if editing is not None and editing.session.has_errors:
             typer.echo(escape(f"modelserver: {source.title}: has errors, listed in the tab Edit"), err=True)
         for each in source.notes[:SHOWN_NOTES]:
@@ -137,14 +139,15 @@ def check_installed() -> None:
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:
     """Begin to edit a geometry file, or that of a vehicle file. Raises typer.BadParameter, EditError, OSError.
 
-    Bus and prefix of the service are those given, else of the vehicle file.
+    A YAML file that is not there is a new geometry file. Bus and prefix are those given, else of the vehicle file.
     """
     from mstools.edit import EditedFile, EditSession
     from mstools.view.editor import Editing
 
-    if detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
+    is_new = file.suffix.lower() in (".yaml", ".yml") and not os.path.lexists(file)
+    if not is_new and detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.LOG:
         raise typer.BadParameter("goes with a geometry or vehicle file, not with a log", param_hint="--edit")
-    edited = EditedFile.open(file)
+    edited = EditedFile(file, is_new=True) if is_new else EditedFile.open(file)
     check_writable(str(edited.path))
     if edited.config is not None:
         url, prefix = url or edited.config.lcm.url, prefix or edited.config.lcm.channel_prefix
@@ -166,7 +169,7 @@ def open_source(
 
     if file is None:
         return open_live(url, prefix, timeout, packages)
-    kind = detect_file_kind(read_start(file, EXAMINED_BYTES))
+    kind = detect_file_kind(read_start(file, EXAMINED_BYTES)) if editing is None else FileKind.GEOMETRY
     if kind is FileKind.LOG:
         return open_log(file, prefix, model, packages)
     if model is not None:

@@ -1,19 +1,26 @@
 """The page's editor of a geometry file: what is selected, its fields, the gizmo, problems, saving and applying.
 
 All changes go through an `EditSession`. Callbacks of the page only queue an action, which the viewer executes between
-two pictures. `ItemFields` sets the numbers and texts of an item together: each number has a text field, so that what is
-typed stays as it is typed, and a number that was not changed in its field is as exact as it was given. `PlacePanel`
-computes a pose from a frame with which it coincides, or from distances to others.
+two pictures. `ItemFields` shows the numbers and texts of an item. Each number has a text field, so that what is typed
+stays as it is typed, and a number that was not changed in its field is as exact as it was given. `PlacePanel` computes
+a pose from a frame with which it coincides, or from distances to others.
+
+A text field is set when Enter is pressed in it or it is left. viser's page reports neither, and of all changes within
+50 ms it sends the last one only, of whatever field: a digit is lost where Tab follows it at once. `COMMIT_SCRIPT`
+therefore sends the texts of the fields that were left, through a hidden field, and again after `RESEND_MS`.
 """
 
 from __future__ import annotations
 
 import html
+import json
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import viser
@@ -38,13 +45,12 @@ from modelserver.messages import ReloadReply
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.edit import SAME_RADIANS, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
+from mstools.edit import SAME_RADIANS, WHOLE_FILE, EditError, EditSession, GeometryDocument, GeometryItem, ItemKind
 from mstools.terminal.output import format_count
 from mstools.view.page import Actions, escape_markdown, format_table
 from mstools.view.scene import VehicleScene
 
 SHOWN_PROBLEMS: Final = 8
-MAX_LABEL: Final = 60
 LOOK_PERIOD_S: Final = 2.0
 """Period at which the file is compared with what was read, seconds."""
 
@@ -62,11 +68,65 @@ _INFINITE: Final = {".inf": math.inf, "-.inf": -math.inf}
 _MINUS: Final = str.maketrans(dict.fromkeys("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d", "-"))
 """Minus signs and dashes that keyboards and other programs write."""
 
-_RED: Final = '<span style="color: #c92a2a; font-size: 0.8em">{}</span>'
+_THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+"""What is one number with a decimal comma and another one with a comma between thousands."""
+
+ACCEPTED: Final = "accepted are numbers such as -0.25, 0,25 and 2.5e-2"
+
+_RED: Final = '<div style="color: #e03131; font-size: 0.8em; padding: 0 1em 0.5em">{}</div>'
+
+CARRIER: Final = "typed"
+"""Label of the hidden field."""
+
+RESEND_MS: Final = 120
+"""More than two periods of 50 ms in which viser's page sends one change."""
+
+COMMIT_SCRIPT: Final = f"""\
+const folder = this.closest('.mantine-Paper-root');
+if (folder.isWatched) return;
+folder.isWatched = true;
+const find = (input) => input.closest('.mantine-Flex-root')?.querySelector('label')?.textContent;
+const carrier = [...folder.querySelectorAll('input')].find((each) => find(each) === '{CARRIER}');
+carrier.closest('.mantine-Flex-root').parentElement.style.display = 'none';
+const write = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
+const typed = new Map(), left = new Map();
+let timer;
+const send = () => {{
+  write.call(carrier, JSON.stringify([Date.now(), ...left.values()]));
+  carrier.dispatchEvent(new Event('input', {{bubbles: true}}));
+}};
+const leave = (input) => {{
+  if (!typed.has(input)) return;
+  left.set(input, [...typed.get(input), input.value]);
+  typed.delete(input);
+  send();
+  clearTimeout(timer);
+  timer = setTimeout(() => {{ send(); left.clear(); }}, {RESEND_MS});
+}};
+folder.addEventListener('input', (event) => {{
+  if (!event.isTrusted) return;
+  typed.set(event.target, [folder.querySelector('[data-shown]').dataset.shown, find(event.target)]);
+  left.delete(event.target);
+}}, true);
+folder.addEventListener('focusout', (event) => leave(event.target));
+folder.addEventListener('keydown', (event) => {{ if (event.key === 'Enter') leave(event.target); }});"""
+"""Executed in the page, in the folder of the fields. Each text is reported with the number and label of its fields.
+React regards a value as typed that was written by the setter of all inputs, past its own one, before an event."""
+
+_DIFF_STYLE: Final = "font-family: monospace; font-size: 0.8em; white-space: pre-wrap; overflow-wrap: anywhere"
+_DIFF_STYLES: Final = {
+    "+": "color: #2b8a3e; background: rgba(64, 192, 87, 0.15)",
+    "-": "color: #e03131; background: rgba(250, 82, 82, 0.15)",
+    "@": "opacity: 0.6",
+}
+
+HINT: Final = "Save shows the changes first. Apply reloads the geometry in the running service, also after a question"
+
+_PIXEL: Final = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
 
 Change = Callable[[GeometryDocument], GeometryDocument]
-ChangeItem = Callable[[Change, GeometryItem | None], bool]
-"""Makes a change and selects an item; returns whether it could be made."""
+ChangeItem = Callable[[Change, GeometryItem | None], str]
+"""Makes a change and selects an item; returns why it could not be made, empty if it was."""
 
 
 @dataclass(frozen=True)
@@ -118,19 +178,23 @@ class Editor:
         self._is_outdated = False
         self._buttons: list[Any] = []
         self._status = gui.add_markdown("")
+        buttons: dict[str, Callable[[], object]] = {
+            "Undo": lambda: self._step(session.undo, session.undo_name, "undone"),
+            "Redo": lambda: self._step(session.redo, session.redo_name, "made again"),
+            "Save": self._ask_save,
+            "Apply": self._ask_apply,
+            "Read again": self._ask_read,
+        }
+        group = gui.add_button_group("Changes", tuple(buttons), hint=HINT)
+        group.on_click(lambda event: actions.put(buttons[event.target.value]))
         self._message = gui.add_markdown("")
-        self._undo = self._add_button("Undo", lambda: self._step(session.undo))
-        self._redo = self._add_button("Redo", lambda: self._step(session.redo))
-        self._save = self._add_button("Save ...", self._ask_save)
-        self._apply = self._add_button("Apply to the service ...", lambda: self._start_reload(dry_run=True))
-        self._add_button("Read the file again", self._ask_read)
         self._problems = gui.add_folder("Problems")
         with self._problems:
             self._problem_texts = gui.add_markdown("")
         self._kind: Any = gui.add_dropdown("Kind", tuple(ItemKind), initial_value=ItemKind.FRAME)
         self._name: Any = gui.add_dropdown("Item", ("",))
-        actions.on_update(self._kind, lambda: self._select_first(ItemKind(self._kind.value)))
-        actions.on_update(self._name, lambda: self.select(GeometryItem(ItemKind(self._kind.value), self._name.value)))
+        actions.on_choice(self._kind, lambda kind: self._select_first(ItemKind(kind)))
+        actions.on_choice(self._name, lambda name: self.select(GeometryItem(self._item.kind, name)))
         self._fields = ItemFields(server, session, self._item, self._change_item, actions)
         with gui.add_folder("Gizmo", expand_by_default=False):
             self._gizmo: Any = gui.add_checkbox("Gizmo", True, hint="Drag arrows to move, arcs to turn")
@@ -154,7 +218,7 @@ class Editor:
         return self._actions.add_button(self._gui, label, action)
 
     def _ask(self, title: str, text: str, answer: str, action: Callable[[], object]) -> None:
-        """Show a text in a dialog, and execute an action if a person answers so."""
+        """Show a text in HTML in a dialog, and execute an action if a person answers so."""
         modal: Any = self._gui.add_modal(title)
 
         def confirm() -> None:
@@ -162,7 +226,7 @@ class Editor:
             action()
 
         with modal:
-            self._gui.add_markdown(text)
+            self._gui.add_html(text)
             self._add_button(answer, confirm)
             self._add_button("Cancel", modal.close)
 
@@ -173,7 +237,7 @@ class Editor:
             # what was typed is not lost: it stays until it can be set
             self._kind.value, self._name.value = self._item.kind, self._item.name
             return
-        items = self._session.document.list_items()
+        items = self._session.document.list_items() or [WHOLE_FILE]
         if item not in items:
             return
         self._item = item
@@ -196,22 +260,14 @@ class Editor:
     def _find_first(self, kind: ItemKind) -> GeometryItem:
         """Return the first item of a kind, without one the first of all."""
         items = self._session.document.list_items()
-        return next((each for each in items if each.kind is kind), items[0])
+        return next((each for each in items if each.kind is kind), next(iter(items), WHOLE_FILE))
 
     def _refresh(self) -> None:
         session = self._session
         self._next_look = 0.0
         self._show_status()
-        for button, name, change in (
-            (self._undo, "Undo", session.undo_name),
-            (self._redo, "Redo", session.redo_name),
-        ):
-            button.label = f"{name}: {change}"[:MAX_LABEL] if change else name
-            button.disabled = not change
-        self._save.disabled = not session.is_changed or session.has_errors
-        self._apply.disabled = session.is_changed
         self._show_problems()
-        if self._item not in session.document.list_items():
+        if self._item not in (session.document.list_items() or [WHOLE_FILE]):
             self._item = self._find_first(self._item.kind)
         self.select(self._item)
         if session.model is not None and session.model is not self._shown:
@@ -225,7 +281,7 @@ class Editor:
         state = "not saved" if session.is_changed else "saved"
         if errors:
             state += f"; {format_count(errors, 'error')}: cannot be saved, and the scene shows " + (
-                "the last model" if session.model is not None else "the bodies, not joined"
+                "the last model" if session.model is not None else "the bodies that can be read, not joined"
             )
         if self._is_outdated:
             state += ". **The file changed meanwhile on disk:** read it again before you go on"
@@ -244,6 +300,7 @@ class Editor:
         if notes:
             text += f"\n\n{format_count(notes, 'note')}: modelserver check --notes"
         self._problem_texts.content = text
+        self._problems.visible = bool(found)
         with self._problems:
             for number, problem in enumerate(shown, 1):
                 culprit = self._session.find_culprit(problem)
@@ -257,35 +314,41 @@ class Editor:
 
     # --- changes
 
-    def _do(self, action: Callable[[], object]) -> bool:
-        """Execute an action; show why it cannot be done, if so."""
+    def _do(self, action: Callable[[], object]) -> str:
+        """Execute an action; show and return why it cannot be done, if so."""
+        problem = ""
         try:
             action()
         except (ModelServerError, PlacementError, OSError) as error:
             near = f"; nearest: {', '.join(error.nearest)}" if isinstance(error, QueryError) and error.nearest else ""
-            self._report(f"not done: {error}{near}")
-            return False
-        self._report("")
-        return True
+            problem = f"{error}{near}"
+        self._report(problem and f"not done: {problem}")
+        return problem
 
-    def _step(self, action: Callable[[], None]) -> None:
-        self._do(action)
+    def _step(self, action: Callable[[], None], change: str, done: str) -> None:
+        """Undo a change or make it again."""
+        problem = self._do(action)
         self._refresh()
+        if not problem:
+            self._report(f"{done}: {change}" if change else f"nothing to be {done}")
 
-    def _change(self, name: str, change: Change, new: GeometryItem | None = None) -> bool:
-        """Make a change, after which `new` is selected."""
-        if not self._do(lambda: self._session.change(name, change)):
-            return False
-        if new is not None:
-            self._item = new
-        self._refresh()
-        return True
+    def _change(self, name: str, change: Change, new: GeometryItem | None = None) -> str:
+        """Make a change, after which `new` is selected; return why it cannot be made."""
+        problem = self._do(lambda: self._session.change(name, change))
+        if not problem:
+            if new is not None:
+                self._item = new
+            self._refresh()
+        return problem
 
-    def _change_item(self, change: Change, new: GeometryItem | None = None) -> bool:
+    def _change_item(self, change: Change, new: GeometryItem | None = None) -> str:
         return self._change(f"edit {self._item.name}", change, new)
 
     def _add(self, kind: ItemKind) -> None:
         name, item, frames = self._new.value.strip(), self._item, list_frames(self._session.document)
+        if kind is not ItemKind.BODY and not frames:
+            self._report("not done: there is no frame yet; add a body first")
+            return
         body = (frames[0] if item.kind is ItemKind.CONSTRAINT else item.name).partition(":")[0]
         new, change = name, lambda document: document.add_body(name)
         if kind is ItemKind.FRAME:
@@ -297,14 +360,19 @@ class Editor:
                 self._report("not done: a constraint joins two bodies, and there is only one")
                 return
             change = lambda document: document.add_constraint(name, from_, others[-1])  # noqa: E731
-        self._change(f"add {new}", change, GeometryItem(kind, new))
+        self._make(f"add {new}", change, GeometryItem(kind, new))
+
+    def _make(self, name: str, change: Change, new: GeometryItem) -> None:
+        """Make a change that adds an item; its name is used then."""
+        if not self._change(name, change, new):
+            self._new.value = ""
 
     def _duplicate(self) -> None:
         item = self._item
         plain = item.name.rpartition(":")[2]
         name = self._new.value.strip() or _find_free_name(self._session.document, item)
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name)
-        self._change(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
+        self._make(f"duplicate {item.name}", lambda document: document.duplicate(item, name), new)
 
     def _delete(self) -> None:
         item = self._item
@@ -318,8 +386,15 @@ class Editor:
     # --- gizmo
 
     def show_gizmo(self) -> None:
-        """Show the gizmo at what is selected, where the scene has it."""
+        """Outline what is selected, and show the gizmo at it, where the scene has it."""
         place = self._fields.find_place()
+        part = self._fields.part
+        if isinstance(part, Constraint):
+            # what it moves
+            body, pose = names.split(part.to)[0], self._session.drawn.frame(part.to).pose
+            self._scene.mark(body, pose)
+        else:
+            self._scene.mark(self._item.name.partition(":")[0], part.pose if part is not None else None)
         if not self._gizmo.value or place is None:
             self._scene.hide_gizmo()
             return
@@ -335,29 +410,44 @@ class Editor:
     def _ask_save(self) -> None:
         if not self._fields.commit():
             return
-        diff, shown = self._session.make_diff(), self._session.document
-        # longer than what the file may have
-        fence = "`" * (3 + diff.count("`"))
-        text = f"{fence}diff\n{diff}\n{fence}"
-        self._ask(f"Save {self._session.file.path.name}", text, "Save", lambda: self._write_file(shown))
+        session = self._session
+        if session.has_errors:
+            self._report("not saved: the geometry has errors; fix them first")
+        elif not session.is_changed:
+            self._report("nothing to be saved")
+        else:
+            shown, diff = session.document, format_diff(session.make_diff())
+            self._ask(f"Save {session.file.path.name}", diff, "Save", lambda: self._write_file(shown))
 
     def _ask_read(self) -> None:
         """Read the file again, after a question if changes would be lost."""
         if not self._session.is_changed:
-            self._step(self._session.read)
+            self._read_file()
             return
         text = "The changes that are not saved are dropped."
-        self._ask("Read the file again", text, "Drop them", lambda: self._step(self._session.read))
+        self._ask("Read the file again", text, "Drop them", self._read_file)
+
+    def _read_file(self) -> None:
+        self._fields.drop()
+        self._do(self._session.read)
+        self._refresh()
 
     def _write_file(self, shown: GeometryDocument) -> None:
         if self._session.document is not shown:
             # in another tab
             self._report("not saved: the geometry was edited since its difference was shown; look at it again")
-        elif self._do(self._session.save):
+        elif not self._do(self._session.save):
             self._report(f"saved {self._session.file.path}")
         message = self._message.content
         self._refresh()
         self._message.content = message
+
+    def _ask_apply(self) -> None:
+        if self._fields.commit():
+            if self._session.is_changed:
+                self._report("not applied: save the changes first; the service reads the file")
+            else:
+                self._start_reload(dry_run=True)
 
     def _start_reload(self, dry_run: bool) -> None:
         """Ask the service what a reload would change, or reload."""
@@ -393,16 +483,32 @@ class Editor:
             self._report(f"the service has this geometry already, revision {reply.revision}")
         else:
             self._report("")
-            changes = "\n".join(f"- {escape_markdown(each)}" for each in reply.changes)
-            self._ask("Apply to the running service", changes, "Apply", lambda: self._start_reload(dry_run=False))
+            changes = "".join(f"<li>{html.escape(each)}</li>" for each in reply.changes)
+            self._ask(
+                "Apply to the running service",
+                f"<ul>{changes}</ul>",
+                "Apply",
+                lambda: self._start_reload(dry_run=False),
+            )
 
     def close(self) -> None:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
 
+def format_diff(diff: str) -> str:
+    """Return a unified diff in HTML: what is added in green, what is removed in red, long lines in several."""
+    rows = []
+    for number, line in enumerate(diff.splitlines()):
+        # the first two have the names of the files
+        style = _DIFF_STYLES.get(line[:1], "") if number > 1 else "opacity: 0.6"
+        rows.append(f'<div style="{style}">{html.escape(line) or " "}</div>')
+    return f'<div style="{_DIFF_STYLE}">{"".join(rows)}</div>'
+
+
 def _describe_problem(problem: Problem) -> str:
     fix = f"; {problem.fix}" if problem.fix else ""
-    place = f" ({problem.element})" if problem.element else ""
+    where = problem.element or (f"line {problem.line}" if problem.line else "")
+    place = f" ({where})" if where else ""
     return f"**{problem.severity}**: {escape_markdown(problem.message + place + fix)}"
 
 
@@ -419,66 +525,119 @@ def _find_free_name(document: GeometryDocument, item: GeometryItem) -> str:
 def parse_typed(label: str, text: str) -> float:
     """Return the number that was typed: with a sign, an exponent, a decimal comma. Raises EditError."""
     plain = text.strip().translate(_MINUS)
+    if _THOUSANDS.fullmatch(plain):
+        point = plain.replace(",", ".")
+        raise EditError(f"{label}: {quote(text, 40)} has two meanings; write {point}, or no comma between thousands")
     if plain.count(",") == 1 and "." not in plain:
         plain = plain.replace(",", ".")
+    if "," in plain:
+        raise EditError(f"{label}: {quote(text, 40)} is not a number; {ACCEPTED}")
     try:
         return parse_number(plain)
     except ValueError as error:
-        raise EditError(f"{label}: {error}") from None
+        raise EditError(f"{label}: {error}; {ACCEPTED}") from None
 
 
 def _format_field(value: float) -> str:
     return format_number(round(value, PRECISION) + 0.0)
 
 
+class TypedText:
+    """A text field. What is typed in it is pending until it is set, and not overwritten until then."""
+
+    def __init__(self, gui: viser.GuiApi, label: str, text: str, actions: Actions, hint: str | None = None):
+        self.label = label
+        self._shown: str | None = text
+        self._field: Any = gui.add_text(label, text, hint=hint)
+        self._problem: Any = gui.add_html("")
+        actions.on_update(self._field, lambda: self.mark(""))
+
+    @property
+    def value(self) -> str:
+        return str(self._field.value)
+
+    @value.setter
+    def value(self, text: str) -> None:
+        self._field.value = text
+
+    @property
+    def is_pending(self) -> bool:
+        return self.value != self._shown
+
+    def report(self, text: str, client: int) -> None:
+        """Take a text that the page of a client has, and send it to the pages of others.
+
+        A value that is assigned is sent to this client too, and replaces what is typed there meanwhile; viser offers
+        the way without that to its own messages only.
+        """
+        state = self._field._impl
+        state.value = text
+        state.sync_cb(client, {"value": text})
+
+    def show(self, text: str) -> None:
+        """Show what is set, unless something is pending."""
+        if not self.is_pending:
+            self._shown = self.value = text
+
+    def settle(self) -> None:
+        """What is typed is set."""
+        self._shown = self.value
+        self.mark("")
+
+    def reject(self, problem: str = "") -> None:
+        """What is typed could not be set: it stays, marked with the reason."""
+        self._shown = None
+        self.mark(problem)
+
+    def mark(self, problem: str) -> None:
+        self._problem.content = _RED.format(html.escape(problem)) if problem else ""
+
+
 class NumberFields:
-    """Fields of numbers with a label each. What is no number is marked in red, and stays."""
+    """Text fields of numbers with a label each."""
 
     def __init__(self, gui: viser.GuiApi, labels: Sequence[str], values: Sequence[float], actions: Actions):
-        self._labels = tuple(labels)
         self._given = tuple(map(float, values))
-        self._texts: list[Any] = [
-            gui.add_text(label, _format_field(value)) for label, value in zip(labels, values, strict=True)
+        self.fields = [
+            TypedText(gui, label, _format_field(value), actions) for label, value in zip(labels, values, strict=True)
         ]
-        self._problem: Any = gui.add_html("")
-        for each in self._texts:
-            actions.on_update(each, self.mark)
+
+    def read(self, labels: Collection[str]) -> tuple[float, ...]:
+        """Return the numbers, of fields without these labels what was given. Raises EditError for no number."""
+        numbers = []
+        for old, field in zip(self._given, self.fields, strict=True):
+            number = parse_typed(field.label, field.value) if field.label in labels else old
+            numbers.append(old if number == float(_format_field(old)) else number)
+        return tuple(numbers)
+
+    def show(self, values: Sequence[float]) -> None:
+        """Show numbers where nothing is pending; a text that has the number stays as it is typed."""
+        self._given = tuple(map(float, values))
+        for number, field in zip(self._given, self.fields, strict=True):
+            text = _format_field(number)
+            try:
+                if parse_typed("", field.value) != float(text):
+                    field.show(text)
+            except EditError:
+                field.show(text)
 
     @property
     def value(self) -> tuple[float, ...]:
         """The numbers. Raises EditError for a text that is none."""
-        typed = [parse_typed(label, each.value) for label, each in zip(self._labels, self._texts, strict=True)]
-        return tuple(
-            [old if new == float(_format_field(old)) else new for old, new in zip(self._given, typed, strict=True)]
-        )
+        return self.read([each.label for each in self.fields])
 
     @value.setter
     def value(self, numbers: Sequence[float]) -> None:
         self.texts = tuple(map(_format_field, numbers))
 
     @property
-    def is_changed(self) -> bool:
-        """Whether a number differs from what was given. Raises EditError."""
-        return self.value != self._given
-
-    @property
     def texts(self) -> tuple[str, ...]:
-        return tuple([str(each.value) for each in self._texts])
+        return tuple([each.value for each in self.fields])
 
     @texts.setter
     def texts(self, words: Sequence[str]) -> None:
-        for each, word in zip(self._texts, words, strict=True):
+        for each, word in zip(self.fields, words, strict=True):
             each.value = word
-        self.mark()
-
-    def mark(self) -> None:
-        """Show why the numbers cannot be read, if so."""
-        problem = ""
-        try:
-            _ = self.value
-        except EditError as error:
-            problem = _RED.format(html.escape(str(error)))
-        self._problem.content = problem
 
 
 SNAPS: Final = {
@@ -506,8 +665,18 @@ def find_part(model: Model | None, item: GeometryItem) -> BodyFrame | Constraint
         return None
 
 
+class ShownField(NamedTuple):
+    """What a field shows: numbers with a label each, one of `options`, yes or no, or a text; without label a note."""
+
+    key: str
+    labels: tuple[str, ...]
+    value: Any
+    options: tuple[str, ...] = ()
+    hint: str | None = None
+
+
 class ItemFields:
-    """A form with the fields of what is selected; its button sets all of them as one change."""
+    """The fields of what is selected. A text is set when it is left, a choice when it is made, each as one change."""
 
     def __init__(
         self, server: viser.ViserServer, session: EditSession, item: GeometryItem, change: ChangeItem, actions: Actions
@@ -518,80 +687,91 @@ class ItemFields:
         self._change = change
         self._actions = actions
         self._item = item
-        self._form: Any = None
-        self._part: BodyFrame | Constraint | None = None
+        self._folder: Any = None
+        self.part: BodyFrame | Constraint | None = None
+        self._shown: list[ShownField] = []
         self._fields: dict[str, Any] = {}
-        self._given: dict[str, Any] = {}
+        self._count = 0
         self._exact: dict[str, tuple[float, ...]] = {}
         self._place = gui.add_folder("Values")
+        with self._place:
+            self._carrier: Any = gui.add_text(CARRIER, "")
+            script = html.escape(COMMIT_SCRIPT)
+            gui.add_html(f'<img alt="" style="display: none" src="{_PIXEL}" onload="{script}">')
+
+        def read(event: Any) -> None:
+            # values that this program sets have no client
+            if event.client_id is not None:
+                actions.put(partial(self._set_left, event.target.value, event.client_id))
+
+        self._carrier.on_update(read)
 
     # --- what is shown
 
+    def drop(self) -> None:
+        """Drop what is typed; the next `show` makes the fields again."""
+        self._shown = []
+
     def show(self, item: GeometryItem) -> None:
-        self._item = item
-        self._fields, self._given, self._exact = {}, {}, {}
-        self._part = find_part(self._session.drawn, item)
-        old = self._form
+        """Show an item. Fields that stay the same ones stay on the page, with what is typed in them."""
+        self.part = find_part(self._session.drawn, item)
+        shown = self._list_fields(item)
+        is_same = item == self._item and _list_layout(shown) == _list_layout(self._shown)
+        self._item, self._shown = item, shown
+        if is_same:
+            if not self._is_wrong:
+                with self._server.atomic():
+                    for each in shown:
+                        self._update(each)
+            # else what was set stays to be seen: the scene has the last model without an error
+            return
+        self._fields = {}
+        old = self._folder
         with self._server.atomic():
             with self._place:
-                self._form = self._gui.add_form(None)
-            with self._form:
-                self._add_fields(item)
+                self._folder = self._gui.add_folder(None)
+            self._count += 1
+            with self._folder:
+                self._gui.add_html(f'<i data-shown="{self._count}" hidden></i>')
+                for each in shown:
+                    self._add(each)
             if old is not None:
                 # last: a page hides a folder that was empty for a moment, and may never show it again
                 old.remove()
-        self._form.on_submit(lambda _: self._actions.put(self.set))
 
-    def _add_fields(self, item: GeometryItem) -> None:
+    def _list_fields(self, item: GeometryItem) -> list[ShownField]:
         document = self._session.document
-        self._add("name", self._gui.add_text("Name", item.name.rpartition(":")[2]))
+        self._exact = {}
+        if item == WHOLE_FILE:
+            return [ShownField("note", (), "No body can be read: write the file under *As text*.")]
+        shown = [ShownField("name", ("Name",), item.name.rpartition(":")[2])]
         template = document.find_template(item)
         if template:
             users = ", ".join(document.list_users(template))
             hint = f"Else {item.name.partition(':')[0]} alone gets an entry of its own"
-            self._add("template", self._gui.add_checkbox(f"For all of {template}: {users}", False, hint=hint))
-        part: BodyFrame | Constraint | Body | None = self._part
+            shown.append(ShownField("template", (f"For all of {template}: {users}",), False, hint=hint))
+        part: BodyFrame | Constraint | Body | None = self.part
         if isinstance(part, Constraint):
             frames = tuple(list_frames(document))
             for key, frame in (("from", part.from_), ("to", part.to)):
-                shown = frame if frame in frames else frames[0]
-                self._add(key, self._gui.add_dropdown(key, frames, initial_value=shown))
-        if self._part is not None:
-            self._add_pose(self._part.pose, self._part.sigma)
+                shown.append(ShownField(key, (key,), frame if frame in frames else frames[0], frames))
+        if self.part is not None:
+            shown += _list_pose_fields(self.part.pose, self.part.sigma)
         if isinstance(part, Constraint):
-            self._add_joint(part.joint)
+            shown += self._list_joint_fields(item, part.joint)
         part = part or next((each for each in self._session.drawn.bodies if each.name == item.name), None)
-        self._add("description", self._gui.add_text("Description", part.description if part is not None else ""))
-        self._actions.add_button(self._gui, "Set", self.set)
+        shown.append(ShownField("description", ("Description",), part.description if part is not None else ""))
+        return shown
 
-    def _add(self, key: str, field: Any) -> None:
-        self._fields[key], self._given[key] = field, field.value
-
-    def _add_vector(self, key: str, labels: Sequence[str], values: Sequence[float]) -> None:
-        self._fields[key] = NumberFields(self._gui, labels, values, self._actions)
-
-    def _add_pose(self, pose: Pose, sigma: Sigma | None) -> None:
-        degrees = [math.degrees(each) for each in pose.rpy]
-        self._add_vector("xyz", ("x (m)", "y (m)", "z (m)"), pose.xyz)
-        self._add_vector("rpy", ("roll (deg)", "pitch (deg)", "yaw (deg)"), degrees)
-        self._add(
-            "has_sigma", self._gui.add_checkbox("Sigma", sigma is not None, hint="Standard deviations are stated")
-        )
-        known = sigma or Sigma()
-        turns = np.degrees(known.rotation).tolist()
-        self._add_vector("sigma_xyz", [f"sigma {axis} (m)" for axis in "xyz"], known.position)
-        self._add_vector("sigma_rpy", [f"sigma {axis} (deg)" for axis in ("roll", "pitch", "yaw")], turns)
-
-    def _add_joint(self, joint: Joint) -> None:
-        gui = self._gui
-        self._add("joint", gui.add_dropdown("Joint", tuple(JointType), initial_value=joint.type))
+    def _list_joint_fields(self, item: GeometryItem, joint: Joint) -> list[ShownField]:
+        shown = [ShownField("joint", ("Joint",), joint.type, tuple(JointType))]
         if not joint.is_movable:
-            return
+            return shown
         if joint.type in TYPES_WITH_AXIS:
-            self._add_vector("axis", [f"axis {axis}" for axis in "xyz"], joint.axis)
+            shown.append(ShownField("axis", tuple([f"axis {axis}" for axis in "xyz"]), joint.axis))
         if joint.count > 1:
-            gui.add_markdown("Limits and more of a joint with several coordinates: under *As text*.")
-            return
+            note = "Limits and more of a joint with several coordinates: under *As text*."
+            return [*shown, ShownField("note", (), note)]
         unit = "deg" if joint.type is JointType.REVOLUTE else "m"
         scale = math.degrees(1.0) if unit == "deg" else 1.0
         limits: tuple[float, ...] = ()
@@ -603,17 +783,52 @@ class ItemFields:
             ("default", f"default ({unit})", joint.default),
             ("sigma", f"joint sigma ({unit})", joint.sigma),
         ):
-            self._add(key, gui.add_text(label, _format_values(values, scale), hint="Empty: none is stated"))
+            shown.append(ShownField(key, (label,), _format_values(values, scale), hint="Empty: none is stated"))
             self._exact[key] = values
         others = [each.name for each in self._session.document.list_items() if each.kind is ItemKind.CONSTRAINT]
-        leaders = (NO_CHOICE, *(each for each in others if each != self._item.name))
+        leaders = (NO_CHOICE, *(each for each in others if each != item.name))
         mimic = joint.mimic
         leader = mimic.joint if mimic is not None and mimic.joint in leaders else NO_CHOICE
-        self._add("leader", gui.add_dropdown("follows", leaders, initial_value=leader))
         known = mimic or Mimic("")
-        self._add("multiplier", gui.add_text("multiplier", format_number(known.multiplier)))
-        self._add("offset", gui.add_text(f"offset ({unit})", _format_values([known.offset], scale)))
         self._exact |= {"multiplier": (known.multiplier,), "offset": (known.offset,)}
+        return [
+            *shown,
+            ShownField("leader", ("follows",), leader, leaders),
+            ShownField("multiplier", ("multiplier",), format_number(known.multiplier)),
+            ShownField("offset", (f"offset ({unit})",), _format_values([known.offset], scale)),
+        ]
+
+    def _add(self, shown: ShownField) -> None:
+        gui, value = self._gui, shown.value
+        field: Any
+        if not shown.labels:
+            gui.add_markdown(value)
+            return
+        if isinstance(value, tuple):
+            field = NumberFields(gui, shown.labels, value, self._actions)
+        elif shown.options or isinstance(value, bool):
+            (label,) = shown.labels
+            if shown.options:
+                field = gui.add_dropdown(label, shown.options, initial_value=value)
+            else:
+                field = gui.add_checkbox(label, value, hint=shown.hint)
+            if shown.key != "template":
+                self._actions.on_choice(field, lambda chosen: self._choose(field, shown, chosen))
+        else:
+            field = TypedText(gui, shown.labels[0], value, self._actions, shown.hint)
+        self._fields[shown.key] = field
+
+    def _update(self, shown: ShownField) -> None:
+        """Show another value in a field."""
+        field = self._fields.get(shown.key)
+        if field is None or shown.key == "template":
+            return
+        if isinstance(field, NumberFields | TypedText):
+            field.show(shown.value)
+        else:
+            if shown.options and field.options != shown.options:
+                field.options = shown.options
+            field.value = shown.value
 
     @property
     def in_template(self) -> bool:
@@ -621,111 +836,146 @@ class ItemFields:
 
     # --- what is set
 
+    def _choose(self, field: Any, shown: ShownField, value: Any) -> None:
+        if field in self._fields.values():
+            field.value = value
+            self.set(shown.labels)
+
+    def _list_texts(self) -> list[TypedText]:
+        texts: list[TypedText] = []
+        for field in self._fields.values():
+            texts += field.fields if isinstance(field, NumberFields) else [field] * isinstance(field, TypedText)
+        return texts
+
+    def _set_left(self, message: str, client: int) -> None:
+        """Set the fields that were left, with the texts that they had on the page of a client."""
+        # of another item, if they are sent again after it was selected
+        texts = {label: text for shown, label, text in json.loads(message)[1:] if shown == str(self._count)}
+        for field in self._list_texts():
+            if field.label in texts:
+                field.report(texts[field.label], client)
+                if field.is_pending or self._is_wrong:
+                    self.set([field.label])
+
     def commit(self) -> bool:
         """Set what was typed, if anything was; return whether nothing is left that cannot be set."""
-        return not self._is_typed() or self.set()
+        return not any(each.is_pending for each in self._list_texts()) or self.set()
 
-    def _is_typed(self) -> bool:
-        try:
-            return any(self._differs(key) for key in self._fields if key != "template")
-        except EditError:
-            return True
-
-    def set(self) -> bool:
-        """Set what was changed in the fields; return whether that could be done."""
+    def set(self, labels: Collection[str] = ()) -> bool:
+        """Set what the fields with these labels have, by default all that was changed; return whether it could be."""
+        texts = [each for each in self._list_texts() if (each.label in labels if labels else each.is_pending)]
         item = self._item
         plain = item.name.rpartition(":")[2]
-        name = self._fields["name"].value.strip()
+        is_named = any(each is self._fields["name"] for each in texts)
+        name = self._fields["name"].value.strip() if is_named else plain
         new = GeometryItem(item.kind, item.name.removesuffix(plain) + name) if name != plain else None
-        return self._change(lambda document: self._write(document, item, name if new is not None else ""), new)
+        for each in texts:
+            each.settle()
+        if new is not None:
+            # its fields stay the same ones
+            self._item = new
+        problem = self._change(lambda document: self._write(document, item, name if new else "", labels, texts), new)
+        if problem:
+            self._item = item
+            for each in texts:
+                is_meant = len(texts) == 1 or problem.startswith(f"{each.label}: ")
+                each.reject(problem if is_meant else "")
+        return not problem
 
-    def _write(self, document: GeometryDocument, item: GeometryItem, name: str) -> GeometryDocument:
+    @property
+    def _is_wrong(self) -> bool:
+        """Whether the text has a wrong change of the item: the scene has the last model without an error."""
+        return self._session.has_errors and not self._session.is_as_loaded(self._item)
+
+    def _write(
+        self,
+        document: GeometryDocument,
+        item: GeometryItem,
+        name: str,
+        labels: Collection[str],
+        texts: Sequence[TypedText],
+    ) -> GeometryDocument:
         in_template = self.in_template
-        if self._is_changed("xyz", "rpy"):
-            xyz, rpy = (so3.to_vector3(self._fields[key].value) for key in ("xyz", "rpy"))
+        chosen = {*labels, *(each.label for each in texts)}
+        values: dict[str, Any] = {}
+        differing, changed = set(), set()
+        for each in self._shown:
+            if (field := self._fields.get(each.key)) is None:
+                continue
+            if isinstance(field, NumberFields):
+                value: Any = field.read(chosen)
+            else:
+                is_read = each.labels[0] in chosen or not (labels or isinstance(field, TypedText))
+                value = field.value if is_read else each.value
+            values[each.key] = value
+            if value != each.value:
+                differing.add(each.key)
+            # where the text has a wrong change of the item, the fields show another value than it
+            if value != each.value or (self._is_wrong and not chosen.isdisjoint(each.labels)):
+                changed.add(each.key)
+        if changed & {"xyz", "rpy"}:
+            xyz, rpy = (so3.to_vector3(values[key]) for key in ("xyz", "rpy"))
             document = document.set_pose(item, xyz, rpy, in_template)
-        if self._is_changed("has_sigma", "sigma_xyz", "sigma_rpy"):
+        if changed & {"has_sigma", "sigma_xyz", "sigma_rpy"}:
             # numbers that are typed are meant, whatever the checkbox has
-            is_stated = self._fields["has_sigma"].value or self._is_changed("sigma_xyz", "sigma_rpy")
-            fields = (self._fields["sigma_xyz"], self._fields["sigma_rpy"])
-            stated = [so3.to_vector3(each.value) if is_stated else None for each in fields]
+            is_stated = values["has_sigma"] or bool(changed & {"sigma_xyz", "sigma_rpy"})
+            stated = [so3.to_vector3(values[key]) if is_stated else None for key in ("sigma_xyz", "sigma_rpy")]
             document = document.set_sigma(item, stated[0], stated[1], in_template)
-        if self._is_changed("description"):
-            document = document.set_description(item, self._fields["description"].value.strip(), in_template)
-        if isinstance(self._part, Constraint):
-            if self._is_changed("from", "to"):
-                document = document.set_ends(item.name, self._fields["from"].value, self._fields["to"].value)
-            joint = self._read_joint(self._part.joint)
-            if joint != self._part.joint:
-                document = document.set_joint(item.name, self._part.joint, joint)
+        if "description" in changed:
+            document = document.set_description(item, values["description"].strip(), in_template)
+        if isinstance(self.part, Constraint):
+            if changed & {"from", "to"}:
+                document = document.set_ends(item.name, values["from"], values["to"])
+            joint = self._read_joint(self.part.joint, values, differing)
+            if joint != self.part.joint:
+                document = document.set_joint(item.name, self.part.joint, joint)
         return document.rename(item, name, in_template) if name else document
 
-    def _is_changed(self, *keys: str) -> bool:
-        """Return whether a field was changed; where the text has a wrong change of the item, all count as such."""
-        present = [key for key in keys if key in self._fields]
-        # the fields show the model that is drawn, not what the text has
-        is_wrong = self._session.has_errors and not self._session.is_as_loaded(self._item)
-        return any(is_wrong or self._differs(key) for key in present)
-
-    def _differs(self, key: str) -> bool:
-        field = self._fields[key]
-        return field.is_changed if isinstance(field, NumberFields) else bool(field.value != self._given[key])
-
-    def _read_joint(self, old: Joint) -> Joint:
-        keys = ("joint", "axis", "limits", "rate_limit", "default", "sigma", "leader", "multiplier", "offset")
-        if not any(key in self._fields and self._differs(key) for key in keys):
+    def _read_joint(self, old: Joint, values: Mapping[str, Any], differing: Collection[str]) -> Joint:
+        keys = {"joint", "axis", "limits", "rate_limit", "default", "sigma", "leader", "multiplier", "offset"}
+        if keys.isdisjoint(differing):
             return old
-        kind = JointType(self._fields["joint"].value)
-        axis = so3.to_vector3(self._fields["axis"].value) if "axis" in self._fields else (0.0, 0.0, 1.0)
+        kind = JointType(values["joint"])
+        axis = so3.to_vector3(values["axis"]) if "axis" in values else (0.0, 0.0, 1.0)
+
+        def read(key: str, count: int, is_angle: bool) -> tuple[float, ...]:
+            return _read_values(key, values[key], count, is_angle) if key in differing else self._exact[key]
+
         try:
             if kind is JointType.FIXED:
                 return Joint()
             if kind is not old.type:
                 # its numbers had other units
                 return Joint(kind, axis)
-            if "limits" not in self._fields:
+            if "limits" not in values:
                 return replace(old, axis=axis)
             is_angle = kind is JointType.REVOLUTE
-            limits = self._read_values("limits", 2, is_angle)
+            limits = read("limits", 2, is_angle)
             if limits and limits[0] > limits[1]:
-                raise EditError(f"limits: expected the lower one first, got {quote(self._fields['limits'].value, 40)}")
+                raise EditError(f"limits: expected the lower one first, got {quote(values['limits'], 40)}")
             mimic = None
-            if self._fields["leader"].value != NO_CHOICE:
-                (multiplier,) = self._read_values("multiplier", 1, is_angle=False) or (1.0,)
-                (offset,) = self._read_values("offset", 1, is_angle) or (0.0,)
-                mimic = Mimic(self._fields["leader"].value, multiplier, offset)
+            if values["leader"] != NO_CHOICE:
+                (multiplier,) = read("multiplier", 1, is_angle=False) or (1.0,)
+                (offset,) = read("offset", 1, is_angle) or (0.0,)
+                mimic = Mimic(values["leader"], multiplier, offset)
             return Joint(
                 kind,
                 axis,
                 limits[:1],
                 limits[1:],
-                self._read_values("rate_limit", 1, is_angle),
-                self._read_values("default", 1, is_angle) if mimic is None else (),
-                self._read_values("sigma", 1, is_angle),
+                read("rate_limit", 1, is_angle),
+                read("default", 1, is_angle) if mimic is None else (),
+                read("sigma", 1, is_angle),
                 mimic,
             )
         except ValueError as error:
             raise EditError(str(error)) from None
 
-    def _read_values(self, key: str, count: int, is_angle: bool) -> tuple[float, ...]:
-        """Return the numbers in a text, none for an empty one, radians and meters."""
-        if not self._differs(key):
-            return self._exact[key]
-        text = self._fields[key].value.strip()
-        if not text:
-            return ()
-        label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
-        if len(parts) != count:
-            what = "two numbers, lower and upper" if count == 2 else "one number"
-            raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
-        numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
-        return tuple([math.radians(each) if is_angle else each for each in numbers])
-
     # --- gizmo
 
     def find_place(self) -> tuple[str, Pose, Pose] | None:
         """Return the body on which the pose stands, that of its parent on it, and the pose; None for a body."""
-        model, part = self._session.drawn, self._part
+        model, part = self._session.drawn, self.part
         if part is None:
             return None
         if isinstance(part, BodyFrame):
@@ -734,10 +984,10 @@ class ItemFields:
 
     def set_dragged(self, pose: Pose, steps: tuple[float, float], is_end: bool) -> None:
         """Show where the gizmo is; at the end of a drag set it. What was not moved, or not turned, stays exact."""
-        if self._part is None:
+        if self.part is None:
             return
         meters, degrees = steps
-        moved, turned = self._part.pose.distance(pose)
+        moved, turned = self.part.pose.distance(pose)
         if moved > SAME:
             self._fields["xyz"].value = tuple([round(round(each / meters) * meters, PRECISION) for each in pose.xyz])
         if turned > SAME:
@@ -745,6 +995,35 @@ class ItemFields:
             self._fields["rpy"].value = tuple([round(round(each / degrees) * degrees, PRECISION) for each in rpy])
         if is_end:
             self.set()
+
+
+def _list_layout(shown: Sequence[ShownField]) -> list[tuple[str, tuple[str, ...]]]:
+    return [(each.key, each.labels) for each in shown]
+
+
+def _list_pose_fields(pose: Pose, sigma: Sigma | None) -> list[ShownField]:
+    known, axes, angles = sigma or Sigma(), "xyz", ("roll", "pitch", "yaw")
+    turns = tuple(np.degrees(known.rotation).tolist())
+    return [
+        ShownField("xyz", tuple([f"{axis} (m)" for axis in axes]), pose.xyz),
+        ShownField("rpy", tuple([f"{angle} (deg)" for angle in angles]), tuple(map(math.degrees, pose.rpy))),
+        ShownField("has_sigma", ("Sigma",), sigma is not None, hint="Standard deviations are stated"),
+        ShownField("sigma_xyz", tuple([f"sigma {axis} (m)" for axis in axes]), known.position),
+        ShownField("sigma_rpy", tuple([f"sigma {angle} (deg)" for angle in angles]), turns),
+    ]
+
+
+def _read_values(key: str, text: str, count: int, is_angle: bool) -> tuple[float, ...]:
+    """Return the numbers in a text, none for an empty one, radians and meters. Raises EditError."""
+    text = text.strip()
+    if not text:
+        return ()
+    label, parts = key.replace("_", " "), [each.strip() for each in text.strip("[]").split(",")]
+    if len(parts) != count:
+        what = "two numbers with a decimal point, lower and upper" if count == 2 else "one number with a decimal point"
+        raise EditError(f"{label}: expected {what}, got {quote(text, 40)}")
+    numbers = [_INFINITE[each.lower()] if each.lower() in _INFINITE else parse_typed(label, each) for each in parts]
+    return tuple([math.radians(each) if is_angle else each for each in numbers])
 
 
 def _format_values(values: Sequence[float], scale: float) -> str:

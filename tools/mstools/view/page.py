@@ -154,6 +154,12 @@ class Actions(queue.SimpleQueue[Callable[[], object]]):
         """Queue an action where a person changes a field; values that this program sets have no client."""
         field.on_update(lambda event: self.put(action) if event.client_id is not None else None)
 
+    def on_choice(self, field: Any, action: Callable[[Any], object]) -> None:
+        """Queue an action with the value that a person gave a field: the field may have another one until it runs."""
+        field.on_update(
+            lambda event: self.put(partial(action, event.target.value)) if event.client_id is not None else None
+        )
+
     def add_button(self, gui: viser.GuiApi, label: str, action: Callable[[], object]) -> viser.GuiButtonHandle:
         """Add a button that queues an action."""
         button = gui.add_button(label)

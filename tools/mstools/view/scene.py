@@ -83,6 +83,26 @@ GIZMO_SCALE: Final = 0.2
 LABEL_SPACING: Final = 20.0
 """Meters."""
 
+NO_LINES: Final = np.zeros((0, 2, 3))
+
+SELECTED_COLOR: Final[Rgb] = (130, 40, 240)
+MARK_SCALE: Final = 0.12
+"""Edge of the cube that marks a frame, as a part of the size of the model: axes have 0.05, the gizmo covers less."""
+
+OUTLINE_SCALE: Final = 1.01
+"""Size of an outline relative to its shape, whose surface would hide half of each line."""
+
+_CUBE: Final = np.array(
+    [
+        (a, b)
+        for a in np.ndindex(2, 2, 2)
+        for b in np.ndindex(2, 2, 2)
+        if a < b and sum(p != q for p, q in zip(a, b, strict=True)) == 1
+    ],
+    float,
+)
+"""The 12 edges of the unit cube (12, 2, 3), corners at 0 and 1."""
+
 
 class NameLabels(StrEnum):
     """Which names stand in the scene."""
@@ -161,12 +181,13 @@ class VehicleScene:
         )
         self._gizmo: Any = None
         self._gizmo_count = 0
+        self._mark: Any = None
         self._ellipsoid = self._scene.add_icosphere("/world/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False)
 
-    def _add_lines(self, name: str, color: Rgb, width: float) -> Any:
-        """Add a node of line segments, none at first, `width` pixels wide."""
+    def _add_lines(self, name: str, color: Rgb, width: float, points: Array = NO_LINES) -> Any:
+        """Add a node of line segments (n, 2, 3), `width` pixels wide."""
         return self._scene.add_line_segments(
-            name, np.zeros((0, 2, 3), np.float32), color, thickness=width, thickness_units="screen"
+            name, points.astype(np.float32), color, thickness=width, thickness_units="screen"
         )
 
     def set_shadows(self, is_on: bool) -> None:
@@ -186,7 +207,7 @@ class VehicleScene:
         for each in self._bodies.values():
             each.remove()
         # went with its body
-        self._gizmo = None
+        self._gizmo = self._mark = None
         self._bodies, self._poses, self._labels, self._points, self._solid, self.unread = {}, {}, [], {}, {}, {}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
@@ -387,6 +408,38 @@ class VehicleScene:
             self._gizmo.remove()
             self._gizmo = None
 
+    def mark(self, body: str, place: Pose | None) -> None:
+        """Outline a body, and a frame on it at `place`, where they are drawn."""
+        if self._mark is not None:
+            self._mark.remove()
+            self._mark = None
+        node = self._bodies.get(body)
+        if node is None or self._frames is None:
+            return
+        shapes = list(_list_shapes(self._frames.model.body(body)))
+        if place is not None:
+            shapes.append(Shape(ShapeKind.BOX, (MARK_SCALE * self._size,) * 3, place))
+        edges = [self._outline(each) for each in shapes]
+        # as for the gizmo
+        self._gizmo_count += 1
+        self._mark = self._add_lines(
+            f"{node.name}/selected{self._gizmo_count}", SELECTED_COLOR, 3.0, np.concatenate(edges)
+        )
+
+    def _outline(self, shape: Shape) -> Array:
+        """Return the edges (12, 2, 3) of the box around a shape, on its body; none of a mesh that cannot be read."""
+        if shape.kind is ShapeKind.MESH:
+            try:
+                points = self._meshes.read(shape.file).outline * np.array(shape.size)
+            except MeshError:
+                return NO_LINES
+        else:
+            points = _list_outline(shape)
+        low, high = points.min(axis=0), points.max(axis=0)
+        center, half = (low + high) / 2.0, OUTLINE_SCALE * (high - low) / 2.0
+        corners = (center + (2.0 * _CUBE - 1.0) * half).reshape(-1, 3)
+        return shape.pose.transform(corners).reshape(-1, 2, 3)
+
     def show_trail(self, utimes: npt.NDArray[np.int64], points: Array) -> None:
         """Draw the trail through points (n, 3) in World:UTM at times (n,), microseconds.
 
@@ -468,6 +521,10 @@ def _make_box(body: Body) -> Shape:
     low, high = corners.min(axis=0), corners.max(axis=0)
     x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()
     return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
+
+
+def _list_shapes(body: Body) -> tuple[Shape, ...]:
+    return body.visuals or body.collisions or (_make_box(body),)
 
 
 def _list_outline(shape: Shape) -> Array:

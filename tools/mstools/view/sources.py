@@ -102,11 +102,11 @@ def open_geometry(
 
     Raises GeometryError, ConfigError, OSError.
     """
-    file = EditedFile.open(path)
+    file = EditedFile.open(path) if session is None else session.file
     geometry, base_frame = file.path, file.config.base_frame if file.config is not None else ""
     model = load_given_model(geometry, variables) if session is None else session.drawn
     drive = Drive(keep_geometry=True)
-    answers = FilePlatform(model, next(frame.full_name for body in model.bodies for frame in body), f"in {path}")
+    answers = FilePlatform(model, next((frame.full_name for body in model.bodies for frame in body), ""), f"in {path}")
     meshes = MeshFolders(geometry.resolve().parent, tuple(packages))
     source = Source(f"{model.name or path.name}", drive, answers, meshes)
 
