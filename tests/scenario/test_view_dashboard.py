@@ -36,8 +36,8 @@ def drive_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_drive(tmp_path_factory.mktemp("view"), 30.0)
 
 
-@pytest.fixture(scope="module")
-def shown(browser: Browser, drive_log: Path) -> Iterator[tuple[Page, Drive]]:
+@pytest.fixture(scope="module", name="shown")
+def show_log(browser: Browser, drive_log: Path) -> Iterator[tuple[Page, Drive]]:
     source = open_log(drive_log)
     with show(browser, source, path="") as page:
         page.wait_for_function("document.documentElement.dataset.charts !== undefined")

@@ -178,7 +178,7 @@ class Table:
 class ChannelCount:
     """Messages of a channel: their number, receive time of the last, and rate in Hz over the last seconds.
 
-    `course` has the rate of each second, and the longest time from a stamp to the reception in it, seconds.
+    `course` has the rate of each second, and the longest time from a stamp to the receipt in it, seconds.
     """
 
     count: int = 0
