@@ -6,21 +6,29 @@ import io
 import math
 import sys
 import tempfile
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
+import trimesh
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import FrameLocator, Page
 from support_browser import CHROMIUM, open_link, select_item, show, start_browser
 from support_lcm import reserved_url
+from support_recordings import HUSKY, REPOSITORY
 from support_view import follow_drive, record_drive
+from trimesh.visual.material import PBRMaterial
 
 from mstools.commands.demo import find_vehicle_file
+from mstools.commands.replay import open_localized
 from mstools.edit import EditedFile, EditSession
+from mstools.recordings.bag_log import open_lcm_log
 from mstools.report import charts
 from mstools.view.editor import Editing
 from mstools.view.sources import Source, open_geometry, open_log
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+IMAGES = REPOSITORY / "docs" / "images"
+SHARED = REPOSITORY.parent / "shared" / "data"
 DRIVE_S = 40.0
 
 
@@ -34,11 +42,14 @@ def main() -> int:
     take_editor("view-edit.png")
     with tempfile.TemporaryDirectory() as folder:
         log = record_drive(Path(folder), DRIVE_S)
-        source = open_log(log)
-        take("view-log.png", source, "Time", "Play", 12.0)
-        take("view-state.png", open_log(log), "Time", "Play", 20.0)
+        take_page("view-log.png", open_log(log), at=0.75 * DRIVE_S)
+        take_state("view-state.png", open_log(log))
+        take("view-robot.png", open_geometry(make_robot(Path(folder)), {}))
+    if (bag := SHARED / "husky" / "test1.bag").exists():
+        with open_lcm_log(bag) as log, open_localized(log, HUSKY) as localized:
+            take_page("view-husky.png", open_log(localized), at=200.0, panes=("map", "plots"))
     with tempfile.TemporaryDirectory() as folder, reserved_url() as url, follow_drive(url, Path(folder)) as source:
-        take("view-live.png", source, seconds=25.0)
+        take_page("view-live.png", source, seconds=25.0)
     return 0
 
 
@@ -108,19 +119,64 @@ def take_charts(name: str) -> None:
     print(IMAGES / name)
 
 
-def take(name: str, source: Source, tab: str = "", button: str = "", seconds: float = 3.0) -> None:
-    """Write one screenshot, after a tab and a button were clicked and some seconds have passed."""
+def take(name: str, source: Source) -> None:
+    """Write the screenshot of a scene with its tabs."""
     with start_browser() as browser, show(browser, source, sharpness=1.0) as page:
         close_warning(page)
-        if tab:
-            page.get_by_role("tab", name=tab).click()
-            page.get_by_role("button", name=button).click()
-        page.wait_for_timeout(seconds * 1e3)
-        if "state" in name:
-            page.get_by_role("tab", name="State").click()
-            page.wait_for_timeout(2e3)
+        page.wait_for_timeout(3e3)
         write_picture(page.screenshot(), IMAGES / name)
     print(IMAGES / name)
+
+
+def take_state(name: str, source: Source) -> None:
+    """Write the screenshot of the tab State, of a log that plays."""
+    with start_browser() as browser, show(browser, source, sharpness=1.0) as page:
+        close_warning(page)
+        page.get_by_role("tab", name="Time").click()
+        page.get_by_role("button", name="Play").click()
+        page.wait_for_timeout(20e3)
+        page.get_by_role("tab", name="State").click()
+        page.wait_for_timeout(2e3)
+        write_picture(page.screenshot(), IMAGES / name)
+    print(IMAGES / name)
+
+
+def take_page(
+    name: str, source: Source, at: float = 0.0, seconds: float = 5.0, panes: Sequence[str] = ("scene", "map", "plots")
+) -> None:
+    """Write the screenshot of the whole page at a time of a drive, after some seconds."""
+    with start_browser() as browser, show(browser, source, sharpness=1.0, path="") as page:
+        close_warning(page.frame_locator("#scene"))
+        for pane in ("scene", "map"):
+            if (page.locator(f"[data-pane={pane}]").get_attribute("aria-pressed") == "true") != (pane in panes):
+                page.locator(f"[data-pane={pane}]").click()
+        page.wait_for_function("document.documentElement.dataset.charts !== undefined")
+        if at:
+            page.evaluate(f"seek({at})")
+        page.wait_for_timeout(seconds * 1e3)
+        write_picture(page.screenshot(), IMAGES / name)
+    print(IMAGES / name)
+
+
+def make_robot(folder: Path) -> Path:
+    """Write an arm whose meshes have colors of their own, and return its URDF."""
+    parts = {"base": (60, 60, 66), "upper": (230, 120, 20), "fore": (230, 120, 20), "hand": (40, 90, 170)}
+    sizes = {"base": (0.3, 0.3, 0.2), "upper": (0.12, 0.12, 0.5), "fore": (0.1, 0.1, 0.4), "hand": (0.16, 0.05, 0.12)}
+    lines = []
+    for name, color in parts.items():
+        mesh = trimesh.creation.box(sizes[name])
+        mesh.apply_translation((0.0, 0.0, sizes[name][2] / 2.0))
+        mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(baseColorFactor=(*color, 255)))
+        mesh.export(folder / f"{name}.glb")
+        lines.append(f'<link name="{name}"><visual><geometry><mesh filename="{name}.glb"/></geometry></visual></link>')
+    for (below, above), pitch in zip(pairwise(parts), (0.3, 0.9, 0.5), strict=True):
+        place = f'<origin xyz="0 0 {sizes[below][2]}" rpy="0 {pitch} 0"/><axis xyz="0 1 0"/>'
+        ends = f'<parent link="{below}"/><child link="{above}"/>'
+        limit = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
+        lines.append(f'<joint name="{above}_joint" type="revolute">{ends}{place}{limit}</joint>')
+    path = folder / "robot.urdf"
+    path.write_text(f'<robot name="arm">{"".join(lines)}</robot>')
+    return path
 
 
 def take_editor(name: str) -> None:
@@ -143,7 +199,7 @@ def write_picture(png: bytes, path: Path) -> None:
     picture.quantize(128, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def close_warning(page: Page) -> None:
+def close_warning(page: Page | FrameLocator) -> None:
     """Close the note that the picture is computed without a graphics card."""
     page.locator(".mantine-Notification-closeButton").first.click()
 

@@ -83,7 +83,8 @@ def edit(browser: Browser, path: Path, url: str, *more: str) -> Iterator[Page]:
         stack.callback(process.stdout.close)
         link = re.search(r"http\S+\?token=\S+", process.stdout.readline())
         assert link is not None
-        page = stack.enter_context(open_link(browser, link[0]))
+        # the scene with its tabs alone, without the page around it
+        page = stack.enter_context(open_link(browser, link[0].replace("/?", "/scene?")))
         page.get_by_role("tab", name="Edit").click()
         page.get_by_text(re.compile("^geometry.yaml: ")).wait_for()
         yield page

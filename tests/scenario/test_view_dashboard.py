@@ -162,3 +162,16 @@ def test_given_a_viewer_that_ends_then_the_page_reports_it_and_returns_with_the_
         Viewer(served, source)
         page.get_by_role("alert").wait_for(state="hidden")
     served.close()
+
+
+def test_given_a_link_with_a_token_then_page_and_scene_open_and_without_it_neither(browser: Browser) -> None:
+    served = open_page(port=0, with_token=True)
+    Viewer(served, open_geometry(find_vehicle_file(), {}))
+    try:
+        with open_link(browser, served.link) as page:
+            page.frame_locator("#scene").get_by_role("tab", name="Query").wait_for()
+            assert "token" not in page.frame_locator("#scene").locator("html").evaluate("() => location.href")
+        with open_link(browser, served.link.partition("?")[0], expected_errors=("403",)) as page:
+            page.get_by_text("the token is missing or wrong").wait_for()
+    finally:
+        served.close()
