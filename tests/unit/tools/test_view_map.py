@@ -105,7 +105,7 @@ def test_given_a_place_on_the_map_then_its_geodetic_coordinates_are_exact_to_a_c
 def test_given_a_track_then_the_view_that_fits_has_all_of_it_in_the_middle() -> None:
     drive = make_drive()
     add_poses(drive, [VALID] * 101)
-    view = fit_view(drive, drive.end, 1000, 500)
+    view = fit_view(drive, 1000, 500)
     west, _, east, _ = view.bounds
     assert west < 0.0 < 100.0 < east
     assert (view.east, view.north) == pytest.approx((50.0, 0.0))

@@ -155,7 +155,7 @@ class Dashboard:
         with self._source.lock:
             drive = self._source.drive
             picture = drive.get_picture(shown.utime)
-            view = fit_view(drive, picture.utime, width, height)
+            view = fit_view(drive, width, height)
             if "scale" in query:
                 scale = _read_number(query, "scale", 1e-4, 2e3)
                 east, north = (_read_number(query, name, -1e7, 1e7) for name in ("east", "north"))

@@ -18,7 +18,7 @@ from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.messages import Invalid
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.recordings.drive import FIX_COLOR, FIX_POSITION, INVALID, Drive, FixColor, Picture
+from mstools.recordings.drive import FIX_COLOR, FIX_POSITION, INVALID, MAX_STAMP, Drive, FixColor, Picture
 from mstools.view.signals import compute_headings
 
 MAX_FIXES: Final = 3_000
@@ -48,9 +48,10 @@ class View:
         return self.east - half_x, self.north - half_y, self.east + half_x, self.north + half_y
 
 
-def fit_view(drive: Drive, utime: int, width: int, height: int) -> View:
-    """Return the view of the whole track and the fixes until a time, with a margin; of 40 m around a single place."""
-    points = np.concatenate([drive.get_track(utime)[1][:, :2], drive.get_fixes(utime)[0][:, :2]])
+def fit_view(drive: Drive, width: int, height: int) -> View:
+    """Return the view of the whole track and the fixes, with a margin; of 40 m around a single place."""
+    # drive.end may be before a fix that came last
+    points = np.concatenate([drive.get_track(drive.end)[1][:, :2], drive.get_fixes(MAX_STAMP)[0][:, :2]])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.zeros((1, 2))

@@ -21,8 +21,11 @@ from mstools.recordings.drive import COVARIANCE, EPOCH, HORIZONTAL, INVALID, QUA
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, StripRow
 
-SPEED_SPAN_US: Final = 200_000
-"""Time over which positions are differenced to a speed: noise of a pose of 1 mm is 7 mm/s then."""
+SPEED_SPAN_US: Final = 400_000
+"""Time over which positions are differenced to a speed: a correction of the pose by 0.1 m is 0.25 m/s then."""
+
+SHOWN_SHARE: Final = 0.995
+"""Share of the values that an axis has: a jump of the pose, as at its alignment, would flatten the rest."""
 
 MAX_GAP_US: Final = 1_000_000
 """Longer gaps between poses interrupt lines and strips."""
@@ -166,7 +169,8 @@ def _make_axis(label: str, values: Sequence[Array], least: float, floor: float |
     """Return an axis around the finite values, at least `least` wide, and from `floor` upwards if given."""
     known = np.concatenate([np.asarray(each, float) for each in values] or [np.zeros(0)])
     known = known[np.isfinite(known)]
-    low, high = charts.value_range((known.min(), known.max()) if len(known) else (), min_width=least)
+    tail = 0.5 * (1.0 - SHOWN_SHARE)
+    low, high = charts.value_range(np.quantile(known, (tail, 1.0 - tail)) if len(known) else (), min_width=least)
     if floor is not None:
         return Axis(label, floor, max(high, floor + least))
     return Axis(label, low, high)

@@ -11,8 +11,10 @@ function createMap(section, fetchJson, onView) {
   const bar = section.querySelector(".scale");
   const pen = canvas.getContext("2d");
   const images = new Map();
-  // the view: null until the first answer, which then fits the track
+  // the view: null before the first answer
   let view = null;
+  // whether it fits the track, until a person moves it
+  let isFitted = true;
   let isFollowing = false;
   let data = null;
   let isFetching = false;
@@ -37,7 +39,7 @@ function createMap(section, fetchJson, onView) {
     isFetching = true;
     const query = new URLSearchParams({ width, height });
     const asked = view;
-    if (view) for (const [n, name] of ["east", "north", "scale"].entries()) query.set(name, view[n]);
+    if (view && !isFitted) for (const [n, name] of ["east", "north", "scale"].entries()) query.set(name, view[n]);
     if (isFollowing && view) query.set("follow", 1);
     try {
       data = await fetchJson(`/map?${query}`);
@@ -71,13 +73,13 @@ function createMap(section, fetchJson, onView) {
     pen.setTransform(density, 0, 0, density, 0, 0);
     paintGrid(data.grids?.geodetic ?? [], readTone("--line"), [2, 4], true);
     paintGrid(data.grids?.utm ?? [], readTone("--line"), [], false);
-    pen.lineWidth = 2.5;
+    paintFixes();
+    pen.lineWidth = 2;
     for (const line of data.trail) {
       pen.strokeStyle = readTone(line.valid ? "--valid" : "--invalid");
       trace(line.points);
       pen.stroke();
     }
-    paintFixes();
     for (const [name, place] of Object.entries(data.places)) paintPlace(name, place);
     if (data.vehicle) paintVehicle(data.vehicle);
     paintScale();
@@ -202,6 +204,7 @@ function createMap(section, fetchJson, onView) {
 
   function zoom(factor, x, y) {
     if (!view) return;
+    isFitted = false;
     const before = toPlace(x, y);
     const scale = Math.min(Math.max(view[2] * factor, 1e-3), 1000);
     view = [view[0], view[1], scale];
@@ -215,6 +218,7 @@ function createMap(section, fetchJson, onView) {
 
   function setFollow(value) {
     isFollowing = value;
+    if (value) isFitted = false;
     section.querySelector("[data-do=follow]").setAttribute("aria-pressed", value);
     refresh();
   }
@@ -237,6 +241,7 @@ function createMap(section, fetchJson, onView) {
     held.set(event.pointerId, now);
     if (held.size === 1) {
       if (isFollowing) setFollow(false);
+      isFitted = false;
       view = [view[0] - (now[0] - last[0]) * view[2], view[1] + (now[1] - last[1]) * view[2], view[2]];
       paint();
       refresh();
@@ -253,6 +258,7 @@ function createMap(section, fetchJson, onView) {
     if (event.key === "+") zoomMiddle(0.7);
     else if (event.key === "-") zoomMiddle(1.4);
     else if (steps && view) {
+      isFitted = false;
       view = [view[0] + steps[0] * 60 * view[2], view[1] + steps[1] * 60 * view[2], view[2]];
       refresh();
     } else return;
@@ -260,7 +266,7 @@ function createMap(section, fetchJson, onView) {
     event.stopPropagation();
   });
   const actions = {
-    fit: () => { view = null; setFollow(false); },
+    fit: () => { isFitted = true; setFollow(false); },
     follow: () => setFollow(!isFollowing),
     in: () => zoomMiddle(0.6),
     out: () => zoomMiddle(1 / 0.6),

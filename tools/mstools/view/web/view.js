@@ -91,7 +91,8 @@ function showStrip() {
     item.className = each.silent ? "silent" : "";
     setText(item, `${each.name} ${formatAge(each.age)}`);
   });
-  setText(find("revision"), state.revision ? `revision ${state.revision}` : "");
+  setText(find("revision"), state.revision);
+  find("revision").title = `Revision of the geometry: ${state.revision}`;
 }
 
 // --- panes
